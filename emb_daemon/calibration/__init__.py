@@ -1,0 +1,1 @@
+"""Calibration and configuration files: typed, strict, and turned into the estimator's parameter records."""

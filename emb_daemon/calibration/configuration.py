@@ -1,0 +1,105 @@
+"""The daemon's configuration file: bus, corners, folders, real-time settings."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.strict_yaml import load_yaml
+from emb_daemon.calibration.types import Calibration, Struct, to_parameters
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.wire.layout import CORNERS, load_layout
+
+
+class Bus(Struct, kw_only=True):
+    """The CAN bus, in python-can's words; the command line and CAN_* variables come before it."""
+
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: Annotated[int, Meta(gt=0)] | None = None
+
+
+class Corner(Struct, kw_only=True):
+    """One wheel's brake."""
+
+    #: Calibration file, relative to this configuration.
+    calibration: str
+
+
+class Realtime(Struct, kw_only=True):
+    """What makes the loop punctual where the system allows it."""
+
+    #: SCHED_FIFO priority, or null for ordinary scheduling.
+    fifo_priority: Annotated[int, Meta(ge=1, le=99)] | None = 60
+    #: CPU to run the loop on, or null for any.
+    cpu: Annotated[int, Meta(ge=0)] | None = None
+    lock_memory: bool = True
+
+
+class Configuration(Struct, kw_only=True):
+    """config/emb.yaml."""
+
+    format: Annotated[int, Meta(ge=1, le=1)]
+    bus: Bus = Bus()
+    #: FL, FR, RL, RR: those that this process estimates.
+    corners: dict[str, Corner]
+    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same.
+    dbc: str | None = None
+    #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
+    state_directory: str | None = None
+    realtime: Realtime = Realtime()
+    log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"
+
+    def __post_init__(self):
+        if not self.corners:
+            raise ValueError("corners: expected at least one of FL, FR, RL, RR")
+        for name in self.corners:
+            if name not in CORNERS:
+                raise ValueError(f"corners.{name}: expected FL, FR, RL or RR")
+
+
+class Setup:
+    """A configuration with everything that it names, loaded and checked.
+
+    Attributes:
+        calibrations: by corner name.
+        parameters: PARAMETERS array, shape (4,).
+        layout: LAYOUT array, shape (1,).
+    """
+
+    def __init__(self, path: Path):
+        """Raises InputErrors with every fault of configuration, calibrations and DBC."""
+        self.path = Path(path)
+        self.configuration = load_yaml(self.path, Configuration)
+        faults: list[str] = []
+        folder = self.path.parent
+        try:
+            dbc = self.configuration.dbc
+            self.layout = load_layout(folder / dbc if dbc else None, tuple(self.configuration.corners))
+        except InputErrors as error:
+            faults += error.faults
+        except InputError as error:
+            faults.append(str(error))
+        self.calibrations: dict[str, Calibration] = {}
+        self.parameters = np.zeros(4, PARAMETERS)
+        loaded: dict[Path, Calibration | None] = {}
+        for name, corner in self.configuration.corners.items():
+            file = folder / corner.calibration
+            if file not in loaded:
+                loaded[file] = None
+                try:
+                    loaded[file] = load_calibration(file)
+                    to_parameters(loaded[file])
+                except InputErrors as error:
+                    faults += error.faults
+                except InputError as error:
+                    faults.append(f"{file}: {error}")
+            if loaded[file] is not None:
+                self.calibrations[name] = loaded[file]
+                if not faults:
+                    self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
+        if faults:
+            raise InputErrors(faults)

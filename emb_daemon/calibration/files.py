@@ -1,0 +1,56 @@
+"""Calibration files: load, state which one it is, write."""
+
+import hashlib
+from pathlib import Path
+
+import msgspec
+import yaml
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.strict_yaml import load_yaml
+from emb_daemon.calibration.types import Calibration
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration.
+
+    Raises:
+        InputErrors: every fault with file, line and key.
+    """
+    return load_yaml(Path(path), Calibration)
+
+
+def calibration_hash(calibration: Calibration) -> str:
+    """Twelve hexadecimal digits over the values, whatever the file's formatting; provenance does not count."""
+    values = msgspec.to_builtins(msgspec.structs.replace(calibration, provenance=None))
+    return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:12]
+
+
+def dump_calibration(calibration: Calibration) -> str:
+    """The file's text."""
+    return yaml.dump(msgspec.to_builtins(calibration), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    write_atomically(Path(path), dump_calibration(calibration).encode())
+
+
+class _Dumper(yaml.SafeDumper):
+    """Numbers that our reader and every YAML 1.1 reader take for numbers; lists of numbers on one line."""
+
+
+def _float(dumper: yaml.Dumper, value: float) -> yaml.Node:
+    text = repr(value)
+    if "e" in text and "." not in text:
+        text = text.replace("e", ".0e")
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+def _sequence(dumper: yaml.Dumper, value) -> yaml.Node:
+    numbers = all(isinstance(item, int | float) for item in value)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=numbers)
+
+
+_Dumper.add_representer(float, _float)
+_Dumper.add_representer(list, _sequence)
+_Dumper.add_representer(tuple, _sequence)

@@ -1,0 +1,169 @@
+"""YAML read strictly into msgspec structs.
+
+PyYAML alone takes `1e-3` for a string, `on` for true, `010` for eight, keeps the last of two equal keys and accepts `.nan`.
+Here a scalar is what YAML 1.2's core schema says, a duplicate key or a number that is not finite is a fault, and every
+fault of a file is reported at once with its line.
+"""
+
+import difflib
+import math
+import re
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from emb_daemon.errors import InputError, InputErrors
+
+_T = typing.TypeVar("_T")
+_INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
+_CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
+_NOT_FINITE = {".nan", ".inf", "-.inf", "+.inf", "nan", "inf", "-inf"}
+
+
+class _Reader:
+    def __init__(self, name: str):
+        self.name = name
+        self.faults: list[str] = []
+
+    def fault(self, node: yaml.Node, path: str, text: str) -> None:
+        self.faults.append(f"{self.name}:{node.start_mark.line + 1}: {path + ': ' if path else ''}{text}")
+
+    def scalar(self, node: yaml.ScalarNode, path: str) -> Any:
+        text = node.value
+        if node.style in ("'", '"', "|", ">"):
+            return text
+        if text.lower() in _NOT_FINITE:
+            self.fault(node, path, f"{text} is not a finite number")
+            return None
+        if text in _CONSTANTS:
+            return _CONSTANTS[text]
+        if _INTEGER.match(text):
+            return int(text)
+        if _FLOAT.match(text):
+            value = float(text)
+            if math.isfinite(value) and not (text.lstrip("+-").startswith("0") and text.lstrip("+-0").isdigit()):
+                return value
+            self.fault(node, path, f"{text}: expected a finite decimal number without leading zeros")
+            return None
+        return text
+
+    def plain(self, node: yaml.Node, path: str) -> Any:
+        """Plain Python data, checked for duplicate keys on the way."""
+        if isinstance(node, yaml.ScalarNode):
+            return self.scalar(node, path)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.plain(item, f"{path}[{index}]") for index, item in enumerate(node.value)]
+        return {key: self.plain(value, _join(path, key)) for key, value in self.entries(node, path).items()}
+
+    def entries(self, node: yaml.MappingNode, path: str) -> dict[str, yaml.Node]:
+        entries: dict[str, yaml.Node] = {}
+        for key, value in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else "?"
+            if name in entries:
+                self.fault(key, _join(path, name), "stands here twice")
+            entries[name] = value
+        return entries
+
+    def convert(self, node: yaml.Node, kind: Any, path: str) -> Any:
+        """``node`` as ``kind``; None after a fault, which is then recorded."""
+        optional, kind = _strip_optional(kind)
+        if optional and isinstance(node, yaml.ScalarNode) and node.value in ("null", "~", ""):
+            return None
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+            return self.struct(node, kind, path)
+        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+        if origin is tuple and arguments[-1] is Ellipsis and _holds_struct(arguments[0]):
+            if not isinstance(node, yaml.SequenceNode):
+                return self.fault(node, path, "expected a list")
+            return tuple(self.convert(item, arguments[0], f"{path}[{index}]") for index, item in enumerate(node.value))
+        if origin is dict and _holds_struct(arguments[1]):
+            if not isinstance(node, yaml.MappingNode):
+                return self.fault(node, path, "expected keys and values")
+            entries = self.entries(node, path)
+            return {key: self.convert(value, arguments[1], _join(path, key)) for key, value in entries.items()}
+        before = len(self.faults)
+        value = self.plain(node, path)
+        if len(self.faults) > before:
+            return None
+        try:
+            return msgspec.convert(value, kind)
+        except msgspec.ValidationError as error:
+            text, _, where = str(error).partition(" - at `$")
+            self.fault(node, path + where.rstrip("`"), text)
+
+    def struct(self, node: yaml.Node, kind: type[msgspec.Struct], path: str) -> Any:
+        if not isinstance(node, yaml.MappingNode):
+            return self.fault(node, path, f"expected keys, such as {', '.join(kind.__struct_fields__[:3])}")
+        before = len(self.faults)
+        fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+        values = {}
+        entries = self.entries(node, path)
+        for name, child in entries.items():
+            if name not in fields:
+                near = difflib.get_close_matches(name, fields, 1, 0.5)
+                hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(fields)}"
+                self.fault(child, _join(path, name), f"unknown key; {hint}")
+                continue
+            values[fields[name].name] = self.convert(child, fields[name].type, _join(path, name))
+        for name, field in fields.items():
+            if field.required and name not in entries:
+                self.fault(node, _join(path, name), "missing")
+        if len(self.faults) > before:
+            return None
+        try:
+            return kind(**values)
+        except ValueError as error:
+            self.fault(node, path, str(error))
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+def _strip_optional(kind: Any) -> tuple[bool, Any]:
+    if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+        rest = [argument for argument in typing.get_args(kind) if argument is not type(None)]
+        if len(rest) == 1:
+            return True, rest[0]
+    return False, kind
+
+
+def _holds_struct(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def load_yaml(path: Path, kind: type[_T], text: str | None = None) -> _T:
+    """Read a YAML file into a struct type.
+
+    Raises:
+        InputErrors: every fault found, each as ``file:line: key: what was expected``.
+    """
+    if text is None:
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            raise InputErrors([f"{path}: no such file"]) from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputErrors([f"{path}: not a readable text file ({error})"]) from None
+    reader = _Reader(str(path))
+    try:
+        root = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        raise InputErrors([f"{path}:{mark.line + 1 if mark else 1}: not YAML: {error.problem}"]) from None
+    except yaml.YAMLError as error:
+        raise InputErrors([f"{path}: not YAML: {str(error).splitlines()[0]}"]) from None
+    if root is None:
+        raise InputErrors([f"{path}: empty"])
+    try:
+        value = reader.convert(root, kind, "")
+    except RecursionError:
+        raise InputError(f"{path}: nested too deeply") from None
+    if reader.faults:
+        raise InputErrors(reader.faults)
+    return value

@@ -1,0 +1,323 @@
+"""What a calibration file holds. Keys carry their unit; every field's comment is its documentation.
+
+The estimator never sees these objects: `to_parameters` turns them into its record once.
+"""
+
+from itertools import pairwise
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from emb_daemon.effects import REGISTRY
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import (
+    CURVE_TERMS,
+    FORCE_GRID,
+    PARAMETERS,
+    SPEED_GRID,
+    TEMPERATURE_GRID,
+)
+from emb_daemon.models.thermal import mesh
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Base of everything that is read from YAML."""
+
+
+class Motor(Struct, kw_only=True):
+    """Motor and gear (thesis 2.3, 2.4)."""
+
+    #: Motor torque per torque-producing current, at 25 degC.
+    torque_constant_Nm_per_A: Positive
+    #: Lumped inertia of motor and gear at the motor shaft.
+    inertia_kg_m2: Positive
+    #: Clamp travel per motor angle; equally motor torque per clamp force. Geometry.
+    gear_gain_m_per_rad: Positive
+    #: Fastest that the motor turns.
+    maximum_speed_rad_per_s: Positive
+
+
+class Friction(Struct, kw_only=True):
+    """Friction of the reduction gear at the motor shaft (thesis 4.1)."""
+
+    #: Friction torque per clamp force (mu_g).
+    load_m_per_rad: NonNegative
+    #: Friction torque without clamp force (eta_g).
+    offset_Nm: NonNegative
+    #: Motor angle over which friction turns over after a reversal; near zero it is the thesis's sign function.
+    presliding_angle_rad: Annotated[float, Meta(ge=1e-6)]
+
+
+class Curve(Struct, kw_only=True):
+    """Characteristic curve of one pad thickness: F = sum of coefficients[n] x^(n+1), x in rad past contact."""
+
+    pad_thickness_mm: Positive
+    #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
+    coefficients: Annotated[tuple[float, ...], Meta(min_length=1, max_length=CURVE_TERMS)]
+
+    def __post_init__(self):
+        if self.coefficients[0] <= 0.0:
+            raise ValueError("the first coefficient (N/rad) must be positive: force rises from contact")
+
+
+class Stiffness(Struct, kw_only=True):
+    """Stiffness path (thesis 2.1, 3.3, 3.4)."""
+
+    #: One curve for each pad thickness that was measured, thinnest first.
+    curves: Annotated[tuple[Curve, ...], Meta(min_length=1)]
+    #: Time constant of the first-order dynamics.
+    relaxation_time_s: NonNegative
+    #: Largest force that the curves were identified for.
+    maximum_force_N: Positive
+
+    def __post_init__(self):
+        thicknesses = [curve.pad_thickness_mm for curve in self.curves]
+        if thicknesses != sorted(set(thicknesses)):
+            raise ValueError("curves: expected ascending, distinct pad thicknesses")
+
+
+class Contact(Struct, kw_only=True):
+    """Where the pads touch."""
+
+    #: Motor angle from the released position to contact.
+    clearance_rad: NonNegative
+    #: Its standard deviation at power-on.
+    clearance_sigma_rad: Positive
+    #: Random walk of the contact angle, by wear and heat.
+    walk_rad_per_sqrt_s: NonNegative
+
+
+class Noise(Struct, kw_only=True):
+    """Errors of both paths, as the filter needs them; identified from data that did not fit the models."""
+
+    #: Error of the stiffness path that does not grow with force, and the part that does.
+    stiffness_N: Positive
+    stiffness_relative: NonNegative
+    #: Time over which the stiffness path's error stays the same.
+    stiffness_correlation_s: Positive
+    #: Noise of the current, and the time over which it stays correlated.
+    current_A: Positive
+    current_correlation_s: Positive
+    #: White noise of the motor speed.
+    speed_rad_per_s: Positive
+    #: Error of the friction state in the middle of a reversal, as a share of full friction.
+    presliding: NonNegative
+    #: Relative error of the torque path that stays.
+    torque_relative: NonNegative
+
+
+class Pad(Struct, kw_only=True):
+    """Both brake pads (thesis 7.4 to 8.1). Conductivity is k0 (1 + rise (T - 20 degC)), specific heat likewise."""
+
+    area_m2: Positive
+    density_kg_per_m3: Positive
+    conductivity_W_per_mK: Positive
+    conductivity_rise_per_K: float = 0.0
+    specific_heat_J_per_kgK: Positive
+    specific_heat_rise_per_K: float = 0.0
+    #: Shares of the friction power that enter the inner and the outer pad directly (thesis p).
+    inner_heat_share: Share
+    outer_heat_share: Share
+    #: Between pad surface and disc, braking and released; between pad and backing plate's thermocouple.
+    contact_conductance_W_per_m2K: NonNegative
+    gap_conductance_W_per_m2K: NonNegative
+    backplate_conductance_W_per_m2K: Positive
+
+    def __post_init__(self):
+        if self.inner_heat_share + self.outer_heat_share > 1.0:
+            raise ValueError("inner_heat_share and outer_heat_share: their sum exceeds 1")
+
+
+class Disc(Struct, kw_only=True):
+    """The lumped disc (thesis 8.2). Loses cooling + cooling_per_speed * wheel speed, and radiates."""
+
+    heat_capacity_J_per_K: Positive
+    effective_radius_m: Positive
+    cooling_W_per_K: NonNegative
+    cooling_per_speed_J_per_rad_K: NonNegative
+    radiating_area_m2: NonNegative = 0.0
+
+
+class FrictionTable(Struct, kw_only=True):
+    """Pad-on-disc friction coefficient for service without a brake torque sensor (thesis 8.5)."""
+
+    force_N: Annotated[tuple[float, ...], Meta(min_length=FORCE_GRID, max_length=FORCE_GRID)]
+    disc_speed_rad_per_s: Annotated[tuple[float, ...], Meta(min_length=SPEED_GRID, max_length=SPEED_GRID)]
+    surface_temperature_C: Annotated[tuple[float, ...], Meta(min_length=TEMPERATURE_GRID, max_length=TEMPERATURE_GRID)]
+    #: coefficient[force][speed][temperature]
+    coefficient: tuple[tuple[tuple[Share, ...], ...], ...]
+
+    def __post_init__(self):
+        for name in ("force_N", "disc_speed_rad_per_s", "surface_temperature_C"):
+            grid = getattr(self, name)
+            if any(after <= before for before, after in pairwise(grid)):
+                raise ValueError(f"{name}: expected ascending values")
+        shape = (FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID)
+        if np.array(self.coefficient, dtype=object).shape != shape:
+            raise ValueError(f"coefficient: expected {shape[0]} x {shape[1]} x {shape[2]} numbers")
+
+
+class Softening(Struct, kw_only=True):
+    """alpha = 1 - per_K * rise - history_per_K * (rise through a first-order lag); rise of the mean pad temperature over
+    ambient (thesis 8.4)."""
+
+    per_K: float = 0.0
+    history_per_K: float = 0.0
+    history_time_s: Positive = 1000.0
+
+
+class Thermal(Struct, kw_only=True):
+    pad: Pad
+    disc: Disc
+    friction: FrictionTable
+    softening: Softening
+    #: Standard deviation of the modelled pad temperatures.
+    sigma_K: Positive = 5.0
+
+
+class Source(Struct, kw_only=True):
+    """One log that a calibration rests on."""
+
+    log: str
+    sha256: str
+
+
+class Provenance(Struct, kw_only=True):
+    """Where the numbers come from."""
+
+    date: str
+    tool: str
+    campaign: str = ""
+    logs: tuple[Source, ...] = ()
+    #: Error figures on logs that fitted nothing, by name.
+    figures: dict[str, float] = {}
+    #: Standard deviations of identified values, by key.
+    sigmas: dict[str, float] = {}
+
+
+class Calibration(Struct, kw_only=True):
+    """Everything identified of one actuator with its pads and disc."""
+
+    #: Version of this file format.
+    format: Annotated[int, Meta(ge=1, le=1)]
+    #: Which actuator it belongs to; learned values are restored only to the same one.
+    actuator: Annotated[str, Meta(min_length=1)]
+    #: Thickness of the pads now mounted.
+    pad_thickness_mm: Positive
+    motor: Motor
+    friction: Friction
+    stiffness: Stiffness
+    contact: Contact
+    noise: Noise
+    thermal: Thermal
+    #: Effects switched on, by name, with their parameters.
+    effects: dict[str, dict[str, float]] = {}
+    provenance: Provenance | None = None
+
+    def __post_init__(self):
+        known = {effect.name: effect for effect in REGISTRY}
+        for name, values in self.effects.items():
+            if name not in known:
+                raise ValueError(f"effects.{name}: unknown effect; known are {', '.join(known)}")
+            bounds = {parameter.name: parameter for parameter in known[name].parameters}
+            for key, value in values.items():
+                if key not in bounds:
+                    raise ValueError(f"effects.{name}.{key}: unknown parameter; expected {', '.join(bounds)}")
+                if not bounds[key].low <= value <= bounds[key].high:
+                    raise ValueError(
+                        f"effects.{name}.{key}: {value} outside [{bounds[key].low}, {bounds[key].high}] {bounds[key].unit}"
+                    )
+            if missing := bounds.keys() - values.keys():
+                raise ValueError(f"effects.{name}: missing {', '.join(sorted(missing))}")
+
+
+def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
+    """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
+
+    The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
+    nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
+
+    Raises:
+        InputError: the thickness is too far outside of what was measured.
+    """
+    table = np.zeros((len(curves), CURVE_TERMS))
+    for row, curve in enumerate(curves):
+        table[row, : len(curve.coefficients)] = curve.coefficients
+    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
+    if len(curves) == 1:
+        return table[0]
+    low, high = thicknesses[0], thicknesses[-1]
+    margin = 0.5 * np.diff(thicknesses)[[0, -1]]
+    if not low - margin[0] <= pad_thickness_mm <= high + margin[1]:
+        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured {low} to {high} mm")
+    upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
+    share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
+    below, above = table[upper - 1], table[upper]
+    if np.all(below * above > 0.0) or np.all((below * above > 0.0) | ((below == 0.0) & (above == 0.0))):
+        inverse = np.divide(1.0, below, out=np.zeros_like(below), where=below != 0.0) * (1.0 - share)
+        inverse += np.divide(1.0, above, out=np.zeros_like(above), where=above != 0.0) * share
+        return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse != 0.0)
+    return below + share * (above - below)
+
+
+def to_parameters(calibration: Calibration) -> np.void:
+    """The estimator's PARAMETERS record of a calibration."""
+    c = calibration
+    p = np.zeros(1, PARAMETERS)[0]
+    p["gear_gain"] = c.motor.gear_gain_m_per_rad
+    p["torque_constant"] = c.motor.torque_constant_Nm_per_A
+    p["inertia"] = c.motor.inertia_kg_m2
+    p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
+    p["load_friction"] = c.friction.load_m_per_rad
+    p["offset_friction"] = c.friction.offset_Nm
+    p["presliding_angle"] = c.friction.presliding_angle_rad
+    p["curve"] = curve_at(c.stiffness.curves, c.pad_thickness_mm)
+    p["relaxation_time"] = c.stiffness.relaxation_time_s
+    p["maximum_force"] = c.stiffness.maximum_force_N
+    p["clearance"] = c.contact.clearance_rad
+    p["clearance_sigma"] = c.contact.clearance_sigma_rad
+    p["contact_walk"] = c.contact.walk_rad_per_sqrt_s
+    p["stiffness_sigma"] = c.noise.stiffness_N
+    p["stiffness_relative_sigma"] = c.noise.stiffness_relative
+    p["stiffness_correlation_time"] = c.noise.stiffness_correlation_s
+    p["current_sigma"] = c.noise.current_A
+    p["current_correlation_time"] = c.noise.current_correlation_s
+    p["speed_sigma"] = c.noise.speed_rad_per_s
+    p["presliding_sigma"] = c.noise.presliding
+    p["torque_relative_sigma"] = c.noise.torque_relative
+    pad, disc, t = c.thermal.pad, c.thermal.disc, p["thermal"]
+    t["conductivity"] = pad.conductivity_W_per_mK
+    t["conductivity_rise"] = pad.conductivity_rise_per_K
+    t["density"] = pad.density_kg_per_m3
+    t["specific_heat"] = pad.specific_heat_J_per_kgK
+    t["specific_heat_rise"] = pad.specific_heat_rise_per_K
+    t["area"] = pad.area_m2
+    t["thickness"] = 1e-3 * c.pad_thickness_mm
+    t["node_position"] = mesh(1e-3 * c.pad_thickness_mm)
+    t["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
+    t["contact_conductance"] = pad.contact_conductance_W_per_m2K
+    t["gap_conductance"] = pad.gap_conductance_W_per_m2K
+    t["backplate_conductance"] = pad.backplate_conductance_W_per_m2K
+    t["disc_heat_capacity"] = disc.heat_capacity_J_per_K
+    t["disc_cooling"] = disc.cooling_W_per_K
+    t["disc_cooling_per_speed"] = disc.cooling_per_speed_J_per_rad_K
+    t["disc_radiating_area"] = disc.radiating_area_m2
+    t["effective_radius"] = disc.effective_radius_m
+    t["friction_force"] = c.thermal.friction.force_N
+    t["friction_speed"] = c.thermal.friction.disc_speed_rad_per_s
+    t["friction_temperature"] = c.thermal.friction.surface_temperature_C
+    t["friction_coefficient"] = c.thermal.friction.coefficient
+    t["softening"] = c.thermal.softening.per_K
+    t["softening_history"] = c.thermal.softening.history_per_K
+    t["history_time"] = c.thermal.softening.history_time_s
+    t["sigma"] = c.thermal.sigma_K
+    for name, values in c.effects.items():
+        for key, value in values.items():
+            p["effects"][name][key] = value
+    return p

@@ -1,0 +1,32 @@
+"""A second, slower relaxation: part of the pads' force settles after the first time constant is over."""
+
+import numpy as np
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import first_order_lag
+
+STATE = np.dtype([("force", "f8"), ("before", "f8")], align=True)
+
+
+@njit
+def term(p, s, static_force, dt):
+    """Force in N that is still to come: share of the static force that lags with the second time constant."""
+    if p.share == 0.0:
+        return 0.0
+    s.force = first_order_lag(s.force, s.before, static_force, dt, p.time_constant_s)
+    s.before = static_force
+    return p.share * (s.force - static_force)
+
+
+EFFECT = Effect(
+    name="second_relaxation",
+    path="stiffness",
+    parameters=(
+        Parameter("share", "1", -0.5, 0.5, 0.1, "share of the static force that follows slowly"),
+        Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant"),
+    ),
+    equation="F_r = w (v − F_s),  τ₂ dv/dt + v = F_s",
+    source="standard linear solid; Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 1",
+    state=STATE,
+)

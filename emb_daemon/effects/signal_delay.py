@@ -1,0 +1,19 @@
+"""Time by which the resolver's angle is older than the force it is compared with."""
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+
+
+@njit
+def term(p, speed):
+    """Angle in rad by which the motor has gone on."""
+    return p.delay_s * speed
+
+
+EFFECT = Effect(
+    name="signal_delay",
+    path="stiffness",
+    parameters=(Parameter("delay_s", "s", -0.01, 0.01, 0.001, "age of the angle"),),
+    equation="θ → θ + d ω",
+    source="first-order hold of a delayed sample",
+)

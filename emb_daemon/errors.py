@@ -1,0 +1,13 @@
+"""The error that a user sees: one line that says where and what was expected."""
+
+
+class InputError(Exception):
+    """Unusable input (file, key, frame or argument). The command line prints it and ends with exit status 2."""
+
+
+class InputErrors(InputError):
+    """Several faults found in one pass over the same input, one per line."""
+
+    def __init__(self, faults: list[str]):
+        super().__init__("\n".join(faults))
+        self.faults = faults

@@ -1,0 +1,219 @@
+"""Records that the estimator reads and writes: parameters, state, sample, estimate. SI units; temperatures in degC."""
+
+import numpy as np
+
+from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
+from emb_daemon.models.fusion import STATES
+from emb_daemon.models.thermal import CHAIN, NODES, mesh
+
+#: What the estimate rests on (wire: ForceSource).
+FUSED, STIFFNESS_ONLY, TORQUE_ONLY, PREDICTED, INVALID = 0, 1, 2, 3, 15
+SOURCES = {FUSED: "fused", STIFFNESS_ONLY: "stiffness", TORQUE_ONLY: "torque", PREDICTED: "predicted", INVALID: "invalid"}
+
+#: Mode of a corner (wire: Mode).
+INIT, RUNNING, ADAPTING, DEGRADED, FAULT = range(5)
+MODES = ("init", "running", "adapting", "degraded", "fault")
+
+#: Bits of DegradedReasons, as the DBC documents them.
+RESOLVER_LOST = 1 << 0
+CURRENT_LOST = 1 << 1
+THERMOCOUPLE_LOST = 1 << 2
+WHEEL_SPEED_LOST = 1 << 3
+WHEEL_PULSE_LOST = 1 << 4
+VEHICLE_STATUS_LOST = 1 << 5
+E2E_ERROR = 1 << 6
+OUT_OF_RANGE = 1 << 7
+STUCK = 1 << 8
+PATHS_DISAGREE = 1 << 9
+CONTACT_UNCERTAIN = 1 << 10
+TEMPERATURE_UNCERTAIN = 1 << 11
+BUS_DISTURBED = 1 << 12
+DEADLINE_MISSED = 1 << 13
+OUTSIDE_RANGE = 1 << 14
+SECOND_SENDER = 1 << 15
+REASONS = (
+    "resolver lost", "current lost", "thermocouple lost", "wheel speed lost", "wheel pulse lost", "vehicle status lost",
+    "E2E error", "signal out of range", "signal stuck", "paths disagree", "contact angle uncertain",
+    "pad temperature uncertain", "bus disturbed", "deadline missed", "outside calibrated range", "second sender",
+)  # fmt: skip
+
+CURVE_TERMS = 5
+FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID = 6, 6, 8
+
+#: Parameters of pad and disc heat (models/thermal.py). Conductances in W/(m^2 K), areas in m^2.
+THERMAL = np.dtype(
+    [
+        ("conductivity", "f8"),
+        ("conductivity_rise", "f8"),
+        ("density", "f8"),
+        ("specific_heat", "f8"),
+        ("specific_heat_rise", "f8"),
+        ("area", "f8"),
+        ("thickness", "f8"),
+        ("node_position", "f8", (NODES,)),
+        ("heat_share", "f8", (2,)),
+        ("contact_conductance", "f8"),
+        ("gap_conductance", "f8"),
+        ("backplate_conductance", "f8"),
+        ("disc_heat_capacity", "f8"),
+        ("disc_cooling", "f8"),
+        ("disc_cooling_per_speed", "f8"),
+        ("disc_radiating_area", "f8"),
+        ("effective_radius", "f8"),
+        ("friction_force", "f8", (FORCE_GRID,)),
+        ("friction_speed", "f8", (SPEED_GRID,)),
+        ("friction_temperature", "f8", (TEMPERATURE_GRID,)),
+        ("friction_coefficient", "f8", (FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID)),
+        ("softening", "f8"),
+        ("softening_history", "f8"),
+        ("history_time", "f8"),
+        ("sigma", "f8"),
+    ],
+    align=True,
+)
+
+#: Parameters of one corner. ``*_sigma`` are standard deviations; ``gear_gain`` and ``load_friction`` in m/rad.
+PARAMETERS = np.dtype(
+    [
+        ("gear_gain", "f8"),
+        ("torque_constant", "f8"),
+        ("inertia", "f8"),
+        ("load_friction", "f8"),
+        ("offset_friction", "f8"),
+        ("presliding_angle", "f8"),
+        ("curve", "f8", (CURVE_TERMS,)),
+        ("relaxation_time", "f8"),
+        ("clearance", "f8"),
+        ("clearance_sigma", "f8"),
+        ("maximum_force", "f8"),
+        ("maximum_speed", "f8"),
+        ("stiffness_sigma", "f8"),
+        ("stiffness_relative_sigma", "f8"),
+        ("stiffness_correlation_time", "f8"),
+        ("current_sigma", "f8"),
+        ("current_correlation_time", "f8"),
+        ("speed_sigma", "f8"),
+        ("presliding_sigma", "f8"),
+        ("torque_relative_sigma", "f8"),
+        ("contact_walk", "f8"),
+        ("thermal", THERMAL),
+        ("effects", EFFECT_PARAMETERS),
+    ],
+    align=True,
+)
+
+SAMPLE = np.dtype(
+    [
+        ("dt", "f8"),
+        ("angle", "f8"),
+        ("speed", "f8"),
+        ("current_q", "f8"),
+        ("inner_backplate", "f8"),
+        ("outer_backplate", "f8"),
+        ("caliper", "f8"),
+        ("ambient", "f8"),
+        ("wheel_speed", "f8"),
+        ("wheel_pulse", "f8"),
+        ("vehicle_speed", "f8"),
+        ("park_brake", "f8"),
+        ("brake_request", "f8"),
+        ("brake_torque", "f8"),
+        ("has_current", "?"),
+        ("has_thermocouple", "?"),
+        ("has_wheel_speed", "?"),
+        ("has_wheel_pulse", "?"),
+        ("has_status", "?"),
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("started", "?"),
+        ("angle", "f8"),
+        ("speed", "f8"),
+        ("contact_angle", "f8"),
+        # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
+        ("past_contact", "f8"),
+        ("drive", "f8"),
+        ("drive_slope", "f8"),
+        ("force", "f8"),
+        ("slope", "f8"),
+        # Torque path.
+        ("friction_state", "f8"),
+        ("friction_variance", "f8"),
+        ("torque_age", "f8"),
+        ("balance", "f8"),
+        ("leverage", "f8"),
+        # Fusion.
+        ("error", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        ("sensitivity", "f8", (STATES,)),
+        ("gain", "f8", (STATES,)),
+        # Heat.
+        ("pads", "f8", (2, NODES)),
+        ("disc", "f8"),
+        ("history", "f8"),
+        ("temperature_known", "?"),
+        ("work", "f8", (4, CHAIN)),
+        ("effects", EFFECT_STATES),
+        # Last answer, which predictions start from.
+        ("fused", "f8"),
+        ("fused_sigma", "f8"),
+        ("rate", "f8"),
+    ],
+    align=True,
+)
+
+DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
+
+ESTIMATE = np.dtype(
+    [
+        ("time_ns", "i8"),
+        ("cycle", "i8"),
+        ("elapsed_cycles", "i8"),
+        ("age_cycles", "i8"),
+        ("corner", "i8"),
+        ("counter", "i8"),
+        ("mode", "i8"),
+        ("source", "i8"),
+        ("reasons", "i8"),
+        ("is_sample", "?"),
+        ("force", "f8"),
+        ("sigma", "f8"),
+        ("stiffness_force", "f8"),
+        ("stiffness_sigma", "f8"),
+        ("torque_force", "f8"),
+        ("torque_sigma", "f8"),
+        ("ml_force", "f8"),
+        ("contact_angle", "f8"),
+        ("contact_sigma", "f8"),
+        ("stiffness_factor", "f8"),
+        ("innovation", "f8"),
+        ("innovation_sigma", "f8"),
+        ("surface", "f8", (2,)),
+        ("mean", "f8", (2,)),
+        ("depth", "f8", (2, len(DEPTHS_M))),
+        ("disc", "f8"),
+    ],
+    align=True,
+)
+
+
+def new_state(count: int = 1) -> np.ndarray:
+    """States of estimators that have seen nothing."""
+    return np.zeros(count, STATE)
+
+
+def unit_parameters() -> np.void:
+    """Parameters that stand for no brake but keep every expression finite."""
+    p = np.zeros(1, PARAMETERS)[0]
+    for record in (p, p["thermal"]):
+        for name in record.dtype.names:
+            if record.dtype[name] == np.float64:
+                record[name] = 1.0
+    thermal = p["thermal"]
+    thermal["node_position"] = mesh(1.0)
+    for grid in ("friction_force", "friction_speed", "friction_temperature"):
+        thermal[grid] = np.arange(len(thermal[grid]))
+    return p

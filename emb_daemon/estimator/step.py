@@ -1,0 +1,247 @@
+"""One step of one corner: what runs in a tick, on one screen.
+
+`step` is pure but for the state it is given. The daemon, replay, identify and diagnose all call it and nothing else
+computes a clamp force.
+"""
+
+from math import exp, sqrt
+
+import numpy as np
+
+from emb_daemon.effects import second_relaxation, signal_delay, stiffness_hysteresis
+from emb_daemon.estimator.records import (
+    CONTACT_UNCERTAIN,
+    DEPTHS_M,
+    FUSED,
+    INIT,
+    INVALID,
+    OUTSIDE_RANGE,
+    PREDICTED,
+    RUNNING,
+    STIFFNESS_ONLY,
+    TEMPERATURE_UNCERTAIN,
+)
+from emb_daemon.jit import njit
+from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
+from emb_daemon.models.thermal import (
+    NODES,
+    at_depth,
+    friction_power,
+    heat_step,
+    mean_temperature,
+    stiffness_factor,
+)
+from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
+
+#: Clamp force from which pads and disc exchange heat by contact, N.
+_TOUCHING_N = 200.0
+#: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
+_DISSOLVING_PER_S = 0.05
+#: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
+_SELF_LOCKING = 0.2
+#: Variance that the torque path's relative error gains, 1/s: friction changes over months.
+_TORQUE_GAIN_WALK = 1e-9
+
+
+@njit
+def _start(s, p, m):
+    s.started = True
+    s.angle = m.angle
+    s.speed = m.speed
+    s.contact_angle = m.angle + p.clearance
+    s.past_contact = -p.clearance
+    s.friction_variance = 1.0
+    s.torque_age = 1e9
+    s.covariance[:, :] = 0.0
+    s.covariance[0, 0] = 1.0
+    s.covariance[1, 1] = p.clearance_sigma * p.clearance_sigma
+    s.covariance[2, 2] = p.torque_relative_sigma * p.torque_relative_sigma
+    s.covariance[3, 3] = (p.torque_constant * p.current_sigma) ** 2
+    s.balance = np.nan
+
+
+@njit
+def _heat(s, p, m):
+    """Pads and disc up to this sample, heated by what the last estimate says; returns the stiffness factor."""
+    t = p.thermal
+    if not s.temperature_known:
+        if not m.has_thermocouple:
+            return 1.0
+        # At rest long enough for a start, the pads lie between their backing plates and the disc, which takes their mean.
+        s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
+        for node in range(NODES):
+            share = t.node_position[node] / t.thickness
+            s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
+            s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
+        s.history = 0.5 * (s.pads[0].mean() + s.pads[1].mean()) - (m.ambient if m.has_status else s.disc)
+        s.temperature_known = True
+    ambient = m.ambient if m.has_status else s.disc
+    if m.dt > 0.0:
+        wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
+        braking = s.fused > _TOUCHING_N
+        power = 0.0
+        if braking:
+            if np.isnan(m.brake_torque):
+                power = friction_power(t, s.fused, wheel_speed, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
+            else:
+                power = max(m.brake_torque, 0.0) * wheel_speed
+        # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
+        inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
+        outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
+        s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, braking, wheel_speed, m.dt, s.work)
+    positions = t.node_position
+    rise = 0.5 * (mean_temperature(s.pads[0], positions) + mean_temperature(s.pads[1], positions)) - ambient
+    if t.history_time > 0.0:
+        s.history += (1.0 - exp(-m.dt / t.history_time)) * (rise - s.history)
+    return stiffness_factor(t, rise, s.history)
+
+
+@njit
+def _stiffness(s, p, m, factor):
+    """Stiffness path: advances the dynamic force and its slope."""
+    e, state = p.effects, s.effects
+    angle = m.angle + signal_delay.term(e.signal_delay, m.speed)
+    x = angle - s.contact_angle
+    static, slope = characteristic_curve(x, p.curve)
+    travel = max(x, 0.0) - max(s.past_contact, 0.0)
+    s.past_contact = x
+    drive = factor * static * (1.0 + stiffness_hysteresis.term(e.stiffness_hysteresis, state.stiffness_hysteresis, travel))
+    drive += second_relaxation.term(e.second_relaxation, state.second_relaxation, drive, m.dt)
+    s.force = first_order_lag(s.force, s.drive, drive, m.dt, p.relaxation_time)
+    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, m.dt, p.relaxation_time)
+    s.drive = drive
+    s.drive_slope = factor * slope
+
+
+@njit
+def _torque(s, p, m):
+    """Torque path over the cycle that ends at this sample.
+
+    Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
+    the torque is NaN where it says nothing.
+    """
+    travel = m.angle - s.angle
+    s.friction_state, mean, s.friction_variance = friction_state(
+        s.friction_state, s.friction_variance, travel, p.presliding_angle, _DISSOLVING_PER_S, m.dt
+    )
+    leverage = p.gear_gain + p.load_friction * mean
+    if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain:
+        return np.nan, leverage, 1.0
+    torque = unexplained_torque(p.torque_constant * m.current_q, p.inertia, m.speed - s.speed, m.dt, p.offset_friction, mean)
+    turning = p.presliding_sigma * (1.0 - mean * mean)
+    return torque, leverage, s.friction_variance + turning * turning
+
+
+@njit
+def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
+    """Kalman filter over the errors of both paths; fills force, sigma and innovation of ``out``."""
+    x, P, h = s.error, s.covariance, s.sensitivity
+    relative = p.stiffness_relative_sigma * s.force
+    spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
+    current_torque = p.torque_constant * p.current_sigma
+    decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
+    walked = p.contact_walk * p.contact_walk * m.dt
+    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque)
+    h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
+    out.stiffness_sigma = sqrt(variance_along(P, h))
+    out.innovation = out.innovation_sigma = np.nan
+    mean_force = 0.5 * (force_before + s.force)
+    friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
+    speed_torque = p.inertia * p.speed_sigma / m.dt if m.dt > 0.0 else 0.0
+    white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance
+    gain_error = p.torque_relative_sigma * mean_force
+    out.torque_sigma = sqrt((white + current_torque * current_torque) / (leverage * leverage) + gain_error * gain_error)
+    if np.isfinite(torque):
+        h[0], h[1], h[2], h[3] = leverage * spread, -leverage * s.slope, leverage * mean_force, 1.0
+        innovation = torque - leverage * mean_force
+        for i in range(STATES):
+            innovation -= h[i] * x[i]
+        out.innovation = innovation / leverage
+        out.innovation_sigma = sqrt(update_errors(x, P, s.gain, innovation, h, white)) / leverage
+        s.torque_age = 0.0
+    else:
+        s.torque_age += m.dt
+    # What was learned of the contact angle moves the contact angle itself: the curve is not straight.
+    s.contact_angle += x[1]
+    s.force -= s.slope * x[1]
+    x[1] = 0.0
+    h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
+    out.force = max(s.force + spread * x[0], 0.0)
+    out.sigma = sqrt(variance_along(P, h))
+
+
+@njit
+def step(s, p, m, out):
+    """Advance one corner by one resolver sample.
+
+    Args:
+        s: STATE record, changed in place.
+        p: PARAMETERS record.
+        m: SAMPLE record; ``m.dt`` seconds since the last one, 0 at the first.
+        out: ESTIMATE record to fill; the caller owns time, corner, counter and cycle.
+    """
+    if not s.started:
+        _start(s, p, m)
+    factor = _heat(s, p, m)
+    force_before = s.force
+    _stiffness(s, p, m, factor)
+    torque, leverage, friction_variance = _torque(s, p, m)
+    _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
+    out.stiffness_force = s.force
+    # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
+    out.torque_force, out.ml_force = np.nan, s.force
+    if np.isfinite(torque):
+        paired = np.isfinite(s.balance)
+        force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
+        out.torque_force = max(force, 0.0)
+        out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
+    s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
+    s.fused, s.fused_sigma = out.force, out.sigma
+    out.contact_angle = s.contact_angle
+    out.contact_sigma = sqrt(s.covariance[1, 1])
+    out.stiffness_factor = factor
+    _temperatures(s, p, out)
+    out.mode = RUNNING
+    out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
+    reasons = 0
+    if not s.temperature_known:
+        reasons |= TEMPERATURE_UNCERTAIN
+    if out.contact_sigma > 0.5:
+        reasons |= CONTACT_UNCERTAIN
+    if out.force > p.maximum_force or abs(m.speed) > 1.2 * p.maximum_speed:
+        reasons |= OUTSIDE_RANGE
+    out.reasons = reasons
+    if not (np.isfinite(out.force) and np.isfinite(out.sigma)):
+        out.source = INVALID
+
+
+@njit
+def _temperatures(s, p, out):
+    positions = p.thermal.node_position
+    for side in range(2):
+        pad = s.pads[side]
+        known = s.temperature_known
+        out.surface[side] = pad[0] if known else np.nan
+        out.mean[side] = mean_temperature(pad, positions) if known else np.nan
+        for index in range(len(DEPTHS_M)):
+            out.depth[side, index] = at_depth(pad, positions, DEPTHS_M[index]) if known else np.nan
+    out.disc = s.disc if s.temperature_known else np.nan
+
+
+@njit
+def predict(s, p, age, out):
+    """What can be said ``age`` seconds after the last sample: the last force, and how far it may have moved since."""
+    out.mode = RUNNING if s.started else INIT
+    out.source = PREDICTED if s.started else INVALID
+    out.reasons = 0
+    # The motor cannot have gone faster than its limit, and no further than full clamp or full release.
+    moved = min(p.maximum_speed * age * s.slope, p.maximum_force)
+    out.force = s.fused
+    out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
+    out.stiffness_force = out.torque_force = out.ml_force = np.nan
+    out.contact_angle = s.contact_angle
+    out.contact_sigma = sqrt(s.covariance[1, 1])
+    out.stiffness_factor = 1.0
+    out.innovation = out.innovation_sigma = np.nan
+    _temperatures(s, p, out)

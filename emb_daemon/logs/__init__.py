@@ -1,0 +1,1 @@
+"""Log files: frames and columns in, tables and frames out."""

@@ -1,0 +1,135 @@
+"""can-utils' log format, read in bulk: ``(seconds.fraction) interface id#data [flags]``."""
+
+import numpy as np
+
+from emb_daemon.jit import njit
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITTED
+
+_SPACE, _NEWLINE, _HASH = ord(" "), ord("\n"), ord("#")
+
+
+def _hex_values() -> np.ndarray:
+    values = np.full(256, 255, np.uint8)
+    for digit, characters in enumerate(zip("0123456789abcdef", "0123456789ABCDEF", strict=True)):
+        for character in characters:
+            values[ord(character)] = digit
+    return values
+
+
+_HEX = _hex_values()
+
+
+@njit
+def _parse_line(text, start, stop, frame):
+    """Fill ``frame`` from ``text[start:stop]``; False if the line is malformed."""
+    at = start
+    if text[at] != 40:  # (
+        return False
+    at += 1
+    whole, fraction, digits = np.int64(0), np.int64(0), 0
+    while at < stop and 48 <= text[at] <= 57:
+        whole = whole * 10 + (text[at] - 48)
+        at += 1
+    if at < stop and text[at] == 46:  # .
+        at += 1
+        while at < stop and 48 <= text[at] <= 57:
+            if digits < 9:
+                fraction = fraction * 10 + (text[at] - 48)
+                digits += 1
+            at += 1
+    if at >= stop or text[at] != 41 or digits == 0:  # )
+        return False
+    while digits < 9:
+        fraction *= 10
+        digits += 1
+    frame.time_ns = whole * 1_000_000_000 + fraction
+    at += 1
+    if at >= stop or text[at] != _SPACE:
+        return False
+    at += 1
+    name = at
+    while at < stop and text[at] != _SPACE:
+        at += 1
+    if at == name or at >= stop:
+        return False
+    at += 1
+    can_id, width = np.int64(0), 0
+    while at < stop and _HEX[text[at]] != 255:
+        can_id = can_id * 16 + _HEX[text[at]]
+        width += 1
+        at += 1
+    if (width != 3 and width != 8) or at >= stop or text[at] != _HASH:
+        return False
+    flags = 0
+    if width == 8:
+        flags |= ERROR if can_id & 0x2000_0000 else EXTENDED
+        can_id &= 0x1FFF_FFFF
+    at += 1
+    data, length = np.uint64(0), 0
+    if at < stop and text[at] == _HASH:
+        flags |= FD
+        at += 2
+    if at < stop and (text[at] == 82 or text[at] == 114):  # R, remote request with an optional length
+        flags |= REMOTE
+        at += 1
+        while at < stop and text[at] != _SPACE:
+            at += 1
+    else:
+        while at + 1 < stop and _HEX[text[at]] != 255:
+            low = _HEX[text[at + 1]]
+            if low == 255:
+                return False
+            if length < 8:
+                data |= np.uint64(_HEX[text[at]] * 16 + low) << np.uint64(8 * length)
+            length += 1
+            at += 2
+    if at < stop and text[at] == _SPACE:
+        at += 1
+        if at < stop and text[at] == 84:  # T
+            flags |= TRANSMITTED
+        while at < stop and text[at] != _SPACE:
+            at += 1
+    if at < stop or (length > 8 and not flags & FD):
+        return False
+    frame.can_id = can_id
+    frame.data = data
+    frame.length = length
+    frame.flags = flags
+    return True
+
+
+@njit
+def _parse(text, frames):
+    """Returns (frames filled, line number of the first malformed line or 0, whether that line is an unfinished last one)."""
+    count, line, start, size = 0, 0, 0, len(text)
+    while start < size:
+        stop = start
+        while stop < size and text[stop] != _NEWLINE:
+            stop += 1
+        line += 1
+        end = stop - 1 if stop > start and text[stop - 1] == 13 else stop
+        if end > start:
+            if not _parse_line(text, start, end, frames[count]):
+                return count, line, stop == size
+            count += 1
+        start = stop + 1
+    return count, 0, False
+
+
+def parse_candump(text: bytes) -> tuple[np.ndarray, int, bool]:
+    """FRAME array of a whole candump log, the number of the first malformed line (0: none) and whether that line is the
+    last one and lacks its newline, as a log does whose writer was killed."""
+    array = np.frombuffer(text, np.uint8)
+    frames = np.zeros(text.count(b"\n") + 1, FRAME)
+    count, bad_line, unfinished = _parse(array, frames)
+    return frames[:count], bad_line, unfinished
+
+
+def format_candump(frames: np.ndarray, interface: str = "can0") -> str:
+    """The same format back; classic data frames only, as the daemon sends them."""
+    lines = []
+    for frame in frames:
+        seconds, fraction = divmod(int(frame["time_ns"]), 1_000_000_000)
+        payload = int(frame["data"]).to_bytes(8, "little")[: frame["length"]].hex().upper()
+        lines.append(f"({seconds}.{fraction // 1000:06d}) {interface} {int(frame['can_id']):03X}#{payload}\n")
+    return "".join(lines)

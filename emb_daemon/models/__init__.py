@@ -1,0 +1,1 @@
+"""The physical models, each a short file of compiled functions in SI units."""

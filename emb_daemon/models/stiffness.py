@@ -1,0 +1,42 @@
+"""Dynamic stiffness: clamp force from the motor angle.
+
+Thesis 2.1 (characteristic curve), 3.3.2 and 3.4 (first-order dynamics), discretised exactly for the time that passed
+instead of with the thesis's backward difference, so that the calibration holds the time constant and not a coefficient
+that belongs to one sample time.
+"""
+
+from math import exp
+
+from emb_daemon.jit import njit
+
+
+@njit
+def characteristic_curve(x, coefficients):
+    """Static clamp force (N) and its slope (N/rad) at ``x`` rad past contact; zero in the clearance.
+
+    ``coefficients[n]`` in N/rad^(n+1): the thesis's A0, A1, A2 of F = A0 x + A1 x^2 + A2 x^3.
+    """
+    if x <= 0.0:
+        return 0.0, 0.0
+    force = slope = 0.0
+    for order in range(len(coefficients) - 1, -1, -1):
+        slope = slope * x + (order + 1) * coefficients[order]
+        force = (force + coefficients[order]) * x
+    return force, slope
+
+
+@njit
+def first_order_lag(state, before, now, dt, time_constant):
+    """State after ``dt`` of tau dy/dt + y = u, with u running straight from ``before`` to ``now``: exact for such inputs.
+
+    A time constant of zero lets ``now`` through.
+    """
+    if time_constant <= 0.0:
+        return now
+    if dt <= 0.0:
+        return state
+    ratio = dt / time_constant
+    decay = exp(-ratio)
+    # Mean of the decaying weight over the interval; the series avoids cancellation for short intervals.
+    weight = (1.0 - decay) / ratio if ratio > 1e-6 else 1.0 - 0.5 * ratio
+    return decay * state + (weight - decay) * before + (1.0 - weight) * now

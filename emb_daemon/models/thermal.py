@@ -1,0 +1,194 @@
+"""Heat in the pads and the disc, one dimension, implicit and conservative.
+
+Thesis 7.4 to 7.6 and 8.1 to 8.2. The thesis marches each pad explicitly with a measured or assumed friction surface; here
+the backing plates, both pads and the disc form one chain
+
+    backing plate (measured) | inner pad | disc | outer pad | backing plate (measured)
+
+solved in one tridiagonal sweep, stable for any time step. Nodes stand on the friction surface (0) and the backing plate
+(last); each owns the material up to half way to its neighbours and heat crosses between two nodes once, so that what one
+loses the other gains, for any k(T) and C(T).
+"""
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+STEFAN_BOLTZMANN = 5.670374419e-8
+KELVIN = 273.15
+REFERENCE_C = 20.0
+
+#: Nodes through one pad. `mesh` puts them densest at the friction surface.
+NODES = 13
+CHAIN = 2 * NODES + 1
+_GROWTH = 1.32
+_LONGEST_S = 0.5
+
+
+def mesh(thickness: float) -> np.ndarray:
+    """Node positions (m, shape (NODES,)) from the friction surface to the backing plate, spacing growing by a third."""
+    steps = _GROWTH ** np.minimum(np.arange(NODES - 1), 8)
+    return np.concatenate([[0.0], np.cumsum(steps / steps.sum())]) * thickness
+
+
+@njit
+def at_depth(temperatures, positions, depth):
+    """Temperature at ``depth`` m from the friction surface, linear between nodes; NaN beyond the pad."""
+    if depth > positions[-1] + 1e-9:
+        return np.nan
+    node = 0
+    while node < len(positions) - 2 and positions[node + 1] < depth:
+        node += 1
+    share = (depth - positions[node]) / (positions[node + 1] - positions[node])
+    return temperatures[node] + share * (temperatures[node + 1] - temperatures[node])
+
+
+@njit
+def mean_temperature(temperatures, positions):
+    """Mean over the thickness."""
+    total = 0.0
+    for node in range(len(positions) - 1):
+        total += 0.5 * (temperatures[node] + temperatures[node + 1]) * (positions[node + 1] - positions[node])
+    return total / positions[-1]
+
+
+@njit
+def conductance(p, below, above, distance):
+    """W/(m^2 K) between two nodes at temperatures ``below`` and ``above``, for k = k0 (1 + k1 (T - 20 degC))."""
+    return p.conductivity * (1.0 + p.conductivity_rise * (0.5 * (below + above) - REFERENCE_C)) / distance
+
+
+@njit
+def disc_loss(p, disc, ambient, wheel_speed):
+    """W/K from disc to surroundings: convection rising with wheel speed (rad/s; thesis 8.2), and radiation."""
+    hot, cold = disc + KELVIN, ambient + KELVIN
+    radiation = p.disc_radiating_area * STEFAN_BOLTZMANN * (hot + cold) * (hot * hot + cold * cold)
+    return p.disc_cooling + p.disc_cooling_per_speed * wheel_speed + radiation
+
+
+@njit
+def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
+    """One implicit step of ``dt`` seconds; changes ``pads`` (2, NODES) and returns the new disc temperature."""
+    lower, diagonal, upper, right = work[0], work[1], work[2], work[3]
+    positions = p.node_position
+    contact = p.contact_conductance if braking else p.gap_conductance
+    heat_share = p.heat_share
+    for side in range(2):
+        pad = pads[side]
+        backplate = inner_backplate if side == 0 else outer_backplate
+        for node in range(NODES):
+            below = positions[node] - positions[node - 1] if node > 0 else 0.0
+            above = positions[node + 1] - positions[node] if node < NODES - 1 else 0.0
+            capacity = (
+                p.density
+                * p.specific_heat
+                * (1.0 + p.specific_heat_rise * (pad[node] - REFERENCE_C))
+                * 0.5
+                * (below + above)
+                / dt
+            )
+            diag, rhs = capacity, capacity * pad[node]
+            if node > 0:
+                to_disc = conductance(p, pad[node - 1], pad[node], below)
+            else:
+                to_disc = contact
+                rhs += heat_share[side] * power / p.area
+            diag += to_disc
+            to_plate = 0.0
+            if node < NODES - 1:
+                to_plate = conductance(p, pad[node], pad[node + 1], above)
+                diag += to_plate
+            else:
+                diag += p.backplate_conductance
+                rhs += p.backplate_conductance * backplate
+            # The chain runs from the inner backing plate over the disc (row NODES) to the outer one.
+            row = NODES - 1 - node if side == 0 else NODES + 1 + node
+            diagonal[row] = diag
+            right[row] = rhs
+            lower[row] = -to_plate if side == 0 else -to_disc
+            upper[row] = -to_disc if side == 0 else -to_plate
+    loss = disc_loss(p, disc, ambient, wheel_speed) / p.area
+    storage = p.disc_heat_capacity / (p.area * dt)
+    diagonal[NODES] = storage + 2.0 * contact + loss
+    right[NODES] = storage * disc + loss * ambient + (1.0 - heat_share[0] - heat_share[1]) * power / p.area
+    lower[NODES] = upper[NODES] = -contact
+
+    for row in range(1, CHAIN):
+        factor = lower[row] / diagonal[row - 1]
+        diagonal[row] -= factor * upper[row - 1]
+        right[row] -= factor * right[row - 1]
+    right[CHAIN - 1] /= diagonal[CHAIN - 1]
+    for row in range(CHAIN - 2, -1, -1):
+        right[row] = (right[row] - upper[row] * right[row + 1]) / diagonal[row]
+    for node in range(NODES):
+        pads[0, node] = right[NODES - 1 - node]
+        pads[1, node] = right[NODES + 1 + node]
+    return right[NODES]
+
+
+@njit
+def heat_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
+    """Advance pads and disc by ``dt`` seconds.
+
+    Args:
+        p: THERMAL parameters record.
+        pads: temperatures (degC), shape (2, NODES): inner and outer pad, friction surface first; changed in place.
+        disc: disc temperature, degC.
+        inner_backplate, outer_backplate: measured, degC.
+        power: friction power of both pads, W.
+        work: scratch, shape (4, CHAIN).
+
+    Returns:
+        The new disc temperature.
+    """
+    parts = int(np.ceil(dt / _LONGEST_S - 1e-9))
+    for _ in range(parts):
+        disc = _chain_step(
+            p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt / parts, work
+        )
+    return disc
+
+
+@njit
+def friction_power(p, force, wheel_speed, surface):
+    """Friction power of both pads in W without a brake torque sensor (thesis 8.5).
+
+    2 mu r F w, the friction coefficient interpolated from a table over clamp force (N), disc speed (rad/s) and surface
+    temperature (degC); held at its edges, because a table knows nothing beyond them.
+    """
+    if force <= 0.0 or wheel_speed <= 0.0:
+        return 0.0
+    i, u = _cell(p.friction_force, force)
+    j, v = _cell(p.friction_speed, wheel_speed)
+    k, w = _cell(p.friction_temperature, surface)
+    friction = 0.0
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                share = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
+                friction += share * p.friction_coefficient[i + a, j + b, k + c]
+    return 2.0 * friction * p.effective_radius * force * wheel_speed
+
+
+@njit
+def _cell(grid, value):
+    """Lower index and share of the upper one, for a value held inside an ascending grid."""
+    last = len(grid) - 1
+    if value <= grid[0]:
+        return 0, 0.0
+    if value >= grid[last]:
+        return last - 1, 1.0
+    index = 0
+    while grid[index + 1] < value:
+        index += 1
+    return index, (value - grid[index]) / (grid[index + 1] - grid[index])
+
+
+@njit
+def stiffness_factor(p, rise, history):
+    """alpha: stiffness over that of the cold pads (thesis 8.4), from the mean pad temperature over ambient and its history.
+
+    ``rise`` K is the present mean; ``history`` K the same through a first-order lag, which forgets as the thesis's moving
+    window does but needs one number instead of thousands.
+    """
+    return max(1.0 - p.softening * rise - p.softening_history * history, 0.1)

@@ -1,0 +1,45 @@
+"""Torque balance: clamp force from motor torque, inertia and friction.
+
+Thesis 2.4 and 4.2: T_m = gamma F + J dw/dt + (mu F + eta) s. The thesis takes s = sgn of the angle difference; here s is a
+friction state that turns over within a presliding angle (Dahl, "A solid friction model", 1968), which also says what
+friction is while the motor stands still.
+"""
+
+from math import exp
+
+from emb_daemon.jit import njit
+
+
+@njit
+def friction_state(state, variance, travel, presliding_angle, dissolving_rate, dt):
+    """Friction state s in [-1, 1] after ``travel`` rad of sliding, its mean over the travel, and its variance.
+
+    Starts unknown (variance 1) and becomes known by sliding; at standstill vibration dissolves the memory at
+    ``dissolving_rate`` 1/s. ``presliding_angle`` rad is the travel over which s turns over.
+    """
+    distance = abs(travel)
+    variance = min(1.0, variance + dissolving_rate * dt)
+    if distance == 0.0:
+        return state, state, variance
+    direction = 1.0 if travel > 0.0 else -1.0
+    ratio = distance / presliding_angle
+    decay = exp(-ratio)
+    weight = (1.0 - decay) / ratio if ratio > 1e-6 else 1.0 - 0.5 * ratio
+    after = direction + (state - direction) * decay
+    mean = direction + (state - direction) * weight
+    return after, mean, variance * decay * decay
+
+
+@njit
+def unexplained_torque(motor_torque, inertia, speed_change, dt, offset_friction, friction_mean):
+    """Motor torque (N m) that inertia and the friction offset leave to the clamp force, mean over the cycle.
+
+    The current is a mean over the cycle, so the matching inertia term is J dw/dt between the samples that bound it.
+    """
+    return motor_torque - inertia * speed_change / dt - offset_friction * friction_mean
+
+
+@njit
+def torque_balance(torque, leverage):
+    """Clamp force in N from ``torque`` N m left to it and its ``leverage`` gamma + mu s in m/rad. Thesis 4-3."""
+    return torque / leverage

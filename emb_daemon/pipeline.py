@@ -1,0 +1,318 @@
+"""From frames to samples to estimates to frames: the path that the daemon and replay share.
+
+Everything here is driven by frames and by time as data. The daemon passes the frames it has drained and the time of its
+tick; replay passes a log. The same frames in the same order give the same payloads, because the sample time is counted in
+cycles of the resolver message (the Counter says how many passed) and jitter of arrival does not reach the estimator.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_daemon.estimator import records as r
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, STATE
+from emb_daemon.estimator.step import predict, step
+from emb_daemon.jit import njit
+from emb_daemon.wire import layout as wire
+from emb_daemon.wire.e2e import COUNTER_MODULO, protect
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import pack
+from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
+
+CYCLE_NS = 4_000_000
+CYCLE_S = 0.004
+#: A resolver sample waits this long for its current before it is answered without.
+_PAIRING_NS = CYCLE_NS // 2
+#: Without a resolver sample for this many cycles the daemon predicts, once a cycle.
+LATE_CYCLES = 3
+#: Deviation of arrival from the counter's clock up to which the counter is believed.
+_JITTER_NS = 2 * CYCLE_NS
+#: Age up to which a slow input still feeds the models, and ages from which its absence is reported.
+_USABLE_NS = 2_500_000_000
+_REPORTED_CYCLES = 25
+_REFUSED_NS = 1_000_000_000
+_OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
+
+CORNER = np.dtype(
+    [
+        ("estimator", STATE),
+        ("sample", SAMPLE),
+        ("started", "?"),
+        ("active", "?"),
+        ("pending", "i8"),
+        ("pending_ns", "i8"),
+        ("sample_ns", "i8"),
+        ("counter", "i8"),
+        ("cycle", "i8"),
+        ("announced", "i8"),
+        ("predicted", "i8"),
+    ],
+    align=True,
+)
+
+#: E2E counters of what is sent, by message and corner.
+TRANSMISSION = np.dtype([("counter", "i8", (4, 4))], align=True)
+
+
+class Buffers(NamedTuple):
+    """Everything a tick reads and writes, allocated once; see `Pipeline` for what each holds."""
+
+    layout: np.ndarray
+    parameters: np.ndarray
+    receptions: np.ndarray
+    corners: np.ndarray
+    disturbed: np.ndarray
+    estimates: np.ndarray
+    samples: np.ndarray
+
+
+class Pipeline:
+    """The state of one process and its buffers.
+
+    Args:
+        parameters: PARAMETERS array, shape (4,), one record for each corner FL, FR, RL, RR.
+        corners: names of the corners to estimate.
+        layout: LAYOUT array, shape (1,).
+        capacity: estimates that one call of `consume` can hold.
+        collect: keep the samples behind the estimates.
+    """
+
+    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096, collect=False):
+        self.corners = np.zeros(4, CORNER)
+        self.corners["active"] = [name in corners for name in wire.CORNERS]
+        self.corners["pending"] = -1
+        self.corners["sample"]["brake_torque"] = np.nan
+        self.estimates = np.zeros(capacity, ESTIMATE)
+        self.frames = np.zeros(4 * capacity, FRAME)
+        #: The SAMPLE behind each estimate, row by row, if ``collect``.
+        self.samples = np.zeros(capacity if collect else 0, SAMPLE)
+        #: Reason bits that the loop raises on every corner's estimates: what bus and clock know and frames do not.
+        self.disturbed = np.zeros(4, np.int64)
+        self.parameters = parameters
+        self.layout = wire.default_layout() if layout is None else layout
+        self.receptions = new_reception()
+        self.transmission = np.zeros(1, TRANSMISSION)
+        self._buffers = Buffers(
+            self.layout, parameters, self.receptions, self.corners, self.disturbed, self.estimates, self.samples
+        )
+
+    def begin(self, time_ns: int) -> None:
+        """State when listening began, so that silence can be told from the very start."""
+        self.corners["sample_ns"] = time_ns
+
+    def consume(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
+        """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the estimate buffer is nearly full.
+
+        Returns (index of the next frame, number of estimates in ``self.estimates``)."""
+        return _consume(self._buffers, frames, start, predictions)
+
+    def advance(self, time_ns: int) -> int:
+        """Answer what is overdue at ``time_ns``; returns the number of estimates in ``self.estimates``."""
+        return _advance(self._buffers, time_ns, True, 0)
+
+    def broadcast(self, count: int) -> np.ndarray:
+        """The frames that announce the first ``count`` estimates, in sending order."""
+        return self.frames[: _broadcast(self.estimates, count, self.transmission, self.layout, self.frames)]
+
+
+@njit
+def _consume(b, frames, start, predictions):
+    count = 0
+    # One frame gives at most two estimates a corner: one overdue, one its own; predictions check the room themselves.
+    while start < len(frames) and count + 8 < len(b.estimates):
+        frame = frames[start]
+        count = _advance(b, frame.time_ns, predictions, count)
+        if count + 8 >= len(b.estimates):
+            break
+        start += 1
+        slot, verdict = receive(frame, b.receptions, b.layout[0])
+        if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES == wire.THERMOCOUPLE:
+            continue
+        index = slot // wire.CORNER_MESSAGES
+        corner = b.corners[index]
+        if not corner.active:
+            continue
+        resolver = b.receptions[wire.CORNER_MESSAGES * index + wire.RESOLVER]
+        current = b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
+        if slot % wire.CORNER_MESSAGES == wire.RESOLVER:
+            if corner.pending >= 0:
+                count = _answer(b, index, False, count)
+            corner.pending = resolver.counter
+            corner.pending_ns = resolver.time_ns
+            corner.sample.angle = resolver.values[wire.MOTOR_ANGLE]
+            corner.sample.speed = resolver.values[wire.MOTOR_SPEED]
+        paired = current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
+        if corner.pending >= 0 and paired:
+            count = _answer(b, index, True, count)
+    return start, count
+
+
+@njit
+def _advance(b, time_ns, predictions, count):
+    for index in range(4):
+        corner = b.corners[index]
+        if not corner.active:
+            continue
+        if corner.pending >= 0 and time_ns - corner.pending_ns > _PAIRING_NS:
+            count = _answer(b, index, False, count)
+        while (
+            predictions
+            and time_ns - corner.sample_ns >= (LATE_CYCLES + corner.predicted) * CYCLE_NS
+            and count + 8 < len(b.estimates)
+        ):
+            age = LATE_CYCLES + corner.predicted
+            corner.predicted += 1
+            estimate = b.estimates[count]
+            count += 1
+            _head(estimate, index, corner, corner.sample_ns + age * CYCLE_NS, age)
+            predict(corner.estimator, b.parameters[index], age * CYCLE_S, estimate)
+            estimate.is_sample = False
+            _supervise(b, estimate, index, corner)
+    return count
+
+
+@njit
+def _cycles(counter, time_ns, corner):
+    """Cycles from the corner's last sample to this one, at least 1."""
+    elapsed = time_ns - corner.sample_ns
+    step = (counter - corner.counter) % COUNTER_MODULO
+    if step == 0:
+        step = COUNTER_MODULO
+    step += COUNTER_MODULO * max(0, round((elapsed / CYCLE_NS - step) / COUNTER_MODULO))
+    if abs(elapsed - step * CYCLE_NS) <= _JITTER_NS:
+        return step
+    return max(1, round(elapsed / CYCLE_NS))
+
+
+@njit
+def _head(estimate, index, corner, time_ns, age):
+    estimate.corner = index
+    estimate.time_ns = time_ns
+    estimate.counter = corner.counter if corner.started else 15
+    estimate.age_cycles = age
+    estimate.cycle = corner.cycle + age
+    estimate.elapsed_cycles = estimate.cycle - corner.announced
+    corner.announced = estimate.cycle
+
+
+@njit
+def _answer(b, index, with_current, count):
+    """Step the estimator with the pending resolver sample; returns the new count."""
+    corner = b.corners[index]
+    sample = corner.sample
+    base = wire.CORNER_MESSAGES * index
+    now = corner.pending_ns
+    cycles = _cycles(corner.pending, now, corner) if corner.started else 0
+    sample.dt = cycles * CYCLE_S
+    sample.has_current = with_current
+    sample.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
+    thermocouple = b.receptions[base + wire.THERMOCOUPLE]
+    sample.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
+    sample.inner_backplate = thermocouple.values[wire.INNER_BACKPLATE]
+    sample.outer_backplate = thermocouple.values[wire.OUTER_BACKPLATE]
+    sample.caliper = thermocouple.values[wire.CALIPER]
+    speed = b.receptions[wire.WHEEL_SPEED]
+    sample.has_wheel_speed = now - speed.time_ns < _USABLE_NS
+    sample.wheel_speed = speed.values[index]
+    pulse = b.receptions[wire.WHEEL_PULSE]
+    sample.has_wheel_pulse = now - pulse.time_ns < _USABLE_NS
+    sample.wheel_pulse = pulse.values[index]
+    status = b.receptions[wire.VEHICLE_STATUS]
+    sample.has_status = now - status.time_ns < _USABLE_NS
+    sample.park_brake = status.values[wire.PARK_BRAKE]
+    sample.brake_request = status.values[wire.BRAKE_REQUEST]
+    sample.ambient = status.values[wire.AMBIENT]
+    sample.vehicle_speed = status.values[wire.VEHICLE_SPEED]
+
+    corner.cycle += cycles
+    corner.started = True
+    corner.counter = corner.pending
+    corner.sample_ns = now
+    corner.predicted = 0
+    corner.pending = -1
+    estimate = b.estimates[count]
+    _head(estimate, index, corner, now, 0)
+    if len(b.samples):
+        b.samples[count] = sample
+    step(corner.estimator, b.parameters[index], sample, estimate)
+    estimate.is_sample = True
+    _supervise(b, estimate, index, corner)
+    return count + 1
+
+
+@njit
+def _supervise(b, estimate, index, corner):
+    """Add to an estimate the reasons that lie outside the estimator, and settle its mode."""
+    reasons = estimate.reasons | b.disturbed[index]
+    now = estimate.time_ns
+    base = wire.CORNER_MESSAGES * index
+    if estimate.age_cycles >= LATE_CYCLES:
+        reasons |= r.RESOLVER_LOST
+    if now - b.receptions[base + wire.CURRENT].time_ns >= LATE_CYCLES * CYCLE_NS:
+        reasons |= r.CURRENT_LOST
+    for slot, reason in (
+        (base + wire.THERMOCOUPLE, r.THERMOCOUPLE_LOST),
+        (wire.WHEEL_SPEED, r.WHEEL_SPEED_LOST),
+        (wire.WHEEL_PULSE, r.WHEEL_PULSE_LOST),
+        (wire.VEHICLE_STATUS, r.VEHICLE_STATUS_LOST),
+    ):
+        if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
+            reasons |= reason
+    for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
+        if now - b.receptions[slot].refused_ns < _REFUSED_NS:
+            reasons |= r.E2E_ERROR
+    estimate.reasons = reasons
+    if not corner.started:
+        estimate.mode = r.INIT
+    elif estimate.source == r.INVALID:
+        estimate.mode = r.FAULT
+    elif reasons and estimate.mode == r.RUNNING:
+        estimate.mode = r.DEGRADED
+
+
+@njit
+def _broadcast(estimates, count, transmission, layout, frames):
+    """Encode estimates; cycles that pass a message's period make it due. Returns the number of frames."""
+    wires, counters = layout[0], transmission[0].counter
+    values = np.zeros(wire.SENT_SIGNALS)
+    sent = 0
+    for number in range(count):
+        e = estimates[number]
+        for kind in range(4):
+            period = wires.sent_cycle_ns[kind] // CYCLE_NS
+            if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
+                continue
+            usable = e.source != r.INVALID and e.mode != r.INIT
+            status = _NOT_AVAILABLE if e.mode == r.INIT else _FAULT if not usable else _DEGRADED if e.reasons else _OK
+            if kind == wire.CLAMP_FORCE:
+                values[0] = 1e-3 * e.force
+                values[1] = 1e-3 * e.sigma if usable else np.inf
+                values[2] = e.counter
+                values[3] = e.source
+                values[4] = e.age_cycles * (CYCLE_NS // 1_000_000)
+            elif kind == wire.PAD_TEMP:
+                values[0], values[1] = e.surface[0], e.mean[0]
+                values[2], values[3] = e.surface[1], e.mean[1]
+                if np.isnan(e.surface[0]):
+                    status = _NOT_AVAILABLE
+            elif kind == wire.ESTIMATOR_STATUS:
+                values[0] = e.mode
+                values[1] = e.stiffness_factor
+                values[2] = e.contact_angle
+                values[3] = e.reasons
+            else:
+                values[:] = 0.0
+            payload = np.uint64(0)
+            for column in range(wires.sent_count[kind]):
+                payload |= pack(values[column], wires.sent[kind, column])
+            can_id = wires.sent_id[kind, e.corner]
+            counter = counters[kind, e.corner]
+            counters[kind, e.corner] = (counter + 1) % COUNTER_MODULO
+            frame = frames[sent]
+            sent += 1
+            frame.time_ns = e.time_ns
+            frame.can_id = can_id
+            frame.length = 8
+            frame.flags = 0
+            frame.data = protect(can_id, payload, counter, status)
+    return sent

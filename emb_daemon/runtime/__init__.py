@@ -1,0 +1,1 @@
+"""The running daemon: buses, real-time set-up, service manager, loop."""

@@ -1,0 +1,102 @@
+"""Any bus behind the same four calls: wait, drain, send, close."""
+
+import select
+import time
+from collections import deque
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.runtime.rawcan import open_socketcan
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
+
+
+class PythonCanBus:
+    """A bus that python-can drives, frame by frame; same interface as RawCanSocket."""
+
+    def __init__(self, bus):
+        self._bus = bus
+        self._early = deque()
+        self._frames = np.zeros(4096, FRAME)
+        self.dropped = self.unsent = 0
+        self.down = False
+        try:
+            self._fd = bus.fileno()
+        except NotImplementedError:
+            self._fd = -1
+
+    def wait(self, timeout_s: float) -> bool:
+        if timeout_s <= 0:
+            return False
+        if self._fd >= 0:
+            return bool(select.select([self._fd], [], [], timeout_s)[0])
+        message = self._bus.recv(timeout_s)
+        if message is not None:
+            self._early.append(message)
+        return message is not None
+
+    def drain(self) -> np.ndarray:
+        import can
+
+        count, now, offset = 0, time.monotonic_ns(), time.time_ns() - time.monotonic_ns()
+        while count < len(self._frames):
+            try:
+                message = self._early.popleft() if self._early else self._bus.recv(0)
+                self.down = False
+            except can.CanError:
+                self.down = True
+                break
+            if message is None:
+                break
+            frame = self._frames[count]
+            # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
+            stamp = round(message.timestamp * 1e9) - offset
+            frame["time_ns"] = stamp if 0 <= now - stamp < 1_000_000_000 else now
+            frame["can_id"] = message.arbitration_id
+            frame["length"] = len(message.data)
+            frame["data"] = int.from_bytes(message.data[:8], "little")
+            frame["flags"] = (
+                EXTENDED * message.is_extended_id
+                | REMOTE * message.is_remote_frame
+                | ERROR * message.is_error_frame
+                | FD * message.is_fd
+            )
+            count += 1
+        return self._frames[:count]
+
+    def send(self, frames: np.ndarray) -> None:
+        import can
+
+        for frame in frames:
+            data = int(frame["data"]).to_bytes(8, "little")
+            message = can.Message(arbitration_id=int(frame["can_id"]), data=data, is_extended_id=False)
+            try:
+                self._bus.send(message)
+            except can.CanError:
+                self.unsent += 1
+
+    def close(self) -> None:
+        self._bus.shutdown()
+
+
+def open_bus(interface: str | None, channel: str | None, ids: list[int], **options):
+    """Open the bus that the arguments, can.conf and the CAN_* variables name, receiving ``ids`` only.
+
+    SocketCAN goes through `RawCanSocket`, everything else through python-can.
+
+    Raises:
+        InputError: the interface is unknown or cannot be opened.
+    """
+    import can
+
+    try:
+        chosen = can.util.load_config(config={"interface": interface, "channel": channel, **options})
+    except (can.CanInterfaceNotImplementedError, ValueError) as error:
+        raise InputError(f"bus: {error}; name one with --interface and --channel") from None
+    if chosen["interface"] == "socketcan":
+        return open_socketcan(str(chosen["channel"]), ids)
+    filters = [{"can_id": can_id, "can_mask": 0x7FF, "extended": False} for can_id in ids]
+    try:
+        return PythonCanBus(can.Bus(**chosen, can_filters=filters))
+    except Exception as error:
+        raise InputError(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None

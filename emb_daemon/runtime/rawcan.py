@@ -1,0 +1,209 @@
+"""Batches of CAN frames over a socket, one system call in and one out per tick.
+
+Python's socket module has neither recvmmsg nor sendmmsg; a frame at a time costs four to ten system calls more in each
+tick, which is what a small ECU cannot afford. The socket is SocketCAN's AF_CAN or, in one process, a datagram socket pair
+that carries the same 16-byte struct can_frame.
+"""
+
+import ctypes
+import errno
+import os
+import select
+import socket
+import struct
+import time
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.jit import njit
+from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
+
+# Linux UAPI values that the socket module does not export.
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
+_MSG_DONTWAIT = 0x40
+_EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_ERROR_CLASSES = 0x1FFF_FFFF
+
+_CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8")])
+_IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
+# struct mmsghdr of the 64-bit Linux ABIs, where struct msghdr is padded to eight bytes before msg_len.
+_MMSGHDR = np.dtype(
+    {
+        "names": ["name", "name_length", "iov", "iov_length", "control", "control_length", "flags", "length"],
+        "formats": ["u8", "u4", "u8", "u8", "u8", "u8", "i4", "u4"],
+        "offsets": [0, 8, 16, 24, 32, 40, 48, 56],
+        "itemsize": 64,
+    }
+)
+_CONTROL_BYTES = 64
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class _Batch:
+    """Preallocated message headers that point at frame and control buffers."""
+
+    def __init__(self, capacity: int, control: bool):
+        self.raw = np.zeros(capacity, _CAN_FRAME)
+        self.control = np.zeros((capacity, _CONTROL_BYTES), np.uint8)
+        self._iov = np.zeros(capacity, _IOVEC)
+        self.headers = np.zeros(capacity, _MMSGHDR)
+        rows = np.arange(capacity, dtype=np.uint64)
+        self._iov["base"] = self.raw.ctypes.data + rows * _CAN_FRAME.itemsize
+        self._iov["length"] = _CAN_FRAME.itemsize
+        self.headers["iov"] = self._iov.ctypes.data + rows * _IOVEC.itemsize
+        self.headers["iov_length"] = 1
+        if control:
+            self.headers["control"] = self.control.ctypes.data + rows * _CONTROL_BYTES
+            self.headers["control_length"] = _CONTROL_BYTES
+        self.address = ctypes.c_void_p(self.headers.ctypes.data)
+
+
+@njit
+def _from_kernel(raw, headers, control, count, offset_ns, earliest_ns, now_ns, frames):
+    """Frames with times on the monotonic clock; returns the socket's drop counter, or -1 if none was attached.
+
+    The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock and the result is held
+    between the last drain and now, where the truth must lie.
+    """
+    drops = np.int64(-1)
+    for index in range(count):
+        frame, source = frames[index], raw[index]
+        can_id = np.int64(source.can_id)
+        frame.flags = (EXTENDED if can_id & _EFF else 0) | (REMOTE if can_id & _RTR else 0) | (ERROR if can_id & _ERR else 0)
+        frame.can_id = can_id & 0x1FFF_FFFF
+        frame.length = source.length
+        frame.data = source.data
+        stamp = now_ns
+        at, end = 0, np.int64(headers[index].control_length)
+        bytes_ = control[index]
+        while at + 16 <= end:
+            size, kind = np.int64(0), np.int64(0)
+            for byte in range(8):
+                size |= np.int64(bytes_[at + byte]) << (8 * byte)
+            for byte in range(4):
+                kind |= np.int64(bytes_[at + 12 + byte]) << (8 * byte)
+            if size < 16 or at + size > end:
+                break
+            if kind == _SO_TIMESTAMPNS and size >= 32:
+                seconds, nanoseconds = np.int64(0), np.int64(0)
+                for byte in range(8):
+                    seconds |= np.int64(bytes_[at + 16 + byte]) << (8 * byte)
+                    nanoseconds |= np.int64(bytes_[at + 24 + byte]) << (8 * byte)
+                stamp = seconds * 1_000_000_000 + nanoseconds - offset_ns
+            elif kind == _SO_RXQ_OVFL and size >= 20:
+                drops = np.int64(0)
+                for byte in range(4):
+                    drops |= np.int64(bytes_[at + 16 + byte]) << (8 * byte)
+            at += (size + 7) // 8 * 8
+        frame.time_ns = min(max(stamp, earliest_ns), now_ns)
+        earliest_ns = frame.time_ns
+        headers[index].control_length = _CONTROL_BYTES
+    return drops
+
+
+@njit
+def _to_kernel(frames, raw):
+    for index in range(len(frames)):
+        raw[index].can_id = frames[index].can_id
+        raw[index].length = frames[index].length
+        raw[index].data = frames[index].data
+
+
+class RawCanSocket:
+    """Frames in batches over an already connected or bound socket; takes ownership of it.
+
+    Attributes:
+        dropped: frames that the kernel discarded because the receive buffer was full.
+        unsent: frames that the kernel did not take.
+    """
+
+    def __init__(self, sock: socket.socket, capacity: int = 1024):
+        self._socket = sock
+        self._fd = sock.fileno()
+        self._received = _Batch(capacity, control=True)
+        self._sent = _Batch(capacity, control=False)
+        self._frames = np.zeros(capacity, FRAME)
+        self._capacity = capacity
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+        self._last_drain_ns = time.monotonic_ns()
+        self.dropped = 0
+        self.unsent = 0
+        self.down = False
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleep until a frame is there or the time is over."""
+        return bool(self._poll.poll(timeout_s * 1000.0)) if timeout_s > 0 else False
+
+    def drain(self) -> np.ndarray:
+        """All frames that have arrived, at most ``capacity``, as a FRAME array valid until the next call."""
+        count = _libc.recvmmsg(self._fd, self._received.address, self._capacity, _MSG_DONTWAIT, None)
+        now = time.monotonic_ns()
+        if count < 0:
+            code = ctypes.get_errno()
+            # An interface that goes down reports ENETDOWN once; the socket stays bound and works again when it is up.
+            self.down = code in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+            if not self.down and code not in (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED):
+                raise OSError(code, os.strerror(code))
+            return self._frames[:0]
+        self.down = False
+        offset = time.time_ns() - now
+        batch = self._received
+        drops = _from_kernel(batch.raw, batch.headers, batch.control, count, offset, self._last_drain_ns, now, self._frames)
+        self._last_drain_ns = now
+        if drops >= 0:
+            self.dropped = drops
+        return self._frames[:count]
+
+    def send(self, frames: np.ndarray) -> None:
+        """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
+        estimate that waits in a queue is worse than the next one."""
+        count = len(frames)
+        if not count:
+            return
+        _to_kernel(frames, self._sent.raw)
+        taken = max(_libc.sendmmsg(self._fd, self._sent.address, count, _MSG_DONTWAIT), 0)
+        self.unsent += count - taken
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) -> RawCanSocket:
+    """A SocketCAN interface with kernel time stamps, drop counter, error frames and filters for ``ids``.
+
+    Raises:
+        InputError: no such interface, or the kernel has no CAN.
+    """
+    if not hasattr(socket, "AF_CAN"):
+        raise InputError("socketcan: this Python has no AF_CAN")
+    try:
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    except OSError as error:
+        raise InputError(f"socketcan: the kernel offers no CAN sockets ({error.strerror}); try modprobe can_raw") from None
+    try:
+        exact = 0x7FF | _EFF | _RTR
+        filters = b"".join(struct.pack("=II", can_id, exact) for can_id in ids)
+        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_ERR_FILTER, _ERROR_CLASSES)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, receive_buffer)
+        except PermissionError:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+        sock.bind((channel,))
+    except OSError as error:
+        sock.close()
+        raise InputError(f"socketcan: interface {channel}: {error.strerror}") from None
+    return RawCanSocket(sock)
+
+
+def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:
+    """A CAN bus with two ends inside one process."""
+    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    for end in ends:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    return RawCanSocket(ends[0]), RawCanSocket(ends[1])

@@ -1,0 +1,52 @@
+"""Real-time set-up of the process; each measure says what it did or why it could not."""
+
+import ctypes
+import gc
+import os
+import sys
+from collections.abc import Iterator
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+def lock_memory() -> str:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        return f"memory not locked: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)"
+    return "memory locked"
+
+
+def use_fifo(priority: int) -> str:
+    try:
+        # The calling thread alone: helper threads stay with the ordinary scheduler.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        return f"ordinary scheduling: SCHED_FIFO {priority} refused: {error.strerror} (raise LimitRTPRIO)"
+    return f"SCHED_FIFO priority {priority}"
+
+
+def pin(cpu: int) -> str:
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError as error:
+        return f"not pinned to CPU {cpu}: {error.strerror}"
+    return f"pinned to CPU {cpu}"
+
+
+def settle_memory() -> None:
+    """Move everything alive out of the collector's sight: a full collection takes ten periods, so none may run later."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    # A helper thread that parses a calibration gives way to the loop within this time.
+    sys.setswitchinterval(0.0002)
+
+
+def set_up(lock: bool, priority: int | None, cpu: int | None) -> Iterator[str]:
+    """Apply the chosen measures, yielding one log line each."""
+    if lock:
+        yield lock_memory()
+    if cpu is not None:
+        yield pin(cpu)
+    if priority is not None:
+        yield use_fifo(priority)

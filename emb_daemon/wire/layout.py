@@ -1,0 +1,189 @@
+"""Signal layouts taken from the DBC, as arrays that compiled code can read.
+
+The DBC is the one place that states ids, bit positions, scales and ranges. What the code adds is the meaning: which slot a
+message fills and which signal stands in which column.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.jit import njit
+from emb_daemon.resources import resource
+
+CORNERS = ("FL", "FR", "RL", "RR")
+
+RESOLVER, CURRENT, THERMOCOUPLE = 0, 1, 2
+CORNER_MESSAGES = 3
+WHEEL_SPEED, WHEEL_PULSE, VEHICLE_STATUS = 12, 13, 14
+SLOTS = 15
+SIGNALS = 4
+
+FOREIGN = -1
+OURS = -2
+
+MOTOR_ANGLE, MOTOR_SPEED = 0, 1
+CURRENT_Q, CURRENT_D, DC_BUS_VOLTAGE = 0, 1, 2
+INNER_BACKPLATE, OUTER_BACKPLATE, CALIPER = 0, 1, 2
+PARK_BRAKE, BRAKE_REQUEST, AMBIENT, VEHICLE_SPEED = 0, 1, 2, 3
+
+_RECEIVED = {
+    "EMB_{}_Resolver": (RESOLVER, ("MotorAngle", "MotorSpeed")),
+    "EMB_{}_Current": (CURRENT, ("CurrentQ", "CurrentD", "DcBusVoltage")),
+    "EMB_{}_Thermocouple": (THERMOCOUPLE, ("InnerBackplateTemp", "OuterBackplateTemp", "CaliperTemp")),
+}
+_VEHICLE = {
+    "VEH_WheelSpeed": (WHEEL_SPEED, tuple(f"WheelSpeed{c}" for c in CORNERS)),
+    "VEH_WheelPulse": (WHEEL_PULSE, tuple(f"WheelPulse{c}" for c in CORNERS)),
+    "VEH_Status": (VEHICLE_STATUS, ("ParkBrake", "BrakeRequest", "AmbientTemp", "VehicleSpeed")),
+}
+CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS, ADAPT_REQUEST = 0, 1, 2, 3
+_SENT = (
+    ("EMB_{}_ClampForce", ("ClampForce", "ClampForceSigma", "InputCounter", "ForceSource", "InputAge")),
+    ("EMB_{}_PadTemp", ("InnerSurfaceTemp", "InnerMeanTemp", "OuterSurfaceTemp", "OuterMeanTemp")),
+    ("EMB_{}_EstimatorStatus", ("Mode", "StiffnessFactor", "ContactAngle", "DegradedReasons")),
+    ("EMB_{}_AdaptRequest", ("Request", "Progress", "Result", "LowForce", "HighForce", "DitherAmplitude", "DitherFrequency")),
+)
+SENT_SIGNALS = 7
+
+SIGNAL = np.dtype(
+    [("start", "i8"), ("length", "i8"), ("signed", "i8"), ("factor", "f8"), ("offset", "f8"), ("low", "f8"), ("high", "f8")],
+    align=True,
+)
+
+#: Everything compiled code needs to know of the wire. ``slot`` maps an 11-bit id to its slot, FOREIGN or OURS;
+#: ``cycle_ns`` is the nominal period of a slot; ``received[slot, column]`` and ``sent[kind, column]`` are signals, of
+#: which the first ``received_count`` and ``sent_count`` count; ``sent_id[kind, corner]`` are CAN ids.
+LAYOUT = np.dtype(
+    [
+        ("slot", "i2", (2048,)),
+        ("cycle_ns", "i8", (SLOTS,)),
+        ("received", SIGNAL, (SLOTS, SIGNALS)),
+        ("received_count", "i8", (SLOTS,)),
+        ("sent", SIGNAL, (4, SENT_SIGNALS)),
+        ("sent_count", "i8", (4,)),
+        ("sent_id", "i8", (4, 4)),
+        ("sent_cycle_ns", "i8", (4,)),
+    ],
+    align=True,
+)
+
+
+@njit
+def unpack(data, signal):
+    """Physical value of one signal (a SIGNAL record) in a little-endian payload."""
+    raw = np.int64((np.uint64(data) >> np.uint64(signal.start)) & ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)))
+    if signal.signed and raw >> (signal.length - 1):
+        raw -= np.int64(1) << signal.length
+    return raw * signal.factor + signal.offset
+
+
+@njit
+def pack(value, signal):
+    """The bits of one signal, at their place in the payload; a value beyond the signal's range saturates, NaN is ``low``."""
+    if not value > signal.low:
+        value = signal.low
+    elif value > signal.high:
+        value = signal.high
+    raw = np.int64(np.rint((value - signal.offset) / signal.factor))
+    mask = (np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)
+    return (np.uint64(raw) & mask) << np.uint64(signal.start)
+
+
+def signal_columns(database, message: str, names: tuple[str, ...]):
+    """SIGNAL records of the named signals of a cantools message.
+
+    Raises:
+        InputErrors: a message or signal is missing, or is not little-endian.
+    """
+    columns, faults = np.zeros(len(names), SIGNAL), []
+    try:
+        known = {signal.name: signal for signal in database.get_message_by_name(message).signals}
+    except KeyError:
+        raise InputErrors([f"message {message} is missing"]) from None
+    for column, name in enumerate(names):
+        signal = known.get(name)
+        if signal is None:
+            faults.append(f"{message}: signal {name} is missing")
+        elif signal.byte_order != "little_endian" or signal.length > 48:
+            faults.append(f"{message}.{name}: expected a little-endian signal of at most 48 bits")
+        else:
+            full = (1 << signal.length) - 1 if not signal.is_signed else (1 << (signal.length - 1)) - 1
+            least = 0 if not signal.is_signed else -full - 1
+            low = least * signal.scale + signal.offset if signal.minimum is None else signal.minimum
+            high = full * signal.scale + signal.offset if signal.maximum is None else signal.maximum
+            columns[column] = (signal.start, signal.length, signal.is_signed, signal.scale, signal.offset, low, high)
+    if faults:
+        raise InputErrors(faults)
+    return columns
+
+
+def load_database(path: Path):
+    """A cantools database.
+
+    Raises:
+        InputError: the file cannot be read or is no DBC.
+    """
+    import cantools
+
+    try:
+        return cantools.database.load_file(path, database_format="dbc")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected a DBC") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a readable DBC: {str(error).splitlines()[0]}") from None
+
+
+def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
+    """The LAYOUT (shape (1,)) of the messages that concern ``corners``, all others being foreign.
+
+    Raises:
+        InputErrors: the DBC lacks messages, signals or cycle times; every fault is listed.
+    """
+    path = path or resource("dbc/emb.dbc")
+    database = load_database(path)
+    layout, faults = np.zeros(1, LAYOUT), []
+    record = layout[0]
+    record["slot"] = FOREIGN
+
+    def fill(message, names, columns, count_of, where):
+        try:
+            signals = signal_columns(database, message, names)
+            found = database.get_message_by_name(message)
+            if found.frame_id > 0x7FF or found.length != 8:
+                raise InputErrors([f"{message}: expected an 11-bit id and 8 bytes"])
+            if not found.cycle_time:
+                raise InputErrors([f"{message}: GenMsgCycleTime is missing"])
+        except InputErrors as error:
+            faults.extend(f"{path}: {fault}" for fault in error.faults)
+            return None
+        columns[where][: len(names)] = signals
+        count_of[where] = len(names)
+        return found
+
+    received = {template.format(corner): (3 * index + kind, names)
+                for index, corner in enumerate(CORNERS) if corner in corners
+                for template, (kind, names) in _RECEIVED.items()} | _VEHICLE  # fmt: skip
+    for message, (slot, names) in received.items():
+        if found := fill(message, names, record["received"], record["received_count"], slot):
+            record["slot"][found.frame_id] = slot
+            record["cycle_ns"][slot] = found.cycle_time * 1_000_000
+    for kind, (template, names) in enumerate(_SENT):
+        for index, corner in enumerate(CORNERS):
+            if corner in corners and (
+                found := fill(template.format(corner), names, record["sent"], record["sent_count"], kind)
+            ):
+                record["slot"][found.frame_id] = OURS
+                record["sent_id"][kind, index] = found.frame_id
+                record["sent_cycle_ns"][kind] = found.cycle_time * 1_000_000
+    if faults:
+        raise InputErrors(faults)
+    return layout
+
+
+@cache
+def default_layout() -> np.ndarray:
+    """The layout of the shipped DBC with all four corners; treat it as read-only."""
+    return load_layout()
