@@ -1,0 +1,64 @@
+"""emb-daemon: dispatch to one module per command, imported only when called."""
+
+import argparse
+import importlib
+import os
+import sys
+
+from emb_daemon import __version__
+from emb_daemon.errors import InputError
+
+#: Command: what it does. The module of the same name in this package has EXAMPLE, add_arguments and run.
+COMMANDS = {
+    "demo": "simulated car and the real daemon on an in-process bus: live view, summary, picture",
+    "run": "the daemon: estimates from a CAN bus, broadcast 250 times a second",
+    "check": "validate configuration, calibrations and DBC; lists every fault",
+    "replay": "the same estimator over logs, as fast as it goes",
+    "identify": "calibration from a rig campaign, with its evidence",
+    "diagnose": "find what the model lacks, add it, and show the error before and after",
+    "simulate": "the simulated car on a bus",
+    "monitor": "live view of a running daemon's broadcasts",
+    "bench": "whether this machine can hold the loop",
+    "adaptation": "show, reset or list what park brake adaptation has learned",
+}
+
+
+def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="emb-daemon", description="Virtual clamp force sensor for electro-mechanical brakes."
+    )
+    parser.add_argument("--version", action="version", version=f"emb-daemon {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, summary in commands.items():
+        subparsers.add_parser(name, help=summary, add_help=False)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input."""
+    argv = sys.argv[1:] if argv is None else argv
+    chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
+    module = importlib.import_module(f"emb_daemon.cli.{chosen.command}")
+    parser = argparse.ArgumentParser(
+        prog=f"emb-daemon {chosen.command}",
+        description=COMMANDS[chosen.command][0].upper() + COMMANDS[chosen.command][1:] + ".",
+        epilog=f"example:\n  {module.EXAMPLE}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(parser)
+    arguments = parser.parse_args(argv[1:])
+    try:
+        return module.run(arguments)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        # The reader of our output has gone; leave nothing for the interpreter to flush into the closed pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
