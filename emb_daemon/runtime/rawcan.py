@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import Unavailable
 from emb_daemon.jit import njit
 from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 
@@ -175,14 +175,14 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
     """A SocketCAN interface with kernel time stamps, drop counter, error frames and filters for ``ids``.
 
     Raises:
-        InputError: no such interface, or the kernel has no CAN.
+        Unavailable: no such interface, or the kernel has no CAN.
     """
     if not hasattr(socket, "AF_CAN"):
-        raise InputError("socketcan: this Python has no AF_CAN")
+        raise Unavailable("socketcan: this Python has no AF_CAN")
     try:
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
-        raise InputError(f"socketcan: the kernel offers no CAN sockets ({error.strerror}); try modprobe can_raw") from None
+        raise Unavailable(f"socketcan: the kernel offers no CAN sockets ({error.strerror}); try modprobe can_raw") from None
     try:
         exact = 0x7FF | _EFF | _RTR
         filters = b"".join(struct.pack("=II", can_id, exact) for can_id in ids)
@@ -197,7 +197,7 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
         sock.bind((channel,))
     except OSError as error:
         sock.close()
-        raise InputError(f"socketcan: interface {channel}: {error.strerror}") from None
+        raise Unavailable(f"socketcan: interface {channel}: {error.strerror}") from None
     return RawCanSocket(sock)
 
 
