@@ -29,6 +29,7 @@ _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
+_OF_THE_LOOP = records.BUS_DISTURBED | records.DEADLINE_MISSED
 
 
 class Pacer:
@@ -157,7 +158,8 @@ class Daemon:
                 pacer.arrived(corner, int(arrival))
             if estimate["source"] == records.INVALID and estimate["mode"] != records.INIT:
                 self._invalid += 1
-            state = (int(estimate["mode"]), int(estimate["reasons"]))
+            # What disturbs the loop is logged once, not for each corner.
+            state = (int(estimate["mode"]), int(estimate["reasons"]) & ~_OF_THE_LOOP)
             if self._reported.get(corner) != state:
                 self._reported[corner] = state
                 self._report(corner, *state)
@@ -177,6 +179,8 @@ class Daemon:
             self._disturb(records.DEADLINE_MISSED, now_ns)
 
     def _disturb(self, reason: int, now_ns: int) -> None:
+        if now_ns - self._disturbed_ns[reason] >= _SHOWN_NS:
+            log.warning("%s", records.REASONS[reason.bit_length() - 1], extra={"fields": {"reason": reason}})
         self._disturbed_ns[reason] = now_ns
 
     def _watch_bus(self, frames: np.ndarray, now_ns: int) -> None:
