@@ -16,11 +16,12 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.errors import InputError
 from emb_daemon.estimator import records
+from emb_daemon.jit import njit
 from emb_daemon.pipeline import CYCLE_NS, Pipeline
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire.frames import ERROR, FRAME
-from emb_daemon.wire.layout import CORNERS, CURRENT, RESOLVER
+from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 
 #: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
 _MARGIN_NS = 200_000
@@ -59,6 +60,28 @@ class Pacer:
         return min(together, free + _MARGIN_NS)
 
 
+@njit
+def _scan(estimates, count, receptions, arrivals, reported):
+    """What the loop must know of new estimates: ``arrivals`` gets the time at which each corner's sample was complete, 0 for
+    none; ``reported`` mode and reasons. Returns (number of invalid estimates, bit mask of corners whose state changed)."""
+    invalid, changed = 0, 0
+    arrivals[:] = 0
+    for row in range(count):
+        estimate = estimates[row]
+        corner = estimate.corner
+        if estimate.is_sample:
+            base = CORNER_MESSAGES * corner
+            arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
+        if estimate.source == records.INVALID and estimate.mode != records.INIT:
+            invalid += 1
+        # What disturbs the loop is logged once, not for each corner.
+        state = estimate.mode << 16 | estimate.reasons & ~_OF_THE_LOOP
+        if state != reported[corner]:
+            reported[corner] = state
+            changed |= 1 << corner
+    return invalid, changed
+
+
 class Daemon:
     """Estimates of one process on one bus.
 
@@ -82,7 +105,8 @@ class Daemon:
         self._reloaded: Setup | None = None
         self._disturbed_ns = dict.fromkeys((records.BUS_DISTURBED, records.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
-        self._reported: dict[int, tuple[int, int]] = {}
+        self._reported = np.full(len(CORNERS), -1, np.int64)
+        self._arrivals = np.zeros(len(CORNERS), np.int64)
 
     def stop(self) -> None:
         """Ask the loop to end; safe in a signal handler."""
@@ -98,6 +122,7 @@ class Daemon:
         scratch.begin(0)
         count = scratch.advance(CYCLE_NS, scratch.consume(np.zeros(1, FRAME))[1])
         scratch.broadcast(count)
+        _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
         self._bus.drain()
 
     def run(self) -> None:
@@ -142,29 +167,23 @@ class Daemon:
             if start >= len(frames):
                 count = pipeline.advance(now_ns, count)
             self._bus.send(pipeline.broadcast(count))
-            self._follow(pipeline.estimates[:count], pacer)
+            self._follow(count, pacer)
             if start >= len(frames):
                 break
         self._watch_bus(frames, now_ns)
 
-    def _follow(self, estimates: np.ndarray, pacer: Pacer) -> None:
+    def _follow(self, count: int, pacer: Pacer) -> None:
         """Learn when the next samples are due; log what changed."""
-        for row in range(len(estimates)):
-            estimate = estimates[row]
-            corner = int(estimate["corner"])
-            if estimate["is_sample"]:
-                receptions = self.pipeline.receptions
-                arrival = max(receptions[3 * corner + RESOLVER]["time_ns"], receptions[3 * corner + CURRENT]["time_ns"])
-                pacer.arrived(corner, int(arrival))
-            if estimate["source"] == records.INVALID and estimate["mode"] != records.INIT:
-                self._invalid += 1
-            # What disturbs the loop is logged once, not for each corner.
-            state = (int(estimate["mode"]), int(estimate["reasons"]) & ~_OF_THE_LOOP)
-            if self._reported.get(corner) != state:
-                self._reported[corner] = state
-                self._report(corner, *state)
+        invalid, changed = _scan(self.pipeline.estimates, count, self.pipeline.receptions, self._arrivals, self._reported)
+        self._invalid += invalid
+        for corner in range(len(CORNERS)):
+            if self._arrivals[corner]:
+                pacer.arrived(corner, int(self._arrivals[corner]))
+            if changed >> corner & 1:
+                self._report(corner, int(self._reported[corner]))
 
-    def _report(self, corner: int, mode: int, reasons: int) -> None:
+    def _report(self, corner: int, state: int) -> None:
+        mode, reasons = state >> 16, state & 0xFFFF
         words = [text for bit, text in enumerate(records.REASONS) if reasons >> bit & 1]
         level = 30 if mode in (records.DEGRADED, records.FAULT) else 20
         fields = {"corner": CORNERS[corner], "mode": records.MODES[mode], "reasons": ", ".join(words) or "none"}

@@ -1,7 +1,7 @@
 """Batches of CAN frames over a socket, one system call in and one out per tick.
 
 Python's socket module has neither recvmmsg nor sendmmsg; a frame at a time costs four to ten system calls more in each
-tick, which is what a small ECU cannot afford. The socket is SocketCAN's AF_CAN or, in one process, a datagram socket pair
+tick, which is what a small ECU cannot afford. The socket is SocketCAN's AF_CAN or, in one process, a pair of Unix sockets
 that carries the same struct can_frame, followed by the sender's time stamp, which on CAN the kernel attaches.
 """
 
@@ -211,7 +211,7 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
 
 def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:
     """A CAN bus with two ends inside one process."""
-    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     return RawCanSocket(ends[0], stamped=True), RawCanSocket(ends[1], stamped=True)
