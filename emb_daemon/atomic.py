@@ -1,5 +1,6 @@
 """Files that are whole at every moment."""
 
+import contextlib
 import os
 import tempfile
 from pathlib import Path
@@ -20,7 +21,8 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o644) -> None:
         os.chmod(temporary, mode)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
         raise
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -2,19 +2,28 @@
 
 numba's disk cache is keyed on the file of the compiled function alone, so a change in a kernel that it calls, or in a
 record layout, would go unnoticed. The cache folder is therefore named after all sources that compiled code can depend on.
+
+With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same records, which is how tests compare them.
 """
 
+import functools
 import hashlib
 import os
+import sys
+import tempfile
 from pathlib import Path
+
+import numba
+import numpy as np
+from numba.core import config
 
 #: A source that mentions one of these takes part in compiled code.
 _MARKS = (b"emb_daemon.jit", b"np.dtype(")
 
 
-def _source_digest() -> str:
+def _source_digest(package: Path) -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
         if any(mark in content for mark in _MARKS):
             digest.update(content)
@@ -24,14 +33,59 @@ def _source_digest() -> str:
 def _cache_root() -> Path:
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen)
-    base = os.environ.get("CACHE_DIRECTORY") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(str(base).split(":")[0]) / "emb_daemon"
+    base = os.environ.get("CACHE_DIRECTORY") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base.split(":")[0]) / "emb_daemon"
 
 
-import numba  # noqa: E402
-from numba.core import config  # noqa: E402
+def _cache_folder() -> Path:
+    """A writable folder for compiled code: the chosen one or, where that cannot be written, one for this process alone."""
+    folder = _cache_root() / _source_digest(Path(__file__).parent)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        global _private
+        _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
+        print(
+            f"emb_daemon: cannot keep compiled code in {folder} ({error.strerror}), compiling anew at every start; "
+            "set NUMBA_CACHE_DIR to a writable folder",
+            file=sys.stderr,
+        )
+        return Path(_private.name)
 
-config.CACHE_DIR = str(_cache_root() / _source_digest())
+
+class _Record(np.void):
+    """A record whose fields are attributes, as in compiled code."""
+
+    def __getattribute__(self, name):
+        get = super().__getattribute__
+        return _with_attributes(self[name]) if name in get("dtype").names else get(name)
+
+    def __setattr__(self, name, value):
+        self[name] = value
+
+
+def _with_attributes(value):
+    """A view of records, or of a named tuple of them, whose fields are attributes; anything else as it is."""
+    if isinstance(value, np.void | np.ndarray) and value.dtype.names and value.dtype.type is not _Record:
+        return value.view(np.dtype((_Record, value.dtype)))
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(_with_attributes, value))
+    return value
+
+
+def _plain(function):
+    @functools.wraps(function)
+    def call(*arguments):
+        return function(*map(_with_attributes, arguments))
+
+    return call
+
 
 #: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
-njit = numba.njit(cache=True, nogil=True)
+if config.DISABLE_JIT:
+    njit = _plain
+else:
+    config.CACHE_DIR = str(_cache_folder())
+    njit = numba.njit(cache=True, nogil=True)

@@ -191,8 +191,9 @@ def _head(estimate, index, corner, time_ns, age):
     estimate.counter = corner.counter if corner.started else 15
     estimate.age_cycles = age
     estimate.cycle = corner.cycle + age
-    estimate.elapsed_cycles = estimate.cycle - corner.announced
-    corner.announced = estimate.cycle
+    # A sample that comes after predictions may lie before the last of them: that cycle was announced.
+    estimate.elapsed_cycles = max(estimate.cycle - corner.announced, 0)
+    corner.announced = max(estimate.cycle, corner.announced)
 
 
 @njit
@@ -261,6 +262,8 @@ def _supervise(b, estimate, index, corner):
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
         if now - b.receptions[slot].refused_ns < _REFUSED_NS:
             reasons |= r.E2E_ERROR
+        if now - b.receptions[slot].range_ns < _REFUSED_NS:
+            reasons |= r.OUT_OF_RANGE
     estimate.reasons = reasons
     if not corner.started:
         estimate.mode = r.INIT

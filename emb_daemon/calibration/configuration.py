@@ -56,9 +56,8 @@ class Configuration(Struct, kw_only=True):
     def __post_init__(self):
         if not self.corners:
             raise ValueError("corners: expected at least one of FL, FR, RL, RR")
-        for name in self.corners:
-            if name not in CORNERS:
-                raise ValueError(f"corners.{name}: expected FL, FR, RL or RR")
+        if faults := [f"corners.{name}: expected FL, FR, RL or RR" for name in self.corners if name not in CORNERS]:
+            raise ValueError("\n".join(faults))
 
 
 class Setup:

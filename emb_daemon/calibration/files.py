@@ -7,7 +7,7 @@ import msgspec
 import yaml
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.strict_yaml import load_yaml
+from emb_daemon.calibration.strict_yaml import is_not_plain_text, load_yaml
 from emb_daemon.calibration.types import Calibration
 
 
@@ -46,11 +46,17 @@ def _float(dumper: yaml.Dumper, value: float) -> yaml.Node:
     return dumper.represent_scalar("tag:yaml.org,2002:float", text)
 
 
+def _text(dumper: yaml.Dumper, value: str) -> yaml.Node:
+    quoted = is_not_plain_text(value)
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style="'" if quoted else None)
+
+
 def _sequence(dumper: yaml.Dumper, value) -> yaml.Node:
     numbers = all(isinstance(item, int | float) for item in value)
     return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=numbers)
 
 
 _Dumper.add_representer(float, _float)
+_Dumper.add_representer(str, _text)
 _Dumper.add_representer(list, _sequence)
 _Dumper.add_representer(tuple, _sequence)

@@ -25,6 +25,11 @@ _CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
 _NOT_FINITE = {".nan", ".inf", "-.inf", "+.inf", "nan", "inf", "-inf"}
 
 
+def is_not_plain_text(text: str) -> bool:
+    """Whether ``text`` without quotes is read as something else than text."""
+    return text in _CONSTANTS or text.lower() in _NOT_FINITE or bool(_INTEGER.match(text) or _FLOAT.match(text))
+
+
 class _Reader:
     def __init__(self, name: str):
         self.name = name
@@ -70,7 +75,10 @@ class _Reader:
         return entries
 
     def convert(self, node: yaml.Node, kind: Any, path: str) -> Any:
-        """``node`` as ``kind``; None after a fault, which is then recorded."""
+        """``node`` as ``kind``; None after a fault, which is then recorded.
+
+        A struct's ``__post_init__`` may find several faults: one line each of its ValueError, ``key: what was expected``.
+        """
         optional, kind = _strip_optional(kind)
         if optional and isinstance(node, yaml.ScalarNode) and node.value in ("null", "~", ""):
             return None
@@ -81,7 +89,7 @@ class _Reader:
             if not isinstance(node, yaml.SequenceNode):
                 return self.fault(node, path, "expected a list")
             return tuple(self.convert(item, arguments[0], f"{path}[{index}]") for index, item in enumerate(node.value))
-        if origin is dict and _holds_struct(arguments[1]):
+        if origin is dict:
             if not isinstance(node, yaml.MappingNode):
                 return self.fault(node, path, "expected keys and values")
             entries = self.entries(node, path)
@@ -118,7 +126,18 @@ class _Reader:
         try:
             return kind(**values)
         except ValueError as error:
-            self.fault(node, path, str(error))
+            for line in str(error).splitlines():
+                key = line.partition(": ")[0]
+                self.fault(_child(node, key), path, line)
+
+
+def _child(node: yaml.Node, key: str) -> yaml.Node:
+    """The node at a dotted key below ``node``, or the nearest above it."""
+    for name in key.split("."):
+        if not isinstance(node, yaml.MappingNode):
+            break
+        node = next((value for entry, value in node.value if entry.value == name), node)
+    return node
 
 
 def _join(path: str, key: str) -> str:

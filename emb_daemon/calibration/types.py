@@ -221,20 +221,23 @@ class Calibration(Struct, kw_only=True):
     provenance: Provenance | None = None
 
     def __post_init__(self):
-        known = {effect.name: effect for effect in REGISTRY}
+        known, faults = {effect.name: effect for effect in REGISTRY}, []
         for name, values in self.effects.items():
             if name not in known:
-                raise ValueError(f"effects.{name}: unknown effect; known are {', '.join(known)}")
+                faults.append(f"effects.{name}: unknown effect; known are {', '.join(known)}")
+                continue
             bounds = {parameter.name: parameter for parameter in known[name].parameters}
             for key, value in values.items():
                 if key not in bounds:
-                    raise ValueError(f"effects.{name}.{key}: unknown parameter; expected {', '.join(bounds)}")
-                if not bounds[key].low <= value <= bounds[key].high:
-                    raise ValueError(
+                    faults.append(f"effects.{name}.{key}: unknown parameter; expected {', '.join(bounds)}")
+                elif not bounds[key].low <= value <= bounds[key].high:
+                    faults.append(
                         f"effects.{name}.{key}: {value} outside [{bounds[key].low}, {bounds[key].high}] {bounds[key].unit}"
                     )
             if missing := bounds.keys() - values.keys():
-                raise ValueError(f"effects.{name}: missing {', '.join(sorted(missing))}")
+                faults.append(f"effects.{name}: missing {', '.join(sorted(missing))}")
+        if faults:
+            raise ValueError("\n".join(faults))
 
 
 def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:

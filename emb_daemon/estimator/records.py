@@ -154,6 +154,8 @@ STATE = np.dtype(
         ("pads", "f8", (2, NODES)),
         ("disc", "f8"),
         ("history", "f8"),
+        ("ambient", "f8"),
+        ("stiffness_factor", "f8"),
         ("temperature_known", "?"),
         ("work", "f8", (4, CHAIN)),
         ("effects", EFFECT_STATES),

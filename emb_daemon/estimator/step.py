@@ -15,6 +15,7 @@ from emb_daemon.estimator.records import (
     FUSED,
     INIT,
     INVALID,
+    OUT_OF_RANGE,
     OUTSIDE_RANGE,
     PREDICTED,
     RUNNING,
@@ -43,6 +44,9 @@ _TOUCHING_N = 200.0
 _DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
 _SELF_LOCKING = 0.2
+#: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
+_SPEED_MARGIN = 1.2
+_ANGLE_MARGIN = 0.5
 #: Variance that the torque path's relative error gains, 1/s: friction changes over months.
 _TORQUE_GAIN_WALK = 1e-9
 
@@ -65,6 +69,22 @@ def _start(s, p, m):
 
 
 @njit
+def _follow_zero(s, p, m):
+    """Whether the angle jumped as no motor can: then the resolver has a new zero, and the contact angle goes with it.
+
+    What the motor may have turned meanwhile is unknown, so the contact angle becomes uncertain by as much.
+    """
+    jump = m.angle - s.angle
+    reach = p.maximum_speed * m.dt
+    if abs(jump) <= _SPEED_MARGIN * reach + _ANGLE_MARGIN:
+        return False
+    s.angle += jump
+    s.contact_angle += jump
+    s.covariance[1, 1] += reach * reach
+    return True
+
+
+@njit
 def _heat(s, p, m):
     """Pads and disc up to this sample, heated by what the last estimate says; returns the stiffness factor."""
     t = p.thermal
@@ -77,9 +97,10 @@ def _heat(s, p, m):
             share = t.node_position[node] / t.thickness
             s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
             s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-        s.history = 0.5 * (s.pads[0].mean() + s.pads[1].mean()) - (m.ambient if m.has_status else s.disc)
-        s.temperature_known = True
-    ambient = m.ambient if m.has_status else s.disc
+        s.ambient = s.disc
+    # Without vehicle status the last ambient temperature stands: it changes slowly, and a jump would stiffen the pads.
+    if m.has_status:
+        s.ambient = m.ambient
     if m.dt > 0.0:
         wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
         braking = s.fused > _TOUCHING_N
@@ -92,10 +113,13 @@ def _heat(s, p, m):
         # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
         inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
         outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
-        s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, braking, wheel_speed, m.dt, s.work)
+        s.disc = heat_step(t, s.pads, s.disc, inner, outer, s.ambient, power, braking, wheel_speed, m.dt, s.work)
     positions = t.node_position
-    rise = 0.5 * (mean_temperature(s.pads[0], positions) + mean_temperature(s.pads[1], positions)) - ambient
-    if t.history_time > 0.0:
+    rise = 0.5 * (mean_temperature(s.pads[0], positions) + mean_temperature(s.pads[1], positions)) - s.ambient
+    if not s.temperature_known:
+        s.temperature_known = True
+        s.history = rise
+    elif t.history_time > 0.0:
         s.history += (1.0 - exp(-m.dt / t.history_time)) * (rise - s.history)
     return stiffness_factor(t, rise, s.history)
 
@@ -187,7 +211,8 @@ def step(s, p, m, out):
     """
     if not s.started:
         _start(s, p, m)
-    factor = _heat(s, p, m)
+    moved_zero = _follow_zero(s, p, m)
+    factor = s.stiffness_factor = _heat(s, p, m)
     force_before = s.force
     _stiffness(s, p, m, factor)
     torque, leverage, friction_variance = _torque(s, p, m)
@@ -208,12 +233,12 @@ def step(s, p, m, out):
     _temperatures(s, p, out)
     out.mode = RUNNING
     out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
-    reasons = 0
+    reasons = OUT_OF_RANGE if moved_zero else 0
     if not s.temperature_known:
         reasons |= TEMPERATURE_UNCERTAIN
     if out.contact_sigma > 0.5:
         reasons |= CONTACT_UNCERTAIN
-    if out.force > p.maximum_force or abs(m.speed) > 1.2 * p.maximum_speed:
+    if out.force > p.maximum_force or abs(m.speed) > _SPEED_MARGIN * p.maximum_speed:
         reasons |= OUTSIDE_RANGE
     out.reasons = reasons
     if not (np.isfinite(out.force) and np.isfinite(out.sigma)):
@@ -239,13 +264,15 @@ def predict(s, p, age, out):
     out.mode = RUNNING if s.started else INIT
     out.source = PREDICTED if s.started else INVALID
     out.reasons = 0
-    # The motor cannot have gone faster than its limit, and no further than full clamp or full release.
-    moved = min(p.maximum_speed * age * s.slope, p.maximum_force)
+    # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
+    reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * age, p.curve)
+    start, _ = characteristic_curve(s.past_contact, p.curve)
+    moved = min(s.stiffness_factor * (reached - start), p.maximum_force)
     out.force = s.fused
     out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
     out.contact_angle = s.contact_angle
     out.contact_sigma = sqrt(s.covariance[1, 1])
-    out.stiffness_factor = 1.0
+    out.stiffness_factor = s.stiffness_factor if s.started else 1.0
     out.innovation = out.innovation_sigma = np.nan
     _temperatures(s, p, out)

@@ -9,11 +9,12 @@ from emb_daemon.wire.layout import load_database, signal_columns, unpack
 
 
 @njit
-def _select(frames, can_id):
+def _select(frames, can_id, length):
     rows = np.empty(len(frames), np.int64)
     count = 0
     for index in range(len(frames)):
-        if frames[index].can_id == can_id and frames[index].flags & (EXTENDED | REMOTE | ERROR) == 0:
+        frame = frames[index]
+        if frame.can_id == can_id and frame.length >= length and frame.flags & (EXTENDED | REMOTE | ERROR) == 0:
             rows[count] = index
             count += 1
     return rows[:count]
@@ -36,7 +37,7 @@ class Decoder:
         """``time_ns`` and every signal of ``message``, one entry per frame; empty arrays where the log has none."""
         found = self._database.get_message_by_name(message)
         names = tuple(signal.name for signal in found.signals)
-        rows = _select(frames, found.frame_id)
+        rows = _select(frames, found.frame_id, found.length)
         values = np.zeros((len(names), len(rows)))
         _decode(frames, rows, signal_columns(self._database, message, names), values)
         return {"time_ns": frames["time_ns"][rows]} | dict(zip(names, values, strict=True))

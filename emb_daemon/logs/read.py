@@ -1,6 +1,7 @@
 """Any log file as an array of frames."""
 
 import gzip
+import io
 import sys
 import zlib
 from pathlib import Path
@@ -15,6 +16,7 @@ _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".
 
 
 def _content(path: Path) -> bytes:
+    """A file's bytes, unpacked if they are gzip's, whatever the file is called."""
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
@@ -41,9 +43,12 @@ def _candump(path: Path) -> np.ndarray:
 
 def _python_can(path: Path, reader_name: str) -> np.ndarray:
     import can
+    from can.io.generic import TextIOMessageReader
 
+    content = io.BytesIO(_content(path))
     try:
-        reader = getattr(can, reader_name)(path)
+        kind = getattr(can, reader_name)
+        reader = kind(io.TextIOWrapper(content) if issubclass(kind, TextIOMessageReader) else content)
         rows = [
             (
                 round(message.timestamp * 1e9),
@@ -61,7 +66,7 @@ def _python_can(path: Path, reader_name: str) -> np.ndarray:
     except ImportError as error:
         raise InputError(f"{path}: reading this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
     except Exception as error:
-        raise InputError(f"{path}: not a readable {path.suffix} log: {error}") from None
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {error}") from None
     return np.array(rows, FRAME)
 
 

@@ -17,7 +17,8 @@ _NEVER = np.iinfo(np.int64).min // 2
 
 #: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame; ``sequence_ns`` and ``sequence`` of the last
 #: frame that stood in sequence; ``candidate`` the counter of the last frame that did not, or -1; ``refused_ns`` when a
-#: frame was last refused; ``count[verdict]``.
+#: frame was last refused for its form or sequence; ``range_ns`` when one was last refused for a value out of range;
+#: ``count[verdict]``.
 RECEPTION = np.dtype(
     [
         ("values", "f8", (SIGNALS,)),
@@ -27,6 +28,7 @@ RECEPTION = np.dtype(
         ("sequence", "i8"),
         ("candidate", "i8"),
         ("refused_ns", "i8"),
+        ("range_ns", "i8"),
         ("count", "i8", (len(VERDICTS),)),
     ],
     align=True,
@@ -36,7 +38,7 @@ RECEPTION = np.dtype(
 def new_reception() -> np.ndarray:
     """Receivers of all slots, shape (SLOTS,), that have heard nothing."""
     reception = np.zeros(SLOTS, RECEPTION)
-    for field in ("time_ns", "sequence_ns", "refused_ns"):
+    for field in ("time_ns", "sequence_ns", "refused_ns", "range_ns"):
         reception[field] = _NEVER
     reception["counter"] = reception["sequence"] = reception["candidate"] = -1
     reception["values"] = np.nan
@@ -47,8 +49,10 @@ def new_reception() -> np.ndarray:
 def _in_sequence(counter, time_ns, reception, cycle_ns):
     """Whether a counter follows the last one. Time passed explains lost frames; a counter that stands still or runs ahead
     of the clock is a repetition or a stranger, unless two such frames in a row follow each other: then the sender has
-    started anew."""
+    started anew. After a whole turn of silence the counter may stand where it stood."""
     step = (counter - reception.sequence) % COUNTER_MODULO
+    if step == 0 and reception.candidate < 0:
+        step = COUNTER_MODULO
     elapsed = (time_ns - reception.sequence_ns) // cycle_ns
     restarted = reception.candidate >= 0 and 1 <= (counter - reception.candidate) % COUNTER_MODULO <= _TOLERATED_LOSS
     if reception.sequence < 0 or 1 <= step <= _TOLERATED_LOSS + elapsed or restarted:
@@ -76,7 +80,8 @@ def _verdict(frame, slot, reception, layout):
     for column in range(layout.received_count[slot]):
         signal = layout.received[slot, column]
         value = unpack(frame.data, signal)
-        if value < signal.low or value > signal.high:
+        rounding = 0.5 * signal.factor
+        if value < signal.low - rounding or value > signal.high + rounding:
             return BAD_RANGE
     return ACCEPTED
 
@@ -96,7 +101,10 @@ def receive(frame, receptions, layout):
     verdict = _verdict(frame, slot, reception, layout)
     reception.count[verdict] += 1
     if verdict != ACCEPTED:
-        reception.refused_ns = frame.time_ns
+        if verdict == BAD_RANGE:
+            reception.range_ns = frame.time_ns
+        else:
+            reception.refused_ns = frame.time_ns
         return slot, verdict
     reception.time_ns = frame.time_ns
     reception.counter = reception.sequence
