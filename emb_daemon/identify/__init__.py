@@ -1,1 +1,1 @@
-"""From a rig campaign to a calibration."""
+"""From a rig campaign to a calibration, with the evidence."""

@@ -158,7 +158,7 @@ class Excitation:
 def _turning_points(angle, threshold):
     count, direction, extreme = 0, 0, angle[0]
     for value in angle:
-        if direction >= 0 and value > extreme or direction <= 0 and value < extreme:
+        if (direction >= 0 and value > extreme) or (direction <= 0 and value < extreme):
             if direction == 0 and abs(value - angle[0]) > threshold:
                 direction = 1 if value > angle[0] else -1
             if direction != 0:
