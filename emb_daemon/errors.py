@@ -11,3 +11,8 @@ class InputErrors(InputError):
     def __init__(self, faults: list[str]):
         super().__init__("\n".join(faults))
         self.faults = faults
+
+
+class Unavailable(Exception):
+    """Something outside is not there now and may be later, such as a CAN interface. The command line prints it and ends
+    with exit status 1, upon which a service manager tries again."""

@@ -106,9 +106,9 @@ class Pipeline:
         Returns (index of the next frame, number of estimates in ``self.estimates``)."""
         return _consume(self._buffers, frames, start, predictions)
 
-    def advance(self, time_ns: int) -> int:
-        """Answer what is overdue at ``time_ns``; returns the number of estimates in ``self.estimates``."""
-        return _advance(self._buffers, time_ns, True, 0)
+    def advance(self, time_ns: int, count: int = 0) -> int:
+        """Answer what is overdue at ``time_ns``, after the first ``count`` estimates; returns how many there are then."""
+        return _advance(self._buffers, time_ns, True, count)
 
     def broadcast(self, count: int) -> np.ndarray:
         """The frames that announce the first ``count`` estimates, in sending order."""

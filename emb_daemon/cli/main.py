@@ -6,7 +6,7 @@ import os
 import sys
 
 from emb_daemon import __version__
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, Unavailable
 
 #: Command: what it does. The module of the same name in this package has EXAMPLE, add_arguments and run.
 COMMANDS = {
@@ -35,7 +35,8 @@ def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input."""
+    """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if what it needs is not
+    there now."""
     argv = sys.argv[1:] if argv is None else argv
     chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
     module = importlib.import_module(f"emb_daemon.cli.{chosen.command}")
@@ -52,6 +53,9 @@ def main(argv: list[str] | None = None) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
+    except Unavailable as error:
+        print(error, file=sys.stderr)
+        return 1
     except BrokenPipeError:
         # The reader of our output has gone; leave nothing for the interpreter to flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -35,6 +35,9 @@ from emb_daemon.models.thermal import (
 )
 from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
 
+#: The current is averaged over this time before its sample (wire contract), s.
+_CYCLE_S = 0.004
+_ONE_CYCLE_S = 1.5 * _CYCLE_S
 #: Clamp force from which pads and disc exchange heat by contact, N.
 TOUCHING_N = 200.0
 #: Wheel speed from which pads heat: the sensor's noise at standstill does not.
@@ -194,7 +197,8 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     out.innovation = out.innovation_sigma = np.nan
     mean_force = 0.5 * (force_before + s.force)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
-    speed_torque = p.inertia * p.speed_sigma / m.dt if m.dt > 0.0 else 0.0
+    unknown_speed = p.speed_sigma if m.dt <= _ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
+    speed_torque = p.inertia * unknown_speed / _CYCLE_S
     white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance
     gain_error = p.torque_relative_sigma * mean_force
     out.torque_sigma = sqrt((white + current_torque * current_torque) / (leverage * leverage) + gain_error * gain_error)

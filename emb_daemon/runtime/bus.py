@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
@@ -85,7 +85,8 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
     SocketCAN goes through `RawCanSocket`, everything else through python-can.
 
     Raises:
-        InputError: the interface is unknown or cannot be opened.
+        InputError: no interface is named, or an unknown one.
+        Unavailable: it cannot be opened now.
     """
     import can
 
@@ -99,4 +100,4 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
     try:
         return PythonCanBus(can.Bus(**chosen, can_filters=filters))
     except Exception as error:
-        raise InputError(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None
+        raise Unavailable(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None

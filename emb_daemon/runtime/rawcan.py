@@ -2,7 +2,7 @@
 
 Python's socket module has neither recvmmsg nor sendmmsg; a frame at a time costs four to ten system calls more in each
 tick, which is what a small ECU cannot afford. The socket is SocketCAN's AF_CAN or, in one process, a datagram socket pair
-that carries the same 16-byte struct can_frame.
+that carries the same struct can_frame, followed by the sender's time stamp, which on CAN the kernel attaches.
 """
 
 import ctypes
@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import Unavailable
 from emb_daemon.jit import njit
 from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 
@@ -25,7 +25,8 @@ _MSG_DONTWAIT = 0x40
 _EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _ERROR_CLASSES = 0x1FFF_FFFF
 
-_CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8")])
+_CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
+_CAN_FRAME_BYTES = 16
 _IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
 # struct mmsghdr of the 64-bit Linux ABIs, where struct msghdr is padded to eight bytes before msg_len.
 _MMSGHDR = np.dtype(
@@ -44,14 +45,14 @@ _libc = ctypes.CDLL(None, use_errno=True)
 class _Batch:
     """Preallocated message headers that point at frame and control buffers."""
 
-    def __init__(self, capacity: int, control: bool):
+    def __init__(self, capacity: int, frame_bytes: int, control: bool):
         self.raw = np.zeros(capacity, _CAN_FRAME)
         self.control = np.zeros((capacity, _CONTROL_BYTES), np.uint8)
         self._iov = np.zeros(capacity, _IOVEC)
         self.headers = np.zeros(capacity, _MMSGHDR)
         rows = np.arange(capacity, dtype=np.uint64)
         self._iov["base"] = self.raw.ctypes.data + rows * _CAN_FRAME.itemsize
-        self._iov["length"] = _CAN_FRAME.itemsize
+        self._iov["length"] = frame_bytes
         self.headers["iov"] = self._iov.ctypes.data + rows * _IOVEC.itemsize
         self.headers["iov_length"] = 1
         if control:
@@ -61,7 +62,7 @@ class _Batch:
 
 
 @njit
-def _from_kernel(raw, headers, control, count, offset_ns, earliest_ns, now_ns, frames):
+def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, now_ns, frames):
     """Frames with times on the monotonic clock; returns the socket's drop counter, or -1 if none was attached.
 
     The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock and the result is held
@@ -75,7 +76,7 @@ def _from_kernel(raw, headers, control, count, offset_ns, earliest_ns, now_ns, f
         frame.can_id = can_id & 0x1FFF_FFFF
         frame.length = source.length
         frame.data = source.data
-        stamp = now_ns
+        stamp = source.time_ns if stamped else now_ns
         at, end = 0, np.int64(headers[index].control_length)
         bytes_ = control[index]
         while at + 16 <= end:
@@ -104,26 +105,32 @@ def _from_kernel(raw, headers, control, count, offset_ns, earliest_ns, now_ns, f
 
 
 @njit
-def _to_kernel(frames, raw):
+def _to_kernel(frames, now_ns, raw):
     for index in range(len(frames)):
         raw[index].can_id = frames[index].can_id
         raw[index].length = frames[index].length
         raw[index].data = frames[index].data
+        raw[index].time_ns = now_ns
 
 
 class RawCanSocket:
     """Frames in batches over an already connected or bound socket; takes ownership of it.
+
+    Args:
+        stamped: frames carry the sender's time stamp (`socket_pair`) instead of the kernel's.
 
     Attributes:
         dropped: frames that the kernel discarded because the receive buffer was full.
         unsent: frames that the kernel did not take.
     """
 
-    def __init__(self, sock: socket.socket, capacity: int = 1024):
+    def __init__(self, sock: socket.socket, stamped: bool = False, capacity: int = 1024):
         self._socket = sock
         self._fd = sock.fileno()
-        self._received = _Batch(capacity, control=True)
-        self._sent = _Batch(capacity, control=False)
+        frame_bytes = _CAN_FRAME.itemsize if stamped else _CAN_FRAME_BYTES
+        self._received = _Batch(capacity, frame_bytes, control=True)
+        self._sent = _Batch(capacity, frame_bytes, control=False)
+        self._stamped = stamped
         self._frames = np.zeros(capacity, FRAME)
         self._capacity = capacity
         self._poll = select.poll()
@@ -151,7 +158,9 @@ class RawCanSocket:
         self.down = False
         offset = time.time_ns() - now
         batch = self._received
-        drops = _from_kernel(batch.raw, batch.headers, batch.control, count, offset, self._last_drain_ns, now, self._frames)
+        drops = _from_kernel(
+            batch.raw, batch.headers, batch.control, count, self._stamped, offset, self._last_drain_ns, now, self._frames
+        )
         self._last_drain_ns = now
         if drops >= 0:
             self.dropped = drops
@@ -160,12 +169,11 @@ class RawCanSocket:
     def send(self, frames: np.ndarray) -> None:
         """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
         estimate that waits in a queue is worse than the next one."""
-        count = len(frames)
-        if not count:
-            return
-        _to_kernel(frames, self._sent.raw)
-        taken = max(_libc.sendmmsg(self._fd, self._sent.address, count, _MSG_DONTWAIT), 0)
-        self.unsent += count - taken
+        for first in range(0, len(frames), self._capacity):
+            batch = frames[first : first + self._capacity]
+            _to_kernel(batch, time.monotonic_ns(), self._sent.raw)
+            taken = max(_libc.sendmmsg(self._fd, self._sent.address, len(batch), _MSG_DONTWAIT), 0)
+            self.unsent += len(batch) - taken
 
     def close(self) -> None:
         self._socket.close()
@@ -175,14 +183,14 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
     """A SocketCAN interface with kernel time stamps, drop counter, error frames and filters for ``ids``.
 
     Raises:
-        InputError: no such interface, or the kernel has no CAN.
+        Unavailable: no such interface, or the kernel has no CAN.
     """
     if not hasattr(socket, "AF_CAN"):
-        raise InputError("socketcan: this Python has no AF_CAN")
+        raise Unavailable("socketcan: this Python has no AF_CAN")
     try:
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
-        raise InputError(f"socketcan: the kernel offers no CAN sockets ({error.strerror}); try modprobe can_raw") from None
+        raise Unavailable(f"socketcan: the kernel offers no CAN sockets ({error.strerror}); try modprobe can_raw") from None
     try:
         exact = 0x7FF | _EFF | _RTR
         filters = b"".join(struct.pack("=II", can_id, exact) for can_id in ids)
@@ -197,7 +205,7 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
         sock.bind((channel,))
     except OSError as error:
         sock.close()
-        raise InputError(f"socketcan: interface {channel}: {error.strerror}") from None
+        raise Unavailable(f"socketcan: interface {channel}: {error.strerror}") from None
     return RawCanSocket(sock)
 
 
@@ -206,4 +214,4 @@ def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-    return RawCanSocket(ends[0]), RawCanSocket(ends[1])
+    return RawCanSocket(ends[0], stamped=True), RawCanSocket(ends[1], stamped=True)

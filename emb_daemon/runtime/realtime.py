@@ -6,12 +6,13 @@ import os
 import sys
 from collections.abc import Iterator
 
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def lock_memory() -> str:
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+    # On fault: what is mapped and never touched, such as the stacks of helper threads, need not be resident.
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         return f"memory not locked: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)"
     return "memory locked"
 

@@ -1,0 +1,44 @@
+"""emb-daemon run."""
+
+import argparse
+import signal
+from pathlib import Path
+
+EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    from emb_daemon.cli.busoptions import add_bus_arguments
+
+    parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    add_bus_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from emb_daemon.calibration.configuration import Setup
+    from emb_daemon.cli.busoptions import bus_options
+    from emb_daemon.runtime.bus import open_bus
+    from emb_daemon.runtime.daemon import Daemon
+    from emb_daemon.runtime.journal import log, set_up_logging
+    from emb_daemon.runtime.realtime import set_up, settle_memory
+    from emb_daemon.runtime.systemd import ServiceManager
+
+    setup = Setup(arguments.config)
+    configuration = setup.configuration
+    set_up_logging(configuration.log_level)
+    ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
+    bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
+    daemon = Daemon(setup, bus, ServiceManager())
+    signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
+    signal.signal(signal.SIGINT, lambda *_: daemon.stop())
+    signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
+    daemon.warm_up()
+    realtime = configuration.realtime
+    for line in set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu):
+        log.info("%s", line)
+    settle_memory()
+    try:
+        daemon.run()
+    finally:
+        bus.close()
+    return 0

@@ -1,0 +1,105 @@
+"""Logs through the daemon's pipeline, one after the other as one drive."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import PARAMETERS, new_state
+from emb_daemon.judging import force_figures, temperature_figures
+from emb_daemon.logs.columns import References
+from emb_daemon.logs.read import read_frames
+from emb_daemon.offline import corner_index, estimate, run_frames
+from emb_daemon.pipeline import Pipeline
+
+#: Pause between two logs of which the second's clock does not go on from the first's.
+_PAUSE_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Result:
+    """One replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock."""
+
+    path: Path
+    time_ns: np.ndarray
+    estimates: np.ndarray
+    samples: np.ndarray
+    reference: References
+    force_N: np.ndarray
+
+    def figures(self) -> dict:
+        """Error figures against the log's reference instruments, as far as it has any."""
+        return {
+            "log": str(self.path),
+            "samples": len(self.estimates),
+            "seconds": 1e-9 * float(self.time_ns[-1] - self.time_ns[0]),
+            "force_N": force_figures(self.samples, self.estimates, self.force_N),
+            "temperature_K": temperature_figures(self.time_ns, self.estimates, self.reference),
+        }
+
+
+class Replay:
+    """A drive made of logs.
+
+    Args:
+        calibration: of the corner's actuator.
+        corner: FL, FR, RL or RR.
+        measured_torque: heat the pads with the rig's brake torque sensor instead of the estimated force.
+    """
+
+    def __init__(self, calibration: Calibration, corner: str = "FL", measured_torque: bool = False):
+        self._corner = corner
+        self._index = corner_index(corner)
+        self._parameters = np.zeros(4, PARAMETERS)
+        self._parameters[self._index] = to_parameters(calibration)
+        self._measured_torque = measured_torque
+        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, collect=True)
+        self._state = new_state()
+        self._end_ns: int | None = None
+
+    def _on_the_drive(self, frames: np.ndarray) -> int:
+        """Put a log's times on the drive's clock, in place; returns what was added."""
+        first = int(frames["time_ns"][0])
+        if self._end_ns is None:
+            self._pipeline.begin(first)
+            shift = 0
+        else:
+            shift = max(0, self._end_ns + _PAUSE_NS - first)
+        frames["time_ns"] += shift
+        self._end_ns = int(frames["time_ns"][-1])
+        return shift
+
+    def frames(self, path: Path):
+        """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
+        frames = read_frames(path)
+        self._on_the_drive(frames)
+        for estimates in run_frames(self._pipeline, frames, predictions=True):
+            yield self._pipeline.broadcast(len(estimates)).copy()
+
+    def run(self, path: Path) -> Result:
+        """Replay one log.
+
+        Raises:
+            InputError: unreadable, or without a usable resolver sample of the corner.
+        """
+        frames = read_frames(path)
+        shift = self._on_the_drive(frames)
+        estimates, samples = [], []
+        for rows in run_frames(self._pipeline, frames):
+            estimates.append(rows.copy())
+            samples.append(self._pipeline.samples[: len(rows)].copy())
+        estimates, samples = np.concatenate(estimates), np.concatenate(samples)
+        if not len(estimates):
+            raise InputError(f"{path}: no resolver sample of corner {self._corner} that passes its CRC and counter check")
+        reference = References(frames, self._corner)
+        times = estimates["time_ns"]
+        if self._measured_torque:
+            samples["brake_torque"] = reference.at(times, reference.brake_torque_Nm, tolerance_ns=1 << 62)
+            supervised = estimates
+            estimates = estimate(samples, self._parameters[self._index], self._state)
+            for name in ("time_ns", "corner", "counter", "cycle", "mode"):
+                estimates[name] = supervised[name]
+        force = reference.at(times, reference.clamp_force_N)
+        return Result(Path(path), times - shift, estimates, samples, reference, force)

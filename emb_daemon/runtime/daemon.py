@@ -1,0 +1,223 @@
+"""The loop: wake when a sample is due, drain, step, send.
+
+Deadlines are absolute and follow the senders: each corner's next sample is expected one period after its last, and the loop
+sleeps until just after that, so that one system call drains a whole sample and the answer leaves at once. Corners whose
+samples arrive together are answered together. If a sample is late the loop waits on the bus for it; if nothing is heard it
+keeps ticking by itself, so that silence is reported too.
+"""
+
+import math
+import threading
+import time
+
+import numpy as np
+
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.errors import InputError
+from emb_daemon.estimator import records
+from emb_daemon.pipeline import CYCLE_NS, Pipeline
+from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.systemd import ServiceManager
+from emb_daemon.wire.frames import ERROR, FRAME
+from emb_daemon.wire.layout import CORNERS, CURRENT, RESOLVER
+
+#: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
+_MARGIN_NS = 200_000
+#: Samples expected within this time of each other are answered in one tick.
+_TOGETHER_NS = 400_000
+#: How long a disturbance of bus or loop is shown in the estimates.
+_SHOWN_NS = 1_000_000_000
+_STATUS_NS = 10_000_000_000
+_OF_THE_LOOP = records.BUS_DISTURBED | records.DEADLINE_MISSED
+
+
+class Pacer:
+    """When to wake next, from when samples arrived."""
+
+    def __init__(self, now_ns: int):
+        self.expected_ns: dict[int, int] = {}
+        self.last_tick_ns = now_ns
+
+    def arrived(self, corner: int, time_ns: int) -> None:
+        """A sample of ``corner`` was complete at ``time_ns``."""
+        self.expected_ns[corner] = time_ns + CYCLE_NS
+
+    def next_wake(self, now_ns: int) -> int:
+        """Time of the next tick; not later than a period after the last one. In the past if a sample is overdue."""
+        for corner, expected in self.expected_ns.items():
+            # A sample that is a whole period late is lost: expect the next.
+            while now_ns > expected + CYCLE_NS:
+                expected += CYCLE_NS
+            self.expected_ns[corner] = expected
+        wakes = [expected + _MARGIN_NS for expected in self.expected_ns.values()]
+        free = self.last_tick_ns + CYCLE_NS
+        if not wakes:
+            return free
+        first = min(wakes)
+        together = max(wake for wake in wakes if wake <= first + _TOGETHER_NS)
+        return min(together, free + _MARGIN_NS)
+
+
+class Daemon:
+    """Estimates of one process on one bus.
+
+    Args:
+        setup: checked configuration.
+        bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
+
+    Attributes:
+        ticks, missed: periods run, and periods in which the loop did not wake.
+    """
+
+    def __init__(self, setup: Setup, bus, manager: ServiceManager | None = None):
+        self._setup = setup
+        self._bus = bus
+        self._manager = manager or ServiceManager(environment={})
+        self.pipeline = Pipeline(setup.parameters, tuple(setup.configuration.corners), setup.layout)
+        self.ticks = self.missed = 0
+        self._invalid = 0
+        self._stop = threading.Event()
+        self._reload = threading.Event()
+        self._reloaded: Setup | None = None
+        self._disturbed_ns = dict.fromkeys((records.BUS_DISTURBED, records.DEADLINE_MISSED), -_SHOWN_NS)
+        self._losses = (0, 0)
+        self._reported: dict[int, tuple[int, int]] = {}
+
+    def stop(self) -> None:
+        """Ask the loop to end; safe in a signal handler."""
+        self._stop.set()
+
+    def reload(self) -> None:
+        """Ask for the calibrations to be read again; safe in a signal handler."""
+        self._reload.set()
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
+        scratch = Pipeline(self._setup.parameters.copy(), CORNERS, self._setup.layout)
+        scratch.begin(0)
+        count = scratch.advance(CYCLE_NS, scratch.consume(np.zeros(1, FRAME))[1])
+        scratch.broadcast(count)
+        self._bus.drain()
+
+    def run(self) -> None:
+        """Tick until `stop`."""
+        for name, calibration in self._setup.calibrations.items():
+            identity = {"corner": name, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}
+            log.info(
+                "corner %(corner)s: actuator %(actuator)s, calibration %(calibration)s", identity, extra={"fields": identity}
+            )
+        now = time.monotonic_ns()
+        self.pipeline.begin(now)
+        pacer = Pacer(now)
+        watchdog_ns = int(0.4e9 * self._manager.watchdog_s) if self._manager.watchdog_s else None
+        next_ping, next_status = now, now + _STATUS_NS
+        self._manager.notify("READY=1", "STATUS=waiting for inputs")
+        while not self._stop.is_set():
+            wake = pacer.next_wake(time.monotonic_ns())
+            remaining = wake - time.monotonic_ns()
+            if remaining > 0:
+                time.sleep(1e-9 * remaining)
+            else:
+                self._bus.wait(1e-9 * (CYCLE_NS // 2))
+            now = time.monotonic_ns()
+            self._count(now, pacer)
+            self.tick(now, pacer)
+            if self._reload.is_set() or self._reloaded is not None:
+                self._take_calibration()
+            if watchdog_ns and now >= next_ping:
+                next_ping = now + watchdog_ns
+                self._ping()
+            if now >= next_status:
+                next_status = now + _STATUS_NS
+                self._manager.notify(f"STATUS={self.ticks} ticks, {self.missed} missed, {self._bus.dropped} frames dropped")
+        self._manager.notify("STOPPING=1")
+        log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
+
+    def tick(self, now_ns: int, pacer: Pacer) -> None:
+        """Everything that has arrived, answered."""
+        pipeline, frames, start = self.pipeline, self._bus.drain(), 0
+        while True:
+            start, count = pipeline.consume(frames, start)
+            if start >= len(frames):
+                count = pipeline.advance(now_ns, count)
+            self._bus.send(pipeline.broadcast(count))
+            self._follow(pipeline.estimates[:count], pacer)
+            if start >= len(frames):
+                break
+        self._watch_bus(frames, now_ns)
+
+    def _follow(self, estimates: np.ndarray, pacer: Pacer) -> None:
+        """Learn when the next samples are due; log what changed."""
+        for row in range(len(estimates)):
+            estimate = estimates[row]
+            corner = int(estimate["corner"])
+            if estimate["is_sample"]:
+                receptions = self.pipeline.receptions
+                arrival = max(receptions[3 * corner + RESOLVER]["time_ns"], receptions[3 * corner + CURRENT]["time_ns"])
+                pacer.arrived(corner, int(arrival))
+            if estimate["source"] == records.INVALID and estimate["mode"] != records.INIT:
+                self._invalid += 1
+            # What disturbs the loop is logged once, not for each corner.
+            state = (int(estimate["mode"]), int(estimate["reasons"]) & ~_OF_THE_LOOP)
+            if self._reported.get(corner) != state:
+                self._reported[corner] = state
+                self._report(corner, *state)
+
+    def _report(self, corner: int, mode: int, reasons: int) -> None:
+        words = [text for bit, text in enumerate(records.REASONS) if reasons >> bit & 1]
+        level = 30 if mode in (records.DEGRADED, records.FAULT) else 20
+        fields = {"corner": CORNERS[corner], "mode": records.MODES[mode], "reasons": ", ".join(words) or "none"}
+        log.log(level, "corner %(corner)s: %(mode)s (%(reasons)s)", fields, extra={"fields": fields})
+
+    def _count(self, now_ns: int, pacer: Pacer) -> None:
+        late = (now_ns - pacer.last_tick_ns) / CYCLE_NS - 1.0
+        pacer.last_tick_ns = now_ns
+        self.ticks += 1
+        if late >= 1.0:
+            self.missed += math.floor(late)
+            self._disturb(records.DEADLINE_MISSED, now_ns)
+
+    def _disturb(self, reason: int, now_ns: int) -> None:
+        if now_ns - self._disturbed_ns[reason] >= _SHOWN_NS:
+            log.warning("%s", records.REASONS[reason.bit_length() - 1], extra={"fields": {"reason": reason}})
+        self._disturbed_ns[reason] = now_ns
+
+    def _watch_bus(self, frames: np.ndarray, now_ns: int) -> None:
+        losses = (self._bus.dropped, self._bus.unsent)
+        if losses != self._losses or self._bus.down or (len(frames) and np.any(frames["flags"] & ERROR)):
+            self._losses = losses
+            self._disturb(records.BUS_DISTURBED, now_ns)
+        bits = 0
+        for reason, at in self._disturbed_ns.items():
+            if now_ns - at < _SHOWN_NS:
+                bits |= reason
+        self.pipeline.disturbed[:] = bits
+
+    def _take_calibration(self) -> None:
+        if self._reloaded is not None:
+            setup, self._reloaded = self._reloaded, None
+            self.pipeline.parameters[:] = setup.parameters
+            for name, calibration in setup.calibrations.items():
+                log.info("corner %s: calibration %s in use", name, calibration_hash(calibration))
+        if self._reload.is_set():
+            self._reload.clear()
+            threading.Thread(target=self._read_calibration, name="reload", daemon=True).start()
+
+    def _read_calibration(self) -> None:
+        try:
+            setup = Setup(self._setup.path)
+            if setup.configuration.corners.keys() != self._setup.configuration.corners.keys():
+                raise InputError(f"{setup.path}: corners: a reload cannot change them, restart instead")
+        except InputError as error:
+            log.error("calibration not reloaded, the old one stays: %s", error)
+        else:
+            self._reloaded = setup
+
+    def _ping(self) -> None:
+        """Tell the watchdog that the loop is well: it ticks, and no estimate came out that is not a number."""
+        if self._invalid:
+            log.error("%d invalid estimates: the watchdog is not pinged", self._invalid)
+            self._invalid = 0
+            return
+        self._manager.notify("WATCHDOG=1")
