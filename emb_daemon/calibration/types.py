@@ -127,6 +127,8 @@ class Pad(Struct, kw_only=True):
     #: Between pad surface and disc, braking and released; between pad and backing plate's thermocouple.
     contact_conductance_W_per_m2K: NonNegative
     gap_conductance_W_per_m2K: NonNegative
+    #: From the released pad surface to the air that the wheel stirs, per wheel speed.
+    surface_cooling_per_speed_J_per_rad_m2K: NonNegative = 0.0
     backplate_conductance_W_per_m2K: Positive
 
     def __post_init__(self):
@@ -165,7 +167,9 @@ class FrictionTable(Struct, kw_only=True):
 
 class Softening(Struct, kw_only=True):
     """alpha = 1 - per_K * rise - history_per_K * (rise through a first-order lag); rise of the mean pad temperature over
-    ambient (thesis 8.4)."""
+    that at which the curves were identified (thesis 8.4)."""
+
+    reference_C: float = 20.0
 
     per_K: float = 0.0
     history_per_K: float = 0.0
@@ -306,6 +310,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     t["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
     t["contact_conductance"] = pad.contact_conductance_W_per_m2K
     t["gap_conductance"] = pad.gap_conductance_W_per_m2K
+    t["surface_cooling_per_speed"] = pad.surface_cooling_per_speed_J_per_rad_m2K
     t["backplate_conductance"] = pad.backplate_conductance_W_per_m2K
     t["disc_heat_capacity"] = disc.heat_capacity_J_per_K
     t["disc_cooling"] = disc.cooling_W_per_K
@@ -319,6 +324,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     t["softening"] = c.thermal.softening.per_K
     t["softening_history"] = c.thermal.softening.history_per_K
     t["history_time"] = c.thermal.softening.history_time_s
+    t["reference"] = c.thermal.softening.reference_C
     t["sigma"] = c.thermal.sigma_K
     for name, values in c.effects.items():
         for key, value in values.items():

@@ -40,6 +40,9 @@ REASONS = (
 CURVE_TERMS = 5
 FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID = 6, 6, 8
 
+#: Depths from the friction surface at which pad temperatures are told, m.
+DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
+
 #: Parameters of pad and disc heat (models/thermal.py). Conductances in W/(m^2 K), areas in m^2.
 THERMAL = np.dtype(
     [
@@ -54,6 +57,7 @@ THERMAL = np.dtype(
         ("heat_share", "f8", (2,)),
         ("contact_conductance", "f8"),
         ("gap_conductance", "f8"),
+        ("surface_cooling_per_speed", "f8"),
         ("backplate_conductance", "f8"),
         ("disc_heat_capacity", "f8"),
         ("disc_cooling", "f8"),
@@ -67,6 +71,7 @@ THERMAL = np.dtype(
         ("softening", "f8"),
         ("softening_history", "f8"),
         ("history_time", "f8"),
+        ("reference", "f8"),
         ("sigma", "f8"),
     ],
     align=True,
@@ -150,12 +155,21 @@ STATE = np.dtype(
         ("covariance", "f8", (STATES, STATES)),
         ("sensitivity", "f8", (STATES,)),
         ("gain", "f8", (STATES,)),
-        # Heat.
+        # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
+        ("heat_time", "f8"),
+        ("heat_energy", "f8"),
+        ("heat_travel", "f8"),
+        ("touching", "?"),
         ("pads", "f8", (2, NODES)),
         ("disc", "f8"),
+        ("mean", "f8", (2,)),
+        ("depth", "f8", (2, len(DEPTHS_M))),
         ("history", "f8"),
         ("ambient", "f8"),
-        ("stiffness_factor", "f8"),
+        ("factor", "f8"),
+        # Standard deviations, K, left from a start with hot pads.
+        ("temperature_doubt", "f8"),
+        ("history_doubt", "f8"),
         ("temperature_known", "?"),
         ("work", "f8", (4, CHAIN)),
         ("effects", EFFECT_STATES),
@@ -166,8 +180,6 @@ STATE = np.dtype(
     ],
     align=True,
 )
-
-DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
 
 ESTIMATE = np.dtype(
     [

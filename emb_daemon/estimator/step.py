@@ -28,6 +28,7 @@ from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.thermal import (
     NODES,
     at_depth,
+    disc_loss,
     friction_power,
     heat_step,
     mean_temperature,
@@ -39,7 +40,11 @@ from emb_daemon.models.torque import friction_state, torque_balance, unexplained
 _CYCLE_S = 0.004
 _ONE_CYCLE_S = 1.5 * _CYCLE_S
 #: Clamp force from which pads and disc exchange heat by contact, N.
-_TOUCHING_N = 200.0
+TOUCHING_N = 200.0
+#: Wheel speed from which pads heat: the sensor's noise at standstill does not.
+TURNING_RAD_PER_S = 0.5
+#: Time between conduction steps, s: twelve samples, less half a sample against rounding.
+_HEAT_STEP_S = 0.046
 #: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
 _DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
@@ -85,47 +90,87 @@ def _follow_zero(s, p, m):
 
 
 @njit
-def _heat(s, p, m):
-    """Pads and disc up to this sample, heated by what the last estimate says; returns the stiffness factor."""
-    t = p.thermal
-    if not s.temperature_known:
-        if not m.has_thermocouple:
-            return 1.0
-        # At rest long enough for a start, the pads lie between their backing plates and the disc, which takes their mean.
-        s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
-        for node in range(NODES):
-            share = t.node_position[node] / t.thickness
-            s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
-            s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-        s.ambient = s.disc
-    # Without vehicle status the last ambient temperature stands: it changes slowly, and a jump would stiffen the pads.
-    if m.has_status:
-        s.ambient = m.ambient
-    if m.dt > 0.0:
-        wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
-        braking = s.fused > _TOUCHING_N
-        power = 0.0
-        if braking:
-            if np.isnan(m.brake_torque):
-                power = friction_power(t, s.fused, wheel_speed, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
-            else:
-                power = max(m.brake_torque, 0.0) * wheel_speed
-        # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
-        inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
-        outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
-        s.disc = heat_step(t, s.pads, s.disc, inner, outer, s.ambient, power, braking, wheel_speed, m.dt, s.work)
-    positions = t.node_position
-    rise = 0.5 * (mean_temperature(s.pads[0], positions) + mean_temperature(s.pads[1], positions)) - s.ambient
-    if not s.temperature_known:
-        s.temperature_known = True
-        s.history = rise
-    elif t.history_time > 0.0:
-        s.history += (1.0 - exp(-m.dt / t.history_time)) * (rise - s.history)
-    return stiffness_factor(t, rise, s.history)
+def _start_heat(s, t, m):
+    """Profiles out of the backing plates alone: right for pads at rest, and doubted by how far the plates are off the caliper.
+
+    The disc takes the plates' mean and the pads lie between.
+    """
+    s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
+    for node in range(NODES):
+        share = t.node_position[node] / t.thickness
+        s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
+        s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
+    s.ambient = s.disc
+    s.temperature_doubt = s.history_doubt = abs(s.disc - m.caliper)
+    _tell_temperatures(s, t)
+    s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    s.factor = stiffness_factor(t, s.history, s.history)
+    s.temperature_known = True
 
 
 @njit
-def _stiffness(s, p, m, factor):
+def _tell_temperatures(s, t):
+    for side in range(2):
+        s.mean[side] = mean_temperature(s.pads[side], t.node_position)
+        for index in range(len(DEPTHS_M)):
+            s.depth[side, index] = at_depth(s.pads[side], t.node_position, DEPTHS_M[index])
+
+
+@njit
+def _flow(s, t, m):
+    """Let the heat of the time since the last heat step flow, and find the stiffness factor anew."""
+    dt = s.heat_time
+    wheel_speed = s.heat_travel / dt
+    # Without vehicle status the last ambient temperature stands: it changes slowly, and a jump would cool the disc.
+    if m.has_status:
+        s.ambient = m.ambient
+    ambient = s.ambient
+    # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
+    inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
+    outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
+    _tell_temperatures(s, t)
+    rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    forgotten = exp(-dt / t.history_time)
+    s.history = forgotten * s.history + (1.0 - forgotten) * rise
+    s.factor = stiffness_factor(t, rise, s.history)
+    # A wrong start dies out as the disc, which stores most of it, cools.
+    s.temperature_doubt *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed) / t.disc_heat_capacity)
+    s.history_doubt *= forgotten
+    s.heat_time = s.heat_energy = s.heat_travel = 0.0
+
+
+@njit
+def _heat(s, p, m):
+    """Pads and disc up to this sample, heated by what the last estimate says.
+
+    A conduction step costs more than all the rest: one serves several samples, as long as the pads' contact stays the same.
+    """
+    t = p.thermal
+    if not s.temperature_known:
+        s.factor = 1.0
+        if m.has_thermocouple:
+            _start_heat(s, t, m)
+        return
+    touching = s.fused > TOUCHING_N
+    if touching != s.touching and s.heat_time > 0.0:
+        _flow(s, t, m)
+    s.touching = touching
+    wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
+    s.heat_time += m.dt
+    s.heat_travel += wheel_speed * m.dt
+    if touching and wheel_speed > TURNING_RAD_PER_S:
+        if np.isnan(m.brake_torque):
+            power = friction_power(t, s.fused, wheel_speed, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
+        else:
+            power = max(m.brake_torque, 0.0) * wheel_speed
+        s.heat_energy += power * m.dt
+    if s.heat_time >= _HEAT_STEP_S:
+        _flow(s, t, m)
+
+
+@njit
+def stiffness_path(s, p, m, factor):
     """Stiffness path: advances the dynamic force and its slope."""
     e, state = p.effects, s.effects
     angle = m.angle + signal_delay.term(e.signal_delay, m.speed)
@@ -164,7 +209,8 @@ def _torque(s, p, m):
 def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     """Kalman filter over the errors of both paths; fills force, sigma and innovation of ``out``."""
     x, P, h = s.error, s.covariance, s.sensitivity
-    relative = p.stiffness_relative_sigma * s.force
+    softening = p.thermal.softening * s.temperature_doubt + p.thermal.softening_history * s.history_doubt
+    relative = (p.stiffness_relative_sigma + softening) * s.force
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
@@ -212,9 +258,9 @@ def step(s, p, m, out):
     if not s.started:
         _start(s, p, m)
     moved_zero = _follow_zero(s, p, m)
-    factor = s.stiffness_factor = _heat(s, p, m)
+    _heat(s, p, m)
     force_before = s.force
-    _stiffness(s, p, m, factor)
+    stiffness_path(s, p, m, s.factor)
     torque, leverage, friction_variance = _torque(s, p, m)
     _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
@@ -229,12 +275,12 @@ def step(s, p, m, out):
     s.fused, s.fused_sigma = out.force, out.sigma
     out.contact_angle = s.contact_angle
     out.contact_sigma = sqrt(s.covariance[1, 1])
-    out.stiffness_factor = factor
-    _temperatures(s, p, out)
+    out.stiffness_factor = s.factor
+    _temperatures(s, out)
     out.mode = RUNNING
     out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
     reasons = OUT_OF_RANGE if moved_zero else 0
-    if not s.temperature_known:
+    if not s.temperature_known or s.temperature_doubt > 2.0 * p.thermal.sigma:
         reasons |= TEMPERATURE_UNCERTAIN
     if out.contact_sigma > 0.5:
         reasons |= CONTACT_UNCERTAIN
@@ -246,16 +292,14 @@ def step(s, p, m, out):
 
 
 @njit
-def _temperatures(s, p, out):
-    positions = p.thermal.node_position
+def _temperatures(s, out):
+    known = s.temperature_known
     for side in range(2):
-        pad = s.pads[side]
-        known = s.temperature_known
-        out.surface[side] = pad[0] if known else np.nan
-        out.mean[side] = mean_temperature(pad, positions) if known else np.nan
+        out.surface[side] = s.pads[side, 0] if known else np.nan
+        out.mean[side] = s.mean[side] if known else np.nan
         for index in range(len(DEPTHS_M)):
-            out.depth[side, index] = at_depth(pad, positions, DEPTHS_M[index]) if known else np.nan
-    out.disc = s.disc if s.temperature_known else np.nan
+            out.depth[side, index] = s.depth[side, index] if known else np.nan
+    out.disc = s.disc if known else np.nan
 
 
 @njit
@@ -273,6 +317,6 @@ def predict(s, p, age, out):
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
     out.contact_angle = s.contact_angle
     out.contact_sigma = sqrt(s.covariance[1, 1])
-    out.stiffness_factor = s.stiffness_factor if s.started else 1.0
+    out.stiffness_factor = s.factor if s.started else 1.0
     out.innovation = out.innovation_sigma = np.nan
-    _temperatures(s, p, out)
+    _temperatures(s, out)

@@ -21,26 +21,40 @@ REFERENCE_C = 20.0
 #: Nodes through one pad. `mesh` puts them densest at the friction surface.
 NODES = 13
 CHAIN = 2 * NODES + 1
-_GROWTH = 1.32
-_LONGEST_S = 0.5
+_GROWTH = 1.1
+#: Longest step that `heat_step` takes at once: for accuracy, any is stable.
+LONGEST_S = 0.25
 
 
 def mesh(thickness: float) -> np.ndarray:
-    """Node positions (m, shape (NODES,)) from the friction surface to the backing plate, spacing growing by a third."""
-    steps = _GROWTH ** np.minimum(np.arange(NODES - 1), 8)
+    """Node positions (m, shape (NODES,)) from the friction surface to the backing plate, spacing growing by a tenth.
+
+    More growth resolves the surface better and thermocouples near the backing plate worse.
+    """
+    steps = _GROWTH ** np.arange(NODES - 1)
     return np.concatenate([[0.0], np.cumsum(steps / steps.sum())]) * thickness
 
 
 @njit
 def at_depth(temperatures, positions, depth):
-    """Temperature at ``depth`` m from the friction surface, linear between nodes; NaN beyond the pad."""
+    """Temperature at ``depth`` m from the friction surface; NaN beyond the pad.
+
+    A cubic through the four nodes around it: a straight line would lose more between two nodes than the mesh itself does.
+    """
     if depth > positions[-1] + 1e-9:
         return np.nan
     node = 0
     while node < len(positions) - 2 and positions[node + 1] < depth:
         node += 1
-    share = (depth - positions[node]) / (positions[node + 1] - positions[node])
-    return temperatures[node] + share * (temperatures[node + 1] - temperatures[node])
+    first = min(max(node - 1, 0), len(positions) - 4)
+    total = 0.0
+    for i in range(first, first + 4):
+        weight = 1.0
+        for j in range(first, first + 4):
+            if j != i:
+                weight *= (depth - positions[j]) / (positions[i] - positions[j])
+        total += weight * temperatures[i]
+    return total
 
 
 @njit
@@ -72,6 +86,7 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
     lower, diagonal, upper, right = work[0], work[1], work[2], work[3]
     positions = p.node_position
     contact = p.contact_conductance if braking else p.gap_conductance
+    to_air = 0.0 if braking else p.surface_cooling_per_speed * wheel_speed
     heat_share = p.heat_share
     for side in range(2):
         pad = pads[side]
@@ -92,7 +107,8 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
                 to_disc = conductance(p, pad[node - 1], pad[node], below)
             else:
                 to_disc = contact
-                rhs += heat_share[side] * power / p.area
+                diag += to_air
+                rhs += heat_share[side] * power / p.area + to_air * ambient
             diag += to_disc
             to_plate = 0.0
             if node < NODES - 1:
@@ -127,7 +143,9 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
 
 
 @njit
-def heat_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
+def heat_step(
+    p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work, longest=LONGEST_S
+):
     """Advance pads and disc by ``dt`` seconds.
 
     Args:
@@ -135,13 +153,15 @@ def heat_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, b
         pads: temperatures (degC), shape (2, NODES): inner and outer pad, friction surface first; changed in place.
         disc: disc temperature, degC.
         inner_backplate, outer_backplate: measured, degC.
-        power: friction power of both pads, W.
+        power: friction power of both pads, W, mean over the step.
+        braking: pads press on the disc and exchange heat by contact; else across a gap, which the wheel ventilates.
+        longest: s, of the steps that it is done in.
         work: scratch, shape (4, CHAIN).
 
     Returns:
         The new disc temperature.
     """
-    parts = int(np.ceil(dt / _LONGEST_S - 1e-9))
+    parts = int(np.ceil(dt / longest - 1e-9))
     for _ in range(parts):
         disc = _chain_step(
             p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt / parts, work
@@ -186,9 +206,10 @@ def _cell(grid, value):
 
 @njit
 def stiffness_factor(p, rise, history):
-    """alpha: stiffness over that of the cold pads (thesis 8.4), from the mean pad temperature over ambient and its history.
+    """alpha: stiffness over that of the cold pads (thesis 8.4), from the mean pad temperature and its history.
 
-    ``rise`` K is the present mean; ``history`` K the same through a first-order lag, which forgets as the thesis's moving
-    window does but needs one number instead of thousands.
+    ``rise`` K is the present mean over the temperature at which the curve was identified (thesis T_p,c, equation 8-10; not
+    today's ambient, which says nothing of what the curve belongs to and can be lost); ``history`` K the same through a
+    first-order lag, which forgets as the thesis's moving window does but needs one number instead of thousands.
     """
     return max(1.0 - p.softening * rise - p.softening_history * history, 0.1)

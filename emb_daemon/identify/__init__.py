@@ -1,0 +1,1 @@
+"""From a rig campaign to a calibration, with the evidence."""

@@ -1,0 +1,87 @@
+"""can-utils as the tests use them: a log played onto the bus, frames recorded from it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import pytest
+
+CHANNEL = "vcan0"
+
+
+def wait_for(what: str, condition: Callable[[], object], timeout_s: float, poll_s: float = 0.05) -> float:
+    """Waits until the condition is true and returns how long that took; fails the test if it takes too long."""
+    start = time.monotonic()
+    while not condition():
+        if time.monotonic() - start > timeout_s:
+            pytest.fail(f"{what}: not within {timeout_s} s")
+        time.sleep(poll_s)
+    return time.monotonic() - start
+
+
+class Frame(NamedTuple):
+    time_s: float
+    can_id: int
+    data: bytes
+
+
+def read_log(path: Path) -> list[Frame]:
+    """Classic data frames of a candump log."""
+    frames = []
+    for line in path.read_text().splitlines():
+        stamp, _, frame = line.split()[:3]
+        can_id, _, data = frame.partition("#")
+        if len(can_id) == 3:
+            frames.append(Frame(float(stamp[1:-1]), int(can_id, 16), bytes.fromhex(data)))
+    return frames
+
+
+class Recording:
+    """candump on a channel, from the moment it listens until the `with` block ends."""
+
+    def __init__(self, path: Path, filters: str = "") -> None:
+        self.path = path
+        self._command = ["candump", "-L", f"{CHANNEL}{filters}"]
+        self.frames: list[Frame] = []
+
+    def __enter__(self) -> Self:
+        self._output = self.path.open("w")
+        self._process = subprocess.Popen(self._command, stdout=self._output)
+        wait_for("candump listens", self._listens, timeout_s=10)
+        return self
+
+    def _listens(self) -> bool:
+        # It has its socket and sleeps, waiting for frames.
+        with contextlib.suppress(FileNotFoundError):
+            process = Path("/proc", str(self._process.pid))
+            sockets = [fd for fd in (process / "fd").iterdir() if os.readlink(fd).startswith("socket:")]
+            state = (process / "stat").read_text().rpartition(")")[2].split()[0]
+            return bool(sockets) and state == "S"
+        return False
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        self._process.wait(10)
+        self._output.close()
+        self.frames = read_log(self.path)
+
+
+@contextlib.contextmanager
+def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
+    """canplayer plays the log, in its own time unless options say otherwise, until it or the `with` block ends."""
+    recorded_on = re.findall(r"\) (\S+) ", log.open().readline())[0]
+    command = ["canplayer", "-I", str(log), *options, f"{CHANNEL}={recorded_on}"]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(10)

@@ -1,0 +1,63 @@
+"""Tests on a real CAN interface, and under a real systemd.
+
+`.ci/target` brings both, on any Debian machine, and says so in EMB_TARGET. Without it, tests here are skipped, except
+those that need only CAN on a machine where vcan0 is up.
+"""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bus_tools import CHANNEL, Recording
+
+PROJECT = Path(__file__).resolve().parents[2]
+RIG = PROJECT.parent / "shared" / "rig"
+
+# What .ci/target promises. A test that finds a promise broken fails; it is never skipped for that.
+PROMISED = {"native": {"can"}, "uml": {"can"}, "systemd": {"can", "systemd"}}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "target(need): needs a real CAN interface ('can') or systemd ('systemd')")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    available = PROMISED.get(os.environ.get("EMB_TARGET", ""))
+    if available is None:
+        available = {"can"} if Path("/sys/class/net", CHANNEL).exists() else set()
+    for item in items:
+        need = marker.args[0] if (marker := item.get_closest_marker("target")) else None
+        if need is not None and need not in available:
+            item.add_marker(pytest.mark.skip(reason=f"needs {need}: run it with .ci/target"))
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., Recording]:
+    """record(",200:7FC") is a Recording of what passes those candump filters."""
+    number = itertools.count()
+    return lambda filters="": Recording(tmp_path / f"recording_{next(number)}.log", filters)
+
+
+@pytest.fixture(scope="session")
+def rig_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first 30 s of a rig log with every message the daemon listens to, unpacked for canplayer."""
+    path = tmp_path_factory.mktemp("rig") / "random.log"
+    with gzip.open(RIG / "static" / "random_6p5mm.log.gz", "rt") as packed:
+        first = packed.readline()
+        end = float(first[1 : first.index(")")]) + 30
+        with path.open("w") as plain:
+            plain.write(first)
+            plain.writelines(itertools.takewhile(lambda line: float(line[1 : line.index(")")]) < end, packed))
+    return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def can_utils() -> None:
+    if os.environ.get("EMB_TARGET"):
+        assert shutil.which("canplayer") and shutil.which("candump"), "can-utils are not installed"
