@@ -1,6 +1,6 @@
 """Logs through the estimator without a bus: what replay, identify and diagnose stand on.
 
-`load_log` turns a log into samples once, by the daemon's own pipeline; `estimate` runs the daemon's own step over them, with
+`load_log` turns a log into samples once, by the daemon's own pipeline; `estimate` runs the daemon's own estimator over them, with
 any parameters, as often as one likes.
 """
 
@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, new_state, unit_parameters
-from emb_daemon.estimator.step import step
-from emb_daemon.jit import njit
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, new_state
 from emb_daemon.logs.columns import References
 from emb_daemon.logs.read import read_frames
-from emb_daemon.pipeline import Pipeline
+from emb_daemon.pipeline import Pipeline, answer
 from emb_daemon.wire.layout import CORNERS
 
 
@@ -43,14 +41,6 @@ class Log:
         return 1e-9 * (self.time_ns - self.time_ns[0])
 
 
-def run_frames(pipeline: Pipeline, frames: np.ndarray, predictions: bool = False):
-    """Feed a whole log to a pipeline; yields estimate arrays (views, valid until the next one)."""
-    start = 0
-    while start < len(frames):
-        start, count = pipeline.consume(frames, start, predictions)
-        yield pipeline.estimates[:count]
-
-
 def load_log(path: str | Path, corner: str = "FL") -> Log:
     """Read a log into samples.
 
@@ -59,26 +49,18 @@ def load_log(path: str | Path, corner: str = "FL") -> Log:
     """
     path = Path(path)
     frames = read_frames(path)
-    parameters = np.zeros(4, PARAMETERS)
-    # The samples alone matter here; the step that comes with them must only stay finite.
-    parameters[:] = unit_parameters()
-    pipeline = Pipeline(parameters, (corner,), capacity=1 << 14, collect=True)
+    pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=1 << 14)
     pipeline.begin(int(frames["time_ns"][0]))
-    samples, times = [], []
-    for estimates in run_frames(pipeline, frames):
-        samples.append(pipeline.samples[: len(estimates)].copy())
-        times.append(estimates["time_ns"].copy())
-    samples, times = np.concatenate(samples), np.concatenate(times)
+    parts, start = [], 0
+    while start < len(frames):
+        start, count = pipeline.collect(frames, start, predictions=False)
+        parts.append(pipeline.samples[:count].copy())
+    samples = np.concatenate(parts)
     if not len(samples):
         raise InputError(f"{path}: no resolver sample of corner {corner} that passes its CRC and counter check")
     reference = References(frames, corner)
+    times = samples["time_ns"]
     return Log(path, corner, samples, times, reference, reference.at(times, reference.clamp_force_N))
-
-
-@njit
-def _run(samples, parameters, state, estimates):
-    for row in range(len(samples)):
-        step(state[0], parameters[0], samples[row], estimates[row])
 
 
 def estimate(samples: np.ndarray, parameters: np.ndarray | np.void, state: np.ndarray | None = None) -> np.ndarray:
@@ -86,7 +68,7 @@ def estimate(samples: np.ndarray, parameters: np.ndarray | np.void, state: np.nd
 
     ``parameters`` is one PARAMETERS record or an array of shape (1,)."""
     estimates = np.zeros(len(samples), ESTIMATE)
-    _run(samples, np.atleast_1d(parameters), new_state() if state is None else state, estimates)
+    answer(samples, len(samples), new_state() if state is None else state, np.atleast_1d(parameters), estimates)
     return estimates
 
 

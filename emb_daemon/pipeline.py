@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_daemon.estimator import records as r
-from emb_daemon.estimator.records import ESTIMATE, SAMPLE, STATE
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import predict, step
 from emb_daemon.jit import njit
 from emb_daemon.wire import layout as wire
@@ -33,14 +33,16 @@ _REPORTED_CYCLES = 25
 _REFUSED_NS = 1_000_000_000
 _OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
 
+#: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
+#: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then.
 CORNER = np.dtype(
     [
-        ("estimator", STATE),
-        ("sample", SAMPLE),
-        ("started", "?"),
         ("active", "?"),
+        ("started", "?"),
         ("pending", "i8"),
         ("pending_ns", "i8"),
+        ("pending_angle", "f8"),
+        ("pending_speed", "f8"),
         ("sample_ns", "i8"),
         ("counter", "i8"),
         ("cycle", "i8"),
@@ -53,16 +55,17 @@ CORNER = np.dtype(
 #: E2E counters of what is sent, by message and corner.
 TRANSMISSION = np.dtype([("counter", "i8", (4, 4))], align=True)
 
+#: Rows that one frame can give besides predictions: each corner's overdue sample, and the sample that the frame completes.
+_ROWS_A_FRAME = 8
+
 
 class Buffers(NamedTuple):
-    """Everything a tick reads and writes, allocated once; see `Pipeline` for what each holds."""
+    """Everything that turning frames into samples reads and writes, allocated once; `Pipeline` says what each holds."""
 
     layout: np.ndarray
-    parameters: np.ndarray
     receptions: np.ndarray
     corners: np.ndarray
     disturbed: np.ndarray
-    estimates: np.ndarray
     samples: np.ndarray
 
 
@@ -73,42 +76,52 @@ class Pipeline:
         parameters: PARAMETERS array, shape (4,), one record for each corner FL, FR, RL, RR.
         corners: names of the corners to estimate.
         layout: LAYOUT array, shape (1,).
-        capacity: estimates that one call of `consume` can hold.
-        collect: keep the samples behind the estimates.
+        capacity: rows that one call of `consume` can hold.
+
+    Attributes:
+        states: STATE array, shape (4,): the estimators.
+        samples, estimates: SAMPLE and ESTIMATE rows of the last call, row by row.
+        disturbed: reason bits, shape (4,), that the loop raises on estimates: what bus and clock know and frames do not.
     """
 
-    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096, collect=False):
+    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096):
+        self.parameters = parameters
+        self.states = new_state(4)
         self.corners = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
-        self.corners["sample"]["brake_torque"] = np.nan
+        self.samples = np.zeros(capacity, SAMPLE)
         self.estimates = np.zeros(capacity, ESTIMATE)
         self.frames = np.zeros(4 * capacity, FRAME)
-        #: The SAMPLE behind each estimate, row by row, if ``collect``.
-        self.samples = np.zeros(capacity if collect else 0, SAMPLE)
-        #: Reason bits that the loop raises on every corner's estimates: what bus and clock know and frames do not.
         self.disturbed = np.zeros(4, np.int64)
-        self.parameters = parameters
         self.layout = wire.default_layout() if layout is None else layout
         self.receptions = new_reception()
         self.transmission = np.zeros(1, TRANSMISSION)
-        self._buffers = Buffers(
-            self.layout, parameters, self.receptions, self.corners, self.disturbed, self.estimates, self.samples
-        )
+        self._buffers = Buffers(self.layout, self.receptions, self.corners, self.disturbed, self.samples)
 
     def begin(self, time_ns: int) -> None:
         """State when listening began, so that silence can be told from the very start."""
         self.corners["sample_ns"] = time_ns
 
+    def collect(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
+        """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the buffer of samples is nearly full.
+
+        Returns (index of the next frame, number of rows in ``self.samples``)."""
+        return _collect(self._buffers, frames, start, predictions)
+
+    def overdue(self, time_ns: int, count: int = 0) -> int:
+        """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then."""
+        return _overdue(self._buffers, time_ns, True, count)
+
+    def answer(self, count: int) -> None:
+        """Estimate the first ``count`` rows of ``self.samples`` into ``self.estimates``."""
+        answer(self.samples, count, self.states, self.parameters, self.estimates)
+
     def consume(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
-        """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the estimate buffer is nearly full.
-
-        Returns (index of the next frame, number of estimates in ``self.estimates``)."""
-        return _consume(self._buffers, frames, start, predictions)
-
-    def advance(self, time_ns: int, count: int = 0) -> int:
-        """Answer what is overdue at ``time_ns``, after the first ``count`` estimates; returns how many there are then."""
-        return _advance(self._buffers, time_ns, True, count)
+        """`collect` and `answer`."""
+        start, count = self.collect(frames, start, predictions)
+        self.answer(count)
+        return start, count
 
     def broadcast(self, count: int) -> np.ndarray:
         """The frames that announce the first ``count`` estimates, in sending order."""
@@ -116,13 +129,12 @@ class Pipeline:
 
 
 @njit
-def _consume(b, frames, start, predictions):
+def _collect(b, frames, start, predictions):
     count = 0
-    # One frame gives at most two estimates a corner: one overdue, one its own; predictions check the room themselves.
-    while start < len(frames) and count + 8 < len(b.estimates):
+    while start < len(frames) and count + _ROWS_A_FRAME < len(b.samples):
         frame = frames[start]
-        count = _advance(b, frame.time_ns, predictions, count)
-        if count + 8 >= len(b.estimates):
+        count = _overdue(b, frame.time_ns, predictions, count)
+        if count + _ROWS_A_FRAME >= len(b.samples):
             break
         start += 1
         slot, verdict = receive(frame, b.receptions, b.layout[0])
@@ -136,38 +148,35 @@ def _consume(b, frames, start, predictions):
         current = b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
         if slot % wire.CORNER_MESSAGES == wire.RESOLVER:
             if corner.pending >= 0:
-                count = _answer(b, index, False, count)
+                count = _complete(b, index, False, count)
             corner.pending = resolver.counter
             corner.pending_ns = resolver.time_ns
-            corner.sample.angle = resolver.values[wire.MOTOR_ANGLE]
-            corner.sample.speed = resolver.values[wire.MOTOR_SPEED]
+            corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
+            corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
         paired = current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
         if corner.pending >= 0 and paired:
-            count = _answer(b, index, True, count)
+            count = _complete(b, index, True, count)
     return start, count
 
 
 @njit
-def _advance(b, time_ns, predictions, count):
+def _overdue(b, time_ns, predictions, count):
     for index in range(4):
         corner = b.corners[index]
         if not corner.active:
             continue
         if corner.pending >= 0 and time_ns - corner.pending_ns > _PAIRING_NS:
-            count = _answer(b, index, False, count)
+            count = _complete(b, index, False, count)
         while (
             predictions
             and time_ns - corner.sample_ns >= (LATE_CYCLES + corner.predicted) * CYCLE_NS
-            and count + 8 < len(b.estimates)
+            and count + _ROWS_A_FRAME < len(b.samples)
         ):
-            age = LATE_CYCLES + corner.predicted
-            corner.predicted += 1
-            estimate = b.estimates[count]
+            row = b.samples[count]
             count += 1
-            _head(estimate, index, corner, corner.sample_ns + age * CYCLE_NS, age)
-            predict(corner.estimator, b.parameters[index], age * CYCLE_S, estimate)
-            estimate.is_sample = False
-            _supervise(b, estimate, index, corner)
+            row.is_prediction = True
+            _head(b, row, index, LATE_CYCLES + corner.predicted)
+            corner.predicted += 1
     return count
 
 
@@ -185,45 +194,37 @@ def _cycles(counter, time_ns, corner):
 
 
 @njit
-def _head(estimate, index, corner, time_ns, age):
-    estimate.corner = index
-    estimate.time_ns = time_ns
-    estimate.counter = corner.counter if corner.started else 15
-    estimate.age_cycles = age
-    estimate.cycle = corner.cycle + age
-    # A sample that comes after predictions may lie before the last of them: that cycle was announced.
-    estimate.elapsed_cycles = max(estimate.cycle - corner.announced, 0)
-    corner.announced = max(estimate.cycle, corner.announced)
-
-
-@njit
-def _answer(b, index, with_current, count):
-    """Step the estimator with the pending resolver sample; returns the new count."""
+def _complete(b, index, with_current, count):
+    """Make the pending resolver sample a row; returns the new count."""
     corner = b.corners[index]
-    sample = corner.sample
+    row = b.samples[count]
     base = wire.CORNER_MESSAGES * index
     now = corner.pending_ns
     cycles = _cycles(corner.pending, now, corner) if corner.started else 0
-    sample.dt = cycles * CYCLE_S
-    sample.has_current = with_current
-    sample.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
+    row.is_prediction = False
+    row.dt = cycles * CYCLE_S
+    row.angle = corner.pending_angle
+    row.speed = corner.pending_speed
+    row.has_current = with_current
+    row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
     thermocouple = b.receptions[base + wire.THERMOCOUPLE]
-    sample.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
-    sample.inner_backplate = thermocouple.values[wire.INNER_BACKPLATE]
-    sample.outer_backplate = thermocouple.values[wire.OUTER_BACKPLATE]
-    sample.caliper = thermocouple.values[wire.CALIPER]
+    row.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
+    row.inner_backplate = thermocouple.values[wire.INNER_BACKPLATE]
+    row.outer_backplate = thermocouple.values[wire.OUTER_BACKPLATE]
+    row.caliper = thermocouple.values[wire.CALIPER]
     speed = b.receptions[wire.WHEEL_SPEED]
-    sample.has_wheel_speed = now - speed.time_ns < _USABLE_NS
-    sample.wheel_speed = speed.values[index]
+    row.has_wheel_speed = now - speed.time_ns < _USABLE_NS
+    row.wheel_speed = speed.values[index]
     pulse = b.receptions[wire.WHEEL_PULSE]
-    sample.has_wheel_pulse = now - pulse.time_ns < _USABLE_NS
-    sample.wheel_pulse = pulse.values[index]
+    row.has_wheel_pulse = now - pulse.time_ns < _USABLE_NS
+    row.wheel_pulse = pulse.values[index]
     status = b.receptions[wire.VEHICLE_STATUS]
-    sample.has_status = now - status.time_ns < _USABLE_NS
-    sample.park_brake = status.values[wire.PARK_BRAKE]
-    sample.brake_request = status.values[wire.BRAKE_REQUEST]
-    sample.ambient = status.values[wire.AMBIENT]
-    sample.vehicle_speed = status.values[wire.VEHICLE_SPEED]
+    row.has_status = now - status.time_ns < _USABLE_NS
+    row.park_brake = status.values[wire.PARK_BRAKE]
+    row.brake_request = status.values[wire.BRAKE_REQUEST]
+    row.ambient = status.values[wire.AMBIENT]
+    row.vehicle_speed = status.values[wire.VEHICLE_SPEED]
+    row.brake_torque = np.nan
 
     corner.cycle += cycles
     corner.started = True
@@ -231,23 +232,27 @@ def _answer(b, index, with_current, count):
     corner.sample_ns = now
     corner.predicted = 0
     corner.pending = -1
-    estimate = b.estimates[count]
-    _head(estimate, index, corner, now, 0)
-    if len(b.samples):
-        b.samples[count] = sample
-    step(corner.estimator, b.parameters[index], sample, estimate)
-    estimate.is_sample = True
-    _supervise(b, estimate, index, corner)
+    _head(b, row, index, 0)
     return count + 1
 
 
 @njit
-def _supervise(b, estimate, index, corner):
-    """Add to an estimate the reasons that lie outside the estimator, and settle its mode."""
-    reasons = estimate.reasons | b.disturbed[index]
-    now = estimate.time_ns
+def _head(b, row, index, age):
+    """Fill what a row says of itself: ``age`` cycles after the corner's last sample, with what is amiss outside the estimator."""
+    corner = b.corners[index]
+    now = corner.sample_ns + age * CYCLE_NS
+    row.corner = index
+    row.time_ns = now
+    row.counter = corner.counter if corner.started else 15
+    row.age_cycles = age
+    row.cycle = corner.cycle + age
+    # A sample that comes after predictions may lie before the last of them: that cycle was announced.
+    row.elapsed_cycles = max(row.cycle - corner.announced, 0)
+    corner.announced = max(row.cycle, corner.announced)
+
+    reasons = b.disturbed[index]
     base = wire.CORNER_MESSAGES * index
-    if estimate.age_cycles >= LATE_CYCLES:
+    if age >= LATE_CYCLES:
         reasons |= r.RESOLVER_LOST
     if now - b.receptions[base + wire.CURRENT].time_ns >= LATE_CYCLES * CYCLE_NS:
         reasons |= r.CURRENT_LOST
@@ -264,13 +269,36 @@ def _supervise(b, estimate, index, corner):
             reasons |= r.E2E_ERROR
         if now - b.receptions[slot].range_ns < _REFUSED_NS:
             reasons |= r.OUT_OF_RANGE
-    estimate.reasons = reasons
-    if not corner.started:
-        estimate.mode = r.INIT
-    elif estimate.source == r.INVALID:
-        estimate.mode = r.FAULT
-    elif reasons and estimate.mode == r.RUNNING:
-        estimate.mode = r.DEGRADED
+    row.reasons = reasons
+
+
+@njit
+def answer(samples, count, states, parameters, estimates):
+    """Estimate ``samples[:count]``: the one place from which the estimator is run.
+
+    ``states`` and ``parameters`` have one record for each corner, or one in all.
+    """
+    for number in range(count):
+        row, estimate = samples[number], estimates[number]
+        state, p = states[row.corner % len(states)], parameters[row.corner % len(parameters)]
+        estimate.time_ns = row.time_ns
+        estimate.cycle = row.cycle
+        estimate.elapsed_cycles = row.elapsed_cycles
+        estimate.age_cycles = row.age_cycles
+        estimate.corner = row.corner
+        estimate.counter = row.counter
+        estimate.is_sample = not row.is_prediction
+        if row.is_prediction:
+            predict(state, p, row.age_cycles * CYCLE_S, estimate)
+        else:
+            step(state, p, row, estimate)
+        estimate.reasons |= row.reasons
+        if not state.started:
+            estimate.mode = r.INIT
+        elif estimate.source == r.INVALID:
+            estimate.mode = r.FAULT
+        elif estimate.reasons and estimate.mode == r.RUNNING:
+            estimate.mode = r.DEGRADED
 
 
 @njit

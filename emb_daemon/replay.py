@@ -7,11 +7,11 @@ import numpy as np
 
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import PARAMETERS, new_state
+from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.judging import force_figures, temperature_figures
 from emb_daemon.logs.columns import References
 from emb_daemon.logs.read import read_frames
-from emb_daemon.offline import corner_index, estimate, run_frames
+from emb_daemon.offline import corner_index
 from emb_daemon.pipeline import Pipeline
 
 #: Pause between two logs of which the second's clock does not go on from the first's.
@@ -55,8 +55,7 @@ class Replay:
         self._parameters = np.zeros(4, PARAMETERS)
         self._parameters[self._index] = to_parameters(calibration)
         self._measured_torque = measured_torque
-        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, collect=True)
-        self._state = new_state()
+        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14)
         self._end_ns: int | None = None
 
     def _on_the_drive(self, frames: np.ndarray) -> int:
@@ -75,8 +74,10 @@ class Replay:
         """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
         frames = read_frames(path)
         self._on_the_drive(frames)
-        for estimates in run_frames(self._pipeline, frames, predictions=True):
-            yield self._pipeline.broadcast(len(estimates)).copy()
+        start = 0
+        while start < len(frames):
+            start, count = self._pipeline.consume(frames, start)
+            yield self._pipeline.broadcast(count).copy()
 
     def run(self, path: Path) -> Result:
         """Replay one log.
@@ -86,20 +87,19 @@ class Replay:
         """
         frames = read_frames(path)
         shift = self._on_the_drive(frames)
-        estimates, samples = [], []
-        for rows in run_frames(self._pipeline, frames):
-            estimates.append(rows.copy())
-            samples.append(self._pipeline.samples[: len(rows)].copy())
+        reference = References(frames, self._corner)
+        pipeline, estimates, samples, start = self._pipeline, [], [], 0
+        while start < len(frames):
+            start, count = pipeline.collect(frames, start, predictions=False)
+            rows = pipeline.samples[:count]
+            if self._measured_torque:
+                rows["brake_torque"] = reference.latest(rows["time_ns"], reference.brake_torque_Nm)
+            pipeline.answer(count)
+            samples.append(rows.copy())
+            estimates.append(pipeline.estimates[:count].copy())
         estimates, samples = np.concatenate(estimates), np.concatenate(samples)
         if not len(estimates):
             raise InputError(f"{path}: no resolver sample of corner {self._corner} that passes its CRC and counter check")
-        reference = References(frames, self._corner)
         times = estimates["time_ns"]
-        if self._measured_torque:
-            samples["brake_torque"] = reference.at(times, reference.brake_torque_Nm, tolerance_ns=1 << 62)
-            supervised = estimates
-            estimates = estimate(samples, self._parameters[self._index], self._state)
-            for name in ("time_ns", "corner", "counter", "cycle", "mode"):
-                estimates[name] = supervised[name]
         force = reference.at(times, reference.clamp_force_N)
         return Result(Path(path), times - shift, estimates, samples, reference, force)

@@ -4,7 +4,7 @@ import numpy as np
 
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
 from emb_daemon.models.fusion import STATES
-from emb_daemon.models.thermal import CHAIN, NODES, mesh
+from emb_daemon.models.thermal import CHAIN, NODES
 
 #: What the estimate rests on (wire: ForceSource).
 FUSED, STIFFNESS_ONLY, TORQUE_ONLY, PREDICTED, INVALID = 0, 1, 2, 3, 15
@@ -107,8 +107,19 @@ PARAMETERS = np.dtype(
     align=True,
 )
 
+#: One row for the estimator. It is a resolver sample, or asks for a prediction ``age_cycles`` after the last
+#: one. ``dt`` s since the last sample; ``cycle`` its number since the first, ``elapsed_cycles`` since the last row;
+#: ``reasons`` what is amiss outside the estimator. ``brake_torque`` N m is a rig's, NaN in a car.
 SAMPLE = np.dtype(
     [
+        ("time_ns", "i8"),
+        ("cycle", "i8"),
+        ("elapsed_cycles", "i8"),
+        ("age_cycles", "i8"),
+        ("corner", "i8"),
+        ("counter", "i8"),
+        ("reasons", "i8"),
+        ("is_prediction", "?"),
         ("dt", "f8"),
         ("angle", "f8"),
         ("speed", "f8"),
@@ -217,17 +228,3 @@ ESTIMATE = np.dtype(
 def new_state(count: int = 1) -> np.ndarray:
     """States of estimators that have seen nothing."""
     return np.zeros(count, STATE)
-
-
-def unit_parameters() -> np.void:
-    """Parameters that stand for no brake but keep every expression finite."""
-    p = np.zeros(1, PARAMETERS)[0]
-    for record in (p, p["thermal"]):
-        for name in record.dtype.names:
-            if record.dtype[name] == np.float64:
-                record[name] = 1.0
-    thermal = p["thermal"]
-    thermal["node_position"] = mesh(1.0)
-    for grid in ("friction_force", "friction_speed", "friction_temperature"):
-        thermal[grid] = np.arange(len(thermal[grid]))
-    return p

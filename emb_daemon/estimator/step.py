@@ -311,7 +311,7 @@ def predict(s, p, age, out):
     # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
     reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * age, p.curve)
     start, _ = characteristic_curve(s.past_contact, p.curve)
-    moved = min(s.stiffness_factor * (reached - start), p.maximum_force)
+    moved = min(s.factor * (reached - start), p.maximum_force)
     out.force = s.fused
     out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
     out.stiffness_force = out.torque_force = out.ml_force = np.nan

@@ -69,3 +69,8 @@ class References:
         nearer = np.where(np.abs(self.time_ns[after] - time_ns) < np.abs(self.time_ns[before] - time_ns), after, before)
         near = np.abs(self.time_ns[nearer] - time_ns) <= tolerance_ns
         return np.where(near, values[nearer], np.nan)
+
+    def latest(self, time_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Force-rate reference ``values`` last heard at each time, NaN before the first."""
+        row = np.searchsorted(self.time_ns, time_ns, side="right") - 1
+        return np.where(row >= 0, values[np.maximum(row, 0)], np.nan) if len(values) else np.full(len(time_ns), np.nan)

@@ -17,7 +17,7 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.errors import InputError
 from emb_daemon.estimator import records
 from emb_daemon.jit import njit
-from emb_daemon.pipeline import CYCLE_NS, Pipeline
+from emb_daemon.pipeline import CYCLE_NS, LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire.frames import ERROR, FRAME
@@ -120,7 +120,9 @@ class Daemon:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
         scratch = Pipeline(self._setup.parameters.copy(), CORNERS, self._setup.layout)
         scratch.begin(0)
-        count = scratch.advance(CYCLE_NS, scratch.consume(np.zeros(1, FRAME))[1])
+        _, count = scratch.collect(np.zeros(1, FRAME))
+        count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
+        scratch.answer(count)
         scratch.broadcast(count)
         _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
         self._bus.drain()
@@ -163,9 +165,10 @@ class Daemon:
         """Everything that has arrived, answered."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
         while True:
-            start, count = pipeline.consume(frames, start)
+            start, count = pipeline.collect(frames, start)
             if start >= len(frames):
-                count = pipeline.advance(now_ns, count)
+                count = pipeline.overdue(now_ns, count)
+            pipeline.answer(count)
             self._bus.send(pipeline.broadcast(count))
             self._follow(count, pacer)
             if start >= len(frames):
