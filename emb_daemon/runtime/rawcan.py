@@ -23,7 +23,7 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
 _MSG_DONTWAIT = 0x40
 _EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
-_ERROR_CLASSES = 0x1FFF_FFFF
+_CAN_RAW_ERR_FILTER, _ERROR_CLASSES = 2, 0x1FFF_FFFF
 
 _CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
 _CAN_FRAME_BYTES = 16
@@ -195,7 +195,7 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
         exact = 0x7FF | _EFF | _RTR
         filters = b"".join(struct.pack("=II", can_id, exact) for can_id in ids)
         sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
-        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_ERR_FILTER, _ERROR_CLASSES)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ERROR_CLASSES)
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         try:
