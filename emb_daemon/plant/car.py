@@ -145,9 +145,11 @@ def _fast_frames(car, p, s, corner, wires, ids, rng, frames, count):
     """Resolver and current of one sample share their counter."""
     base = wire.CORNER_MESSAGES * corner
     noisy = p.released_angle + delayed_angle(p, s) + p.angle_noise * rng.standard_normal()
-    angle = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
+    # Resolver-to-digital converters have hysteresis, so that a standing motor reads as standing.
+    if abs(noisy - s.angle_reading) > 0.5 * p.angle_count + p.angle_hysteresis:
+        s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
     speed = s.speed + p.speed_noise * rng.standard_normal()
-    payload = pack(angle, wires.received[base, 0]) | pack(speed, wires.received[base, 1])
+    payload = pack(s.angle_reading, wires.received[base, 0]) | pack(speed, wires.received[base, 1])
     sent = car.time_ns + np.int64(1e9 * car.jitter * rng.random())
     count = _say(car, base + wire.RESOLVER, payload, ids, frames, count, sent)
     slot = base + wire.CURRENT
@@ -353,6 +355,7 @@ class Car:
         for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
             self.states[field] = ambient
         self.states["stiffness_factor"] = 1.0
+        self.states["angle_reading"] = self.plants["released_angle"]
         self.states["past_contact"] = -self.plants["contact_angle"]
         self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
         self.trainings = np.zeros(len(plants), TRAINING)

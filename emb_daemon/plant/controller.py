@@ -11,6 +11,8 @@ from emb_daemon.plant.records import ANGLE, FORCE, SUBSTEP_S
 _POSITION_GAIN = 40.0
 _SPEED_GAIN = 250.0
 _SPEED_INTEGRAL = 8000.0
+#: Largest acceleration asked of the motor, rad/s^2.
+_ACCELERATION = 8000.0
 _AT_TARGET_RAD = 0.02
 _FORCE_INTEGRAL = 2.0
 _LARGEST_CORRECTION_RAD = 4.0
@@ -50,9 +52,11 @@ def current_demand(p, s):
         error -= _AT_TARGET_RAD if error > 0.0 else -_AT_TARGET_RAD
     speed = min(max(_POSITION_GAIN * error + s.target_rate, -p.maximum_speed), p.maximum_speed)
     lag = speed - s.speed
-    limit = p.torque_constant * p.maximum_current
-    s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
-    s.speed_integral = min(max(s.speed_integral, -limit), limit)
-    torque = p.gear_gain * s.force + p.inertia * _SPEED_GAIN * lag + s.speed_integral
+    acceleration = _SPEED_GAIN * lag
+    if abs(acceleration) < _ACCELERATION:
+        # Outside of its linear range the integral would wind up.
+        s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
+    acceleration = min(max(acceleration, -_ACCELERATION), _ACCELERATION)
+    torque = p.gear_gain * s.force + p.inertia * acceleration + s.speed_integral
     s.position_target += SUBSTEP_S * s.target_rate
     return torque / p.torque_constant

@@ -109,7 +109,8 @@ def plant_from_calibration(
         p[name] = value
     p["current_noise"], p["current_noise_time"] = c.noise.current_A, c.noise.current_correlation_s
     p["speed_noise"] = c.noise.speed_rad_per_s
-    p["angle_noise"], p["angle_count"] = 0.0003, 2.0 * np.pi / 4096
+    count = 2.0 * np.pi / 4096
+    p["angle_noise"], p["angle_count"], p["angle_hysteresis"] = 0.1 * count, count, 0.5 * count
     p["temperature_noise"], p["force_noise"], p["brake_torque_noise"] = 0.25, 25.0, 0.6
     p["force_lead"] = 0.0
     chosen = {name: dict(values) for name, values in c.effects.items() if name in EFFECTS} | (effects or {})

@@ -141,6 +141,7 @@ PLANT_FIELDS = (
     Field("speed_noise", "rad/s", "standard deviation of the measured motor speed, white"),
     Field("angle_noise", "rad", "of the resolver before quantisation"),
     Field("angle_count", "rad", "resolver's least count"),
+    Field("angle_hysteresis", "rad", "beyond half a count, that the angle moves before the converter's reading follows"),
     Field("temperature_noise", "K", "thermocouples"),
     Field("force_noise", "N", "reference force sensor of the rig"),
     Field("force_lead", "s", "time by which the reference force is younger than the resolver's sample"),
@@ -193,6 +194,7 @@ PLANT_STATE = np.dtype(
         ("mean_current_error", "f8"),
         ("angle_history", "f8", (HISTORY,)),
         ("history_at", "i8"),
+        ("angle_reading", "f8"),
         # Books.
         ("motor_work", "f8"),
         ("friction_loss", "f8"),
