@@ -235,6 +235,19 @@ def scenario(name: str) -> Schedule:
     return SCENARIOS[name][0]()
 
 
+#: Share of the demanded force at a rear brake.
+_REAR_SHARE = 0.6
+
+
+def commands_of(schedule: Schedule, corners: tuple[str, ...]) -> np.ndarray:
+    """COMMAND array (cycles, corners): every corner as scheduled, rear brakes with less force."""
+    commands = np.repeat(schedule.commands[:, None], len(corners), axis=1)
+    for row, corner in enumerate(corners):
+        if corner.startswith("R"):
+            commands["target"][:, row] *= np.where(commands["mode"][:, row] == FORCE, _REAR_SHARE, 1.0)
+    return commands
+
+
 def simulate_log(
     plants: np.ndarray | np.void,
     schedule: Schedule,
@@ -258,5 +271,4 @@ def simulate_log(
     car = Car(np.atleast_1d(plants), corners, seed, reference, **car_options)
     if seconds is not None:
         schedule = schedule.first(seconds)
-    commands = np.repeat(schedule.commands[:, None], len(corners), axis=1)
-    return car.run(commands, schedule.drives)
+    return car.run(commands_of(schedule, corners), schedule.drives)
