@@ -1,6 +1,6 @@
 """Motor, gear, friction, pads and caliper of one corner: ordinary differential equations in sub-steps of a quarter millisecond."""
 
-from math import exp, sin
+from math import cos, exp, sin
 
 from emb_daemon.jit import njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S
@@ -44,11 +44,18 @@ def grown(p, s):
     with the disc's temperature, less wear."""
     e = p.effects
     thickness = 1e-6 * e.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
-    variation = e.disc_thickness_variation
-    if variation.order_1_amplitude_um != 0.0 or variation.order_2_amplitude_um != 0.0:
-        first = variation.order_1_amplitude_um * sin(s.wheel_angle + variation.order_1_phase_rad)
-        second = variation.order_2_amplitude_um * sin(2.0 * s.wheel_angle + variation.order_2_phase_rad)
-        thickness += 1e-6 * (first + second)
+    variation, turn = e.disc_thickness_variation, s.wheel_angle
+    if s.uneven_disc:
+        thickness += 1e-6 * (
+            variation.order_1_cosine_um * cos(turn)
+            + variation.order_1_sine_um * sin(turn)
+            + variation.order_2_cosine_um * cos(2.0 * turn)
+            + variation.order_2_sine_um * sin(2.0 * turn)
+            + variation.order_3_cosine_um * cos(3.0 * turn)
+            + variation.order_3_sine_um * sin(3.0 * turn)
+            + variation.order_4_cosine_um * cos(4.0 * turn)
+            + variation.order_4_sine_um * sin(4.0 * turn)
+        )
     return thickness / p.gear_gain
 
 
@@ -57,10 +64,9 @@ def _friction_level(p, s):
     """Sliding friction torque of the gear (N m), without direction (thesis 4-1)."""
     e = p.effects
     level = p.offset_friction + p.load_friction * s.force
-    if e.stribeck_friction.ratio != 0.0:
-        relative = s.speed / e.stribeck_friction.speed_rad_per_s
-        level *= 1.0 + e.stribeck_friction.ratio * exp(-relative * relative)
-    level *= 1.0 + e.friction_asymmetry.share * s.friction
+    if e.stribeck_friction.rise != 0.0:
+        level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
+    level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
     return level * max(1.0 - e.cold_grease.per_K * (s.caliper - _COLD_C), 0.1)
 
 
@@ -74,18 +80,21 @@ def move_motor(p, s, demand):
         demand = min(max(demand, -room), room)
     demand = min(max(demand, -p.maximum_current), p.maximum_current)
     s.current += (demand - s.current) * h / (p.current_time + h)
-    warm = s.caliper + s.magnet_rise - _MAGNETS_C
-    torque = p.torque_constant * (1.0 - e.torque_constant_fade.per_K * warm) * s.current
+    fade = e.torque_constant_fade
+    warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
+    torque = p.torque_constant * (1.0 - fade.fade_per_K * warm) * s.current
     load = p.gear_gain * s.force
-    if e.gear_mesh_ripple.share != 0.0:
-        load *= 1.0 + e.gear_mesh_ripple.share * sin(e.gear_mesh_ripple.order_per_rad * s.angle + e.gear_mesh_ripple.phase_rad)
+    mesh = e.gear_mesh_ripple
+    if mesh.cosine != 0.0 or mesh.sine != 0.0:
+        phase = mesh.order_per_turn * (p.released_angle + s.angle)
+        load *= 1.0 + mesh.cosine * cos(phase) + mesh.sine * sin(phase)
     level = _friction_level(p, s)
-    turning = p.presliding_damping * (1.0 - s.friction * s.friction) + e.viscous_friction.coefficient_Nms_per_rad
+    turning = p.presliding_damping * (1.0 - s.friction * s.friction) + e.viscous_friction.viscous_Nms_per_rad
     resistance = level * s.friction + turning * s.speed
-    if e.cogging_torque.amplitude_Nm != 0.0:
-        resistance += e.cogging_torque.amplitude_Nm * sin(
-            e.cogging_torque.order_per_rad * s.angle + e.cogging_torque.phase_rad
-        )
+    cogging = e.cogging_torque
+    if cogging.cosine_Nm != 0.0 or cogging.sine_Nm != 0.0:
+        phase = cogging.order_per_turn * (p.released_angle + s.angle)
+        resistance += cogging.cosine_Nm * cos(phase) + cogging.sine_Nm * sin(phase)
     before = s.speed
     s.speed += h * (torque - load - resistance) / p.inertia
     # Symplectic: the friction spring neither gains nor loses energy by integration.
@@ -113,9 +122,9 @@ def clamp(p, s):
     e = p.effects
     angle = s.angle
     if e.spindle_lead_error.amplitude_um != 0.0:
-        error = sin(e.spindle_lead_error.order_per_rad * angle + e.spindle_lead_error.phase_rad)
+        error = sin(e.spindle_lead_error.order_per_turn * angle + e.spindle_lead_error.phase_rad)
         angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error
-    half = 0.5 * e.backlash.angle_rad
+    half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
     x = s.driven_angle + grown(p, s) - p.contact_angle
     s.static_force = static_curve(p, x)

@@ -153,7 +153,7 @@ def _fast_frames(car, p, s, corner, wires, ids, rng, frames, count):
     sent = car.time_ns + np.int64(1e9 * car.jitter * rng.random())
     count = _say(car, base + wire.RESOLVER, payload, ids, frames, count, sent)
     slot = base + wire.CURRENT
-    current = s.mean_current + s.mean_current_error + p.effects.current_offset.offset_A
+    current = s.mean_current + s.mean_current_error - p.effects.current_offset.offset_A
     payload = pack(current, wires.received[slot, 0]) | pack(0.15 * rng.standard_normal(), wires.received[slot, 1])
     payload |= pack(car.supply_voltage, wires.received[slot, 2])
     sent = car.time_ns + np.int64(1e9 * car.jitter * (0.5 + rng.random()))
@@ -180,7 +180,7 @@ def _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, c
             if corners[row] == corner:
                 angle = states[row].wheel_angle
         angle += elapsed * car.wheel_speed
-        pulse = (np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) + car.pulse_offset[corner]) % 4096
+        pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % 4096
         pulses |= pack(float(pulse), wires.received[wire.WHEEL_PULSE, corner])
     sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
     count = _say(car, wire.WHEEL_SPEED, speeds, ids, frames, count, sent)
@@ -355,6 +355,8 @@ class Car:
         for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
             self.states[field] = ambient
         self.states["stiffness_factor"] = 1.0
+        variation = self.plants["effects"]["disc_thickness_variation"]
+        self.states["uneven_disc"] = [any(row) for row in variation.tolist()]
         self.states["angle_reading"] = self.plants["released_angle"]
         self.states["past_contact"] = -self.plants["contact_angle"]
         self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
@@ -368,7 +370,7 @@ class Car:
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
         motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
-        motion["pulse_offset"] = self._rng.integers(0, 4096, 4)
+        self.states["wheel_angle"] = self._rng.uniform(0.0, 4096 / PULSES_PER_TURN * 2.0 * pi, len(plants))
         motion["counter"] = self._rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
         for corner in range(4):
             # Both frames of a sample share their counter.

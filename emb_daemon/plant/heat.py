@@ -54,8 +54,8 @@ def friction_of_pads(p, s, wheel_speed):
     value = p.friction_coefficient + p.friction_per_K * (surface - _REFERENCE_C)
     value += p.friction_per_speed * wheel_speed + p.friction_per_force * s.force
     fade = p.effects.friction_coefficient_fade
-    if fade.per_K != 0.0:
-        value *= max(1.0 - fade.per_K * max(surface - fade.onset_C, 0.0), 0.2)
+    if fade.fade_per_K != 0.0:
+        value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
     return max(value, 0.2 * p.friction_coefficient)
 
 
@@ -99,7 +99,7 @@ def heat_cycle(p, s, wheel_speed, ambient):
         lost = p.plate_loss[side] * (s.plate[side] - s.caliper)
         into_caliper += p.pad_area * lost
         s.plate[side] += dt * (flux - lost) / p.plate_heat_capacity
-        lag = e.thermocouple_lag.time_constant_s
+        lag = e.thermocouple_lag.lag_s
         s.plate_reading[side] += (s.plate[side] - s.plate_reading[side]) * dt / (lag + dt)
     hot, cold = s.disc + _KELVIN, ambient + _KELVIN
     area = p.disc_radiating_area + e.disc_radiation.area_m2

@@ -28,31 +28,33 @@ class Field(NamedTuple):
 #: Effects that a plant can have, all off at zero. The first group carries the catalogue's names and parameters; the second
 #: has no catalogue entry, so that a diagnosis can be tested on what nobody has thought of.
 EFFECTS: dict[str, tuple[Field, ...]] = {
-    "disc_thickness_variation": (
-        Field("order_1_amplitude_um", "um", "thickness over the turn, first order, half of peak to peak"),
-        Field("order_1_phase_rad", "rad", "its phase"),
-        Field("order_2_amplitude_um", "um", "second order"),
-        Field("order_2_phase_rad", "rad", "its phase"),
+    "disc_thickness_variation": tuple(
+        Field(f"order_{order}_{part}_um", "um", f"{part} of {order} per turn, over the angle that wheel pulses count")
+        for order in range(1, 5)
+        for part in ("cosine", "sine")
     ),
     "disc_thermal_expansion": (Field("growth_um_per_K", "um/K", "disc and pads grow with the disc's temperature"),),
     "pad_wear": (Field("wear_um_per_MJ", "um/MJ", "both pads together, by friction energy"),),
-    "torque_constant_fade": (Field("per_K", "1/K", "relative loss of torque constant as the magnets warm"),),
-    "current_offset": (Field("offset_A", "A", "added to the measured current"),),
-    "viscous_friction": (Field("coefficient_Nms_per_rad", "N m s/rad", "friction torque per motor speed"),),
-    "stribeck_friction": (
-        Field("ratio", "1", "friction at standstill over sliding friction, minus one"),
-        Field("speed_rad_per_s", "rad/s", "motor speed at which the excess has fallen to 1/e"),
+    "torque_constant_fade": (
+        Field("fade_per_K", "1/K", "relative loss of torque constant as the magnets warm over 25 degC"),
+        Field("disc_share", "1", "where the motor's surroundings lie between caliper and disc"),
     ),
-    "friction_asymmetry": (Field("share", "1", "more friction clamping, less releasing"),),
+    "current_offset": (Field("offset_A", "A", "flows but is not measured"),),
+    "viscous_friction": (Field("viscous_Nms_per_rad", "N m s/rad", "friction torque per motor speed"),),
+    "stribeck_friction": (
+        Field("rise", "1", "friction at standstill over sliding friction, minus one"),
+        Field("speed_rad_per_s", "rad/s", "motor speed at which the rise has fallen to 1/e"),
+    ),
+    "friction_asymmetry": (Field("asymmetry", "1", "share by which friction is more when clamping, less when releasing"),),
     "gear_mesh_ripple": (
-        Field("share", "1", "of the torque that the clamp force needs"),
-        Field("order_per_rad", "1/rad", "periods per motor radian, times 2 pi"),
-        Field("phase_rad", "rad", "phase"),
+        Field("cosine", "1", "of the torque that the clamp force needs"),
+        Field("sine", "1", "likewise"),
+        Field("order_per_turn", "1", "ripples per motor turn"),
     ),
     "cogging_torque": (
-        Field("amplitude_Nm", "N m", "torque ripple without load"),
-        Field("order_per_rad", "1/rad", "periods per motor radian, times 2 pi"),
-        Field("phase_rad", "rad", "phase"),
+        Field("cosine_Nm", "N m", "torque that turning takes whatever the load"),
+        Field("sine_Nm", "N m", "likewise"),
+        Field("order_per_turn", "1", "teeth per motor turn"),
     ),
     "stiffness_hysteresis": (
         Field("share", "1", "half width of the loop over the clamp force"),
@@ -63,13 +65,13 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("time_constant_s", "s", "its time constant"),
     ),
     "signal_delay": (Field("delay_s", "s", "age of the measured motor angle, up to 15 ms"),),
-    "backlash": (Field("angle_rad", "rad", "motor angle lost at each reversal"),),
+    "backlash": (Field("play_rad", "rad", "motor angle lost at each reversal"),),
     "friction_coefficient_fade": (
-        Field("per_K", "1/K", "relative loss of pad friction above the onset"),
+        Field("fade_per_K", "1/K", "relative loss of pad friction above the onset"),
         Field("onset_C", "degC", "pad surface temperature at which it begins"),
     ),
     "disc_radiation": (Field("area_m2", "m2", "radiating area times emissivity, in addition to the plant's own"),),
-    "thermocouple_lag": (Field("time_constant_s", "s", "first-order lag of the backplate thermocouples"),),
+    "thermocouple_lag": (Field("lag_s", "s", "first-order lag of the backplate thermocouples"),),
     # Outside of the catalogue.
     "clamp_creep": (
         Field("share", "1", "share of the force that creeps in"),
@@ -79,7 +81,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
     "caliper_softening": (Field("per_K", "1/K", "relative loss of stiffness as the caliper warms over 22 degC"),),
     "spindle_lead_error": (
         Field("amplitude_um", "um", "travel error over the spindle's turn"),
-        Field("order_per_rad", "1/rad", "periods per motor radian, times 2 pi"),
+        Field("order_per_turn", "1", "periods per motor turn"),
         Field("phase_rad", "rad", "phase"),
     ),
     "cold_grease": (Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),),
@@ -176,8 +178,9 @@ PLANT_STATE = np.dtype(
         ("target_rate", "f8"),
         ("speed_integral", "f8"),
         ("force_correction", "f8"),
-        # Wheel and heat.
+        # Wheel (its zero is where its pulses count from) and heat.
         ("wheel_angle", "f8"),
+        ("uneven_disc", "?"),
         ("brake_torque", "f8"),
         ("pads", "f8", (2, CELLS)),
         ("surface", "f8", (2,)),
@@ -261,7 +264,6 @@ CAR = np.dtype(
         # s; messages leave up to this late after their sample.
         ("jitter", "f8"),
         ("counter", "i8", (15,)),
-        ("pulse_offset", "i8", (4,)),
         ("reference", "?"),
     ],
     align=True,
