@@ -7,8 +7,9 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import CYCLE_NS
 from emb_daemon.plant.scenarios import Schedule, commands_of
 
-#: A car that the machine has held up for longer than this goes on from now instead of catching up.
-_GIVE_UP_NS = 40_000_000
+#: Frames of a cycle that the machine has held up for longer than this are lost, as they would be on a real bus; the car's
+#: time and counters go on with the clock.
+_LOST_NS = 2 * CYCLE_NS
 
 
 class LiveCar:
@@ -17,6 +18,7 @@ class LiveCar:
     Attributes:
         ticks: cycles run.
         late: cycles that left more than half a cycle after their time, the machine's doing.
+        lost: cycles whose frames were not sent at all because their time had passed.
     """
 
     def __init__(self, car: Car, bus, schedule: Schedule):
@@ -24,7 +26,7 @@ class LiveCar:
         self._bus = bus
         self._drives = schedule.drives
         self._commands = commands_of(schedule, car.corners)
-        self.ticks = self.late = 0
+        self.ticks = self.late = self.lost = 0
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, what a cycle calls; the car stays as it is."""
@@ -34,23 +36,25 @@ class LiveCar:
     def run(self, stop: threading.Event, seconds: float | None = None, sent=None, heard=None) -> None:
         """Run until ``stop`` is set or ``seconds`` are over.
 
-        ``sent(time_ns, truth)`` is called after each cycle has left, with its TRUTH rows; ``heard(frames)`` with whatever
-        came from the bus since. Both views are valid during the call only.
+        ``sent(time_ns, truth)`` is called after each cycle has left, with its TRUTH rows and when it left, 0 if it was lost;
+        ``heard(frames)`` with whatever came from the bus since. Both views are valid during the call only.
         """
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()
         while not stop.is_set() and self.ticks != last:
             row = self.ticks % len(self._drives)
             frames = self.car.tick(self._commands[row], self._drives[row])
-            self._bus.send(frames)
-            now = time.monotonic_ns()
-            if sent is not None:
-                sent(now, self.car.truth)
             self.ticks += 1
-            self.late += now - deadline > CYCLE_NS // 2
+            now = time.monotonic_ns()
+            lost = now - deadline > _LOST_NS
+            self.lost += lost
+            if not lost:
+                self._bus.send(frames)
+                now = time.monotonic_ns()
+                self.late += now - deadline > CYCLE_NS // 2
+            if sent is not None:
+                sent(0 if lost else now, self.car.truth)
             deadline += CYCLE_NS
-            if now - deadline > _GIVE_UP_NS:
-                deadline = now
             self._listen(deadline, heard)
 
     def _listen(self, deadline: int, heard) -> None:

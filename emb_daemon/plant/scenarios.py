@@ -136,7 +136,9 @@ def rig_stop(force_N: float, wheel_speed: float, clamp_seconds: float = 3.0, cyc
     time = CYCLE_S * np.arange(len(schedule))
     begin = cycle_seconds - clamp_seconds - 1.5
     stop = begin + 0.85 * clamp_seconds
-    schedule.drives["wheel_speed"] = wheel_speed * np.clip(np.minimum(time / (0.7 * begin), (stop - time) / (stop - begin)), 0, 1)
+    schedule.drives["wheel_speed"] = wheel_speed * np.clip(
+        np.minimum(time / (0.7 * begin), (stop - time) / (stop - begin)), 0, 1
+    )
     force = force_N * np.clip((time - begin) / 0.2, 0.0, 1.0) * (time < begin + clamp_seconds)
     return _forces(schedule, force)
 
