@@ -47,8 +47,15 @@ def load_log(path: str | Path, corner: str = "FL") -> Log:
     Raises:
         InputError: unreadable, or no resolver sample of that corner in it.
     """
-    path = Path(path)
-    frames = read_frames(path)
+    return log_of(read_frames(path), corner, Path(path))
+
+
+def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:
+    """A FRAME array as samples; ``path`` is what messages call it.
+
+    Raises:
+        InputError: no resolver sample of that corner in it.
+    """
     pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=1 << 14)
     pipeline.begin(int(frames["time_ns"][0]))
     parts, start = [], 0

@@ -1,0 +1,24 @@
+"""emb-daemon demo."""
+
+import argparse
+from pathlib import Path
+
+from emb_daemon.errors import InputError
+
+EXAMPLE = "emb-daemon demo --corners 4 --seconds 30"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
+    parser.add_argument("--seconds", type=float, default=30.0, metavar="S", help="length of the drive (30)")
+    parser.add_argument("--picture", type=Path, default=Path("emb-daemon-demo.png"), metavar="FILE", help="where to save it")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from emb_daemon.demo.session import run_demo
+
+    if not 1.0 <= arguments.seconds <= 3600.0:
+        raise InputError(f"--seconds {arguments.seconds:g}: expected 1 to 3600")
+    if not arguments.picture.absolute().parent.is_dir():
+        raise InputError(f"--picture {arguments.picture}: no such folder {arguments.picture.absolute().parent}")
+    return run_demo(arguments.corners, arguments.seconds, arguments.picture)

@@ -1,0 +1,56 @@
+"""emb-daemon simulate."""
+
+import argparse
+import signal
+from pathlib import Path
+
+EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario drive"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    from emb_daemon.cli.busoptions import add_bus_arguments
+
+    parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds; without it, on Ctrl-C or SIGTERM")
+    parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="the kind of brake; without it, the shipped one")
+    parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
+    parser.add_argument("--seed", type=int, default=0, help="of tolerances and noise (0)")
+    add_bus_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import threading
+
+    import numpy as np
+
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.cli.busoptions import bus_options
+    from emb_daemon.plant.car import Car
+    from emb_daemon.plant.derive import plant_from_calibration
+    from emb_daemon.plant.live import LiveCar
+    from emb_daemon.plant.scenarios import scenario
+    from emb_daemon.resources import resource
+    from emb_daemon.runtime.bus import open_bus
+    from emb_daemon.wire.layout import CORNERS, default_layout
+
+    schedule = scenario(arguments.scenario)
+    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    corners = CORNERS[: arguments.corners]
+    seeds = [arguments.seed + index for index in range(len(corners))]
+    plants = np.array([plant_from_calibration(calibration, seed) for seed in seeds])
+    # What the daemon broadcasts; the car itself reacts to EMB_c_AdaptRequest only.
+    ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
+    bus = open_bus(**bus_options(arguments), ids=ids)
+    live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    live.warm_up()
+    print(f"{', '.join(corners)}: {arguments.scenario}, {schedule.seconds:.0f} s over and over; Ctrl-C ends it", flush=True)
+    try:
+        live.run(stop, arguments.seconds)
+    finally:
+        bus.close()
+    print(f"{live.ticks} cycles, {live.late} late, {bus.unsent} frames not sent")
+    return 0

@@ -1,0 +1,1 @@
+"""The demonstration: the simulated car and the real daemon on a bus inside one process."""

@@ -1,0 +1,151 @@
+"""What the demonstration remembers: the car's truth, and the daemon's broadcasts as they came from the bus."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.estimator.records import INVALID
+from emb_daemon.logs.columns import Decoder
+from emb_daemon.plant.records import CYCLE_NS, TRUTH
+from emb_daemon.wire.e2e import COUNTER_MODULO
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, default_layout
+
+#: An answer that is this late belongs to a later sample with the same counter.
+_LATEST_CYCLES = COUNTER_MODULO - 1
+#: Frames of a corner in one cycle at most: a force, and the slower messages.
+_FRAMES_PER_CYCLE = 6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One corner's estimates beside the truth of the samples that they name.
+
+    Attributes:
+        time_s: of the samples, from the start; shape (n,), as all below.
+        force_N, sigma_N, true_N: estimate, its standard deviation, simulated truth.
+        response_s: from a sample's frames on the bus to its estimate on the bus.
+        usable: the estimate's Status was not NotAvailable or Fault.
+        samples: how many resolver samples reached the bus.
+    """
+
+    time_s: np.ndarray
+    force_N: np.ndarray
+    sigma_N: np.ndarray
+    true_N: np.ndarray
+    response_s: np.ndarray
+    usable: np.ndarray
+    samples: int
+
+    def figures(self) -> dict[str, float]:
+        """Error figures in N over the usable estimates, and the share of them within two sigma."""
+        error = (self.force_N - self.true_N)[self.usable]
+        if not len(error):
+            return dict.fromkeys(("rmse", "bias", "p95", "max", "within_2_sigma"), np.nan)
+        size = np.abs(error)
+        return {
+            "rmse": float(np.sqrt(np.mean(error**2))),
+            "bias": float(np.mean(error)),
+            "p95": float(np.percentile(size, 95)),
+            "max": float(np.max(size)),
+            "within_2_sigma": float(np.mean(size <= 2.0 * self.sigma_N[self.usable])),
+        }
+
+
+class Recorder:
+    """Fills preallocated arrays from the car's thread; read it at any time, compare at the end."""
+
+    def __init__(self, corners: tuple[str, ...], seconds: float):
+        cycles = round(seconds * 1e9 / CYCLE_NS) + 1
+        self.corners = corners
+        self.truth = np.zeros((cycles, len(corners)), TRUTH)
+        self.sent_ns = np.zeros(cycles, np.int64)
+        self.cycles = 0
+        self.frames = np.zeros(cycles * len(corners) * _FRAMES_PER_CYCLE, FRAME)
+        #: Cycles that the car had sent when a frame came.
+        self.frame_cycle = np.zeros(len(self.frames), np.int64)
+        self.count = 0
+        layout = default_layout()[0]
+        self._ids = layout["sent_id"]
+        self._signals = layout["sent"].tolist()
+        #: Payload of each of the daemon's messages as last heard, by CAN id.
+        self.latest: dict[int, int] = {}
+
+    def sent(self, time_ns: int, truth: np.ndarray) -> None:
+        """A cycle of the car has left at ``time_ns``, or was lost if that is 0."""
+        self.truth[self.cycles] = truth
+        self.sent_ns[self.cycles] = time_ns
+        self.cycles += 1
+
+    def heard(self, frames: np.ndarray) -> None:
+        """Frames came from the bus."""
+        room = min(len(frames), len(self.frames) - self.count)
+        self.frames[self.count : self.count + room] = frames[:room]
+        self.frame_cycle[self.count : self.count + room] = self.cycles
+        self.count += room
+        for can_id, data in zip(frames["can_id"].tolist(), frames["data"].tolist(), strict=True):
+            self.latest[can_id] = data
+
+    def value(self, kind: int, row: int, column: int) -> float:
+        """An unsigned signal of the daemon's message ``kind`` for the corner in ``row`` as last heard, NaN before."""
+        corner = CORNERS.index(self.corners[row])
+        data = self.latest.get(int(self._ids[kind, corner]))
+        if data is None:
+            return np.nan
+        start, length, _signed, factor, offset, *_ = self._signals[kind][column]
+        return (data >> start & (1 << length) - 1) * factor + offset
+
+    def status(self, row: int) -> int:
+        """Status of the clamp force as last heard, 15 before."""
+        data = self.latest.get(int(self._ids[CLAMP_FORCE, CORNERS.index(self.corners[row])]))
+        return 15 if data is None else data >> 12 & 0xF
+
+    def progress(self, row: int) -> float:
+        """Progress of adaptation in percent while the daemon asks for training motion, NaN otherwise."""
+        return self.value(ADAPT_REQUEST, row, 1) if self.value(ADAPT_REQUEST, row, 0) == 1.0 else np.nan
+
+    def recent_responses(self, row: int, cycles: int = 500) -> np.ndarray:
+        """Response times (s) of the last estimates of one corner."""
+        start = max(self.count - cycles * len(self.corners) * 2, 0)
+        return self._matched(row, start, self.count)[3]
+
+    def _matched(self, row: int, start: int, stop: int):
+        """(frames of the clamp force, their row in the truth, status, response time in s)."""
+        corner = CORNERS.index(self.corners[row])
+        frames, cycle = self.frames[start:stop], self.frame_cycle[start:stop]
+        mine = (frames["can_id"] == self._ids[CLAMP_FORCE, corner]) & (cycle > 0)
+        frames, newest = frames[mine], cycle[mine] - 1
+        answered = (frames["data"] >> np.uint64(48) & np.uint64(0xF)).astype(np.int64)
+        age = (self.truth["counter"][newest, row] - answered) % COUNTER_MODULO
+        known = (answered < COUNTER_MODULO) & (age <= np.minimum(newest, _LATEST_CYCLES))
+        known &= self.sent_ns[np.where(known, newest - age, 0)] > 0
+        frames, at = frames[known], (newest - age)[known]
+        status = (frames["data"] >> np.uint64(12) & np.uint64(0xF)).astype(np.int64)
+        return frames, at, status, 1e-9 * (frames["time_ns"] - self.sent_ns[at])
+
+    def compare(self, row: int) -> Comparison:
+        """One corner from beginning to end; answers to a sample only, not predictions in its absence."""
+        frames, at, status, response = self._matched(row, 0, self.count)
+        corner = self.corners[row]
+        columns = Decoder().columns(frames, f"EMB_{corner}_ClampForce")
+        answers = columns["InputAge"] == 0.0
+        time = 1e-9 * (self.truth["time_ns"][at, row] - self.truth["time_ns"][0, row])
+        return Comparison(
+            time_s=time[answers],
+            force_N=1e3 * columns["ClampForce"][answers],
+            sigma_N=1e3 * columns["ClampForceSigma"][answers],
+            true_N=self.truth["force"][at, row][answers],
+            response_s=response[answers],
+            usable=(status <= 1)[answers] & (columns["ForceSource"] != INVALID)[answers],
+            samples=int(np.count_nonzero(self.sent_ns)),
+        )
+
+    def temperatures(self, row: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Pad temperatures that one corner's daemon broadcast: (time in s, columns in degC), where they were usable."""
+        frames, cycle = self.frames[: self.count], self.frame_cycle[: self.count]
+        columns = Decoder().columns(frames, f"EMB_{self.corners[row]}_PadTemp")
+        cycle = cycle[np.isin(frames["can_id"], self._ids[1, CORNERS.index(self.corners[row])])]
+        usable = (columns["Status"] <= 1) & (cycle > 0)
+        at = cycle[usable] - 1
+        time = 1e-9 * (self.truth["time_ns"][at, row] - self.truth["time_ns"][0, row])
+        return time, {name: values[usable] for name, values in columns.items()}

@@ -1,0 +1,185 @@
+"""Simulated car and daemon, each in a thread of its own, on the two ends of a bus inside this process."""
+
+import contextlib
+import logging
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.demo.recorder import Recorder
+from emb_daemon.plant.car import Car
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.live import LiveCar
+from emb_daemon.plant.scenarios import city_drive
+from emb_daemon.resources import resource
+from emb_daemon.runtime.daemon import Daemon
+from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.runtime.realtime import settle_memory, use_fifo
+from emb_daemon.wire.layout import CORNERS
+
+_VIEW_S, _LINE_S = 0.25, 3.0
+_DAEMON_PRIORITY = 60
+
+
+class _LastMessages(logging.Handler):
+    """The daemon's last log lines, for the view."""
+
+    def __init__(self, count: int = 4):
+        super().__init__()
+        self.lines: deque[str] = deque(maxlen=count)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
+
+
+class Session:
+    """One demonstration.
+
+    Args:
+        corners: 1 to 4, FL first.
+        seconds: length of the drive.
+        seed: of the brakes' tolerances and of all noise.
+
+    Attributes:
+        recorder: truth and broadcasts.
+        daemon, live: the daemon and the car, for their counts.
+    """
+
+    def __init__(self, corners: int, seconds: float, seed: int = 1):
+        self.seconds = seconds
+        names = CORNERS[:corners]
+        self._folder = tempfile.TemporaryDirectory(prefix="emb-daemon-demo-")
+        calibration = resource("config/calibration.yaml")
+        lines = [f"  {name}: {{calibration: {str(calibration)!r}}}" for name in names]
+        config = Path(self._folder.name) / "emb.yaml"
+        config.write_text("\n".join(["format: 1", "corners:", *lines, ""]), encoding="utf-8")
+        setup = Setup(config)
+        plants = np.array([plant_from_calibration(setup.calibrations[name], seed + row) for row, name in enumerate(names)])
+        ours, theirs = socket_pair()
+        self._buses = (ours, theirs)
+        self.daemon = Daemon(setup, theirs)
+        self.live = LiveCar(Car(plants, names, seed), ours, city_drive())
+        self.recorder = Recorder(names, seconds)
+        self._stop = threading.Event()
+        self._failures: list[BaseException] = []
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache."""
+        self.daemon.warm_up()
+        self.live.warm_up()
+        self.recorder.compare(0)
+        settle_memory()
+
+    def run(self, show, period_s: float) -> None:
+        """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
+        drive = (self._stop, self.seconds, self.recorder.sent, self.recorder.heard)
+        daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")
+        # The car goes first: a real one waits for nobody.
+        car = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY + 1, self.live.run, *drive), name="car")
+        daemon.start()
+        car.start()
+        try:
+            with contextlib.suppress(KeyboardInterrupt):
+                while car.is_alive() and not self._failures:
+                    car.join(period_s)
+                    if self.recorder.latest:
+                        show()
+        finally:
+            self._stop.set()
+            car.join()
+            self.daemon.stop()
+            daemon.join()
+            for bus in self._buses:
+                bus.close()
+            self._folder.cleanup()
+        if self._failures:
+            raise self._failures[0]
+
+    def _guard(self, priority: int, target, *arguments) -> None:
+        try:
+            log.info("%s: %s", threading.current_thread().name, use_fifo(priority))
+            target(*arguments)
+        except BaseException as error:
+            self._failures.append(error)
+
+
+def _summary(session: Session) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    recorder = session.recorder
+    table = Table(title="Estimate from the bus against the simulated truth", title_justify="left")
+    for heading in ("corner", "RMSE", "bias", "95 %", "largest", "within 2 σ", "answered", "response 50 / 99 %"):
+        table.add_column(heading, justify="right")
+    for row, corner in enumerate(recorder.corners):
+        comparison = recorder.compare(row)
+        figures = comparison.figures()
+        median, tail = (
+            (1e3 * np.percentile(comparison.response_s, (50, 99))) if len(comparison.response_s) else (np.nan, np.nan)
+        )
+        table.add_row(
+            corner,
+            *(f"{figures[name]:.0f} N" for name in ("rmse", "bias", "p95", "max")),
+            f"{100.0 * figures['within_2_sigma']:.1f} %",
+            f"{len(comparison.time_s)} of {comparison.samples}",
+            f"{median:.2f} / {tail:.2f} ms",
+        )
+    console = Console() if sys.stdout.isatty() else Console(width=110)
+    console.print(table)
+    daemon, live = session.daemon, session.live
+    console.print(
+        f"Daemon: {daemon.ticks} ticks, {daemon.missed} missed. Car: {live.ticks} cycles, {live.late} late, {live.lost} lost"
+        " (the machine's scheduling; both share one process)."
+    )
+
+
+def run_demo(corners: int, seconds: float, picture: Path) -> int:
+    """Live view, summary, picture; returns the exit status."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from emb_daemon.demo.picture import save_picture
+    from emb_daemon.demo.view import line, render
+
+    handler = _LastMessages()
+    log.handlers[:] = [handler]
+    log.propagate = False
+    log.setLevel(logging.INFO)
+    console = Console()
+    session = Session(corners, seconds)
+    compiling = "Loading compiled code (the first time it is compiled, which takes a minute)"
+    if console.is_terminal:
+        with console.status(compiling):
+            session.warm_up()
+        with Live(console=console, auto_refresh=False) as view:
+
+            def show() -> None:
+                view.update(render(session.recorder, session.daemon, session.live, seconds, handler.lines), refresh=True)
+
+            session.run(show, _VIEW_S)
+    else:
+        print(compiling, flush=True)
+        session.warm_up()
+        next_line = time.monotonic()
+
+        def show_line() -> None:
+            nonlocal next_line
+            if time.monotonic() >= next_line:
+                next_line += _LINE_S
+                print(line(session.recorder, session.daemon, session.live), flush=True)
+
+        session.run(show_line, 0.1)
+    if session.recorder.cycles < 2 or not session.recorder.count:
+        print("ended before the first estimate", file=sys.stderr)
+        return 0
+    _summary(session)
+    save_picture(session.recorder, picture)
+    print(f"Picture: {picture}")
+    return 0

@@ -1,0 +1,111 @@
+"""Live view of the demonstration."""
+
+import math
+
+import numpy as np
+from rich.console import Group
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from emb_daemon.demo.recorder import Recorder
+from emb_daemon.estimator.records import MODES, SOURCES
+from emb_daemon.plant.records import PARK_RELEASED
+from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
+
+_BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
+_STATUS = {0: "ok", 1: "degraded", 2: "fault", 15: "n/a"}
+_STATUS_COLOURS = {0: "green", 1: "yellow", 2: "red", 15: "dim"}
+
+
+def phase(truth: np.void) -> str:
+    """What the car is doing."""
+    if truth["training"]:
+        return "training motion"
+    if truth["park_brake"] != PARK_RELEASED:
+        return "parked"
+    if truth["brake_request"]:
+        return "braking" if truth["vehicle_speed"] > 0.0 else "held"
+    return "driving" if truth["vehicle_speed"] > 0.1 else "standing"
+
+
+def health(recorder: Recorder, daemon, live) -> str:
+    """Loop health in one line: response from sample to estimate as the bus sees it, missed periods, late cycles of the car."""
+    responses = recorder.recent_responses(0)
+    if not len(responses):
+        return "no estimate yet"
+    median, tail = 1e3 * np.percentile(responses, (50, 99))
+    return (
+        f"sample to estimate {median:.2f} ms (99 %: {tail:.2f} ms) · daemon {daemon.ticks} ticks, {daemon.missed} missed"
+        f" · car {live.late} cycles late, {live.lost} lost"
+    )
+
+
+def line(recorder: Recorder, daemon, live) -> str:
+    """The view as one line, for output that is no terminal."""
+    truth = recorder.truth[recorder.cycles - 1]
+    corners = "  ".join(
+        f"{corner} {recorder.value(CLAMP_FORCE, row, 0):6.2f} ± {2.0 * recorder.value(CLAMP_FORCE, row, 1):4.2f} kN"
+        f" (true {1e-3 * truth[row]['force']:6.2f})"
+        for row, corner in enumerate(recorder.corners)
+    )
+    time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
+    return (
+        f"{time:5.1f} s {phase(truth[0]):8s} {truth[0]['vehicle_speed']:4.1f} m/s  {corners}  {health(recorder, daemon, live)}"
+    )
+
+
+def _bar(force_kN: float) -> Text:
+    filled = 0 if math.isnan(force_kN) else round(min(force_kN / _BAR_FULL_KN, 1.0) * _BAR_WIDTH)
+    return Text("█" * filled, style="cyan") + Text("·" * (_BAR_WIDTH - filled), style="dim")
+
+
+def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
+    """The view for a terminal."""
+    if not recorder.cycles:
+        return Panel("starting", title="emb-daemon demo")
+    truth = recorder.truth[recorder.cycles - 1]
+    table = Table(box=None, header_style="bold", padding=(0, 1))
+    for heading in (
+        "",
+        "clamp force",
+        "",
+        "± 2σ",
+        "true*",
+        "source",
+        "status",
+        "mode",
+        "surface",
+        "mean",
+        "true*",
+        "adapting",
+    ):
+        table.add_column(heading, justify="left" if heading in ("", "source", "status", "mode") else "right", no_wrap=True)
+    for row, corner in enumerate(recorder.corners):
+        force = recorder.value(CLAMP_FORCE, row, 0)
+        source, mode = recorder.value(CLAMP_FORCE, row, 3), recorder.value(ESTIMATOR_STATUS, row, 0)
+        status, progress = recorder.status(row), recorder.progress(row)
+        true = truth[row]
+        table.add_row(
+            Text(corner, style="bold"),
+            f"{force:.2f} kN",
+            _bar(force),
+            f"{2.0 * recorder.value(CLAMP_FORCE, row, 1):.2f}",
+            Text(f"{1e-3 * true['force']:.2f}", style="dim"),
+            "" if math.isnan(source) else SOURCES.get(int(source), "?"),
+            Text(_STATUS.get(status, "?"), style=_STATUS_COLOURS.get(status, "red")),
+            "" if math.isnan(mode) else MODES[int(mode)],
+            f"{recorder.value(PAD_TEMP, row, 0):.0f} °C",
+            f"{recorder.value(PAD_TEMP, row, 1):.0f} °C",
+            Text(f"{true['mean'][0]:.0f}", style="dim"),
+            "" if math.isnan(progress) else f"{progress:.0f} %",
+        )
+    time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
+    head = Text(f"{time:5.1f} of {seconds:.0f} s   {phase(truth[0])}   {truth[0]['vehicle_speed']:.1f} m/s", style="bold")
+    foot = Text(health(recorder, daemon, live), style="dim")
+    notes = Text("\n".join(messages), style="dim italic")
+    return Panel(
+        Group(head, Text(""), table, Text(""), foot, notes),
+        title="emb-daemon demo: simulated car, real daemon",
+        subtitle="* simulated truth, which the daemon never sees",
+    )

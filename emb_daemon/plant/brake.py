@@ -1,0 +1,157 @@
+"""Motor, gear, friction, pads and caliper of one corner: ordinary differential equations in sub-steps of a quarter millisecond."""
+
+from math import cos, exp, sin
+
+from emb_daemon.jit import njit
+from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S
+
+_COLD_C = 22.0
+_MAGNETS_C = 25.0
+
+
+@njit
+def static_curve(p, x):
+    """Cold static clamp force (N) at ``x`` rad past contact."""
+    if x <= 0.0:
+        return 0.0
+    force = 0.0
+    for order in range(CURVE_TERMS - 1, -1, -1):
+        force = (force + p.curve[order]) * x
+    return force
+
+
+@njit
+def static_angle(p, force):
+    """Angle past contact (rad) at which the cold static curve reaches ``force`` N, by bisection."""
+    if force <= 0.0:
+        return 0.0
+    high = 1.0
+    while static_curve(p, high) < force and high < 1e3:
+        high *= 2.0
+    low = 0.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if static_curve(p, middle) < force:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@njit
+def grown(p, s):
+    """Motor angle (rad) by which pads and disc are thicker than when cold and new: thickness variation over the turn, growth
+    with the disc's temperature, less wear."""
+    e = p.effects
+    thickness = 1e-6 * e.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
+    variation, turn = e.disc_thickness_variation, s.wheel_angle
+    if s.uneven_disc:
+        thickness += 1e-6 * (
+            variation.order_1_cosine_um * cos(turn)
+            + variation.order_1_sine_um * sin(turn)
+            + variation.order_2_cosine_um * cos(2.0 * turn)
+            + variation.order_2_sine_um * sin(2.0 * turn)
+            + variation.order_3_cosine_um * cos(3.0 * turn)
+            + variation.order_3_sine_um * sin(3.0 * turn)
+            + variation.order_4_cosine_um * cos(4.0 * turn)
+            + variation.order_4_sine_um * sin(4.0 * turn)
+        )
+    return thickness / p.gear_gain
+
+
+@njit
+def _friction_level(p, s):
+    """Sliding friction torque of the gear (N m), without direction (thesis 4-1)."""
+    e = p.effects
+    level = p.offset_friction + p.load_friction * s.force
+    if e.stribeck_friction.rise != 0.0:
+        level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
+    level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
+    return level * max(1.0 - e.cold_grease.per_K * (s.caliper - _COLD_C), 0.1)
+
+
+@njit
+def move_motor(p, s, demand):
+    """One sub-step of current, motor and gear under a current ``demand`` in A."""
+    e, h = p.effects, SUBSTEP_S
+    # Back-EMF: near the top speed the supply drives no further current in the direction of motion.
+    room = p.maximum_current * min(max((1.06 * p.maximum_speed - abs(s.speed)) / (0.1 * p.maximum_speed), 0.0), 1.0)
+    if demand * s.speed > 0.0:
+        demand = min(max(demand, -room), room)
+    demand = min(max(demand, -p.maximum_current), p.maximum_current)
+    s.current += (demand - s.current) * h / (p.current_time + h)
+    fade = e.torque_constant_fade
+    warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
+    torque = p.torque_constant * (1.0 - fade.fade_per_K * warm) * s.current
+    load = p.gear_gain * s.force
+    mesh = e.gear_mesh_ripple
+    if mesh.cosine != 0.0 or mesh.sine != 0.0:
+        phase = mesh.order_per_turn * (p.released_angle + s.angle)
+        load *= 1.0 + mesh.cosine * cos(phase) + mesh.sine * sin(phase)
+    level = _friction_level(p, s)
+    turning = p.presliding_damping * (1.0 - s.friction * s.friction) + e.viscous_friction.viscous_Nms_per_rad
+    resistance = level * s.friction + turning * s.speed
+    cogging = e.cogging_torque
+    if cogging.cosine_Nm != 0.0 or cogging.sine_Nm != 0.0:
+        phase = cogging.order_per_turn * (p.released_angle + s.angle)
+        resistance += cogging.cosine_Nm * cos(phase) + cogging.sine_Nm * sin(phase)
+    before = s.speed
+    s.speed += h * (torque - load - resistance) / p.inertia
+    # Symplectic: the friction spring neither gains nor loses energy by integration.
+    travel = h * s.speed
+    s.angle += travel
+    direction = 1.0 if travel > 0.0 else -1.0
+    # Dahl 1968, exact for the travel of this step.
+    s.friction = direction + (s.friction - direction) * exp(-abs(travel) / p.presliding_angle)
+    mean_travel = 0.5 * h * (before + s.speed)
+    s.motor_work += torque * mean_travel
+    s.friction_loss += resistance * mean_travel
+    s.clamp_work += load * mean_travel
+
+
+@njit
+def _settle(state, before, now, time_constant):
+    """State of a first-order lag after one sub-step, by the trapezoidal rule."""
+    share = 0.5 * SUBSTEP_S / time_constant
+    return ((1.0 - share) * state + share * (before + now)) / (1.0 + share)
+
+
+@njit
+def clamp(p, s):
+    """One sub-step of the clamp force: backlash, static curve, slip, relaxations."""
+    e = p.effects
+    angle = s.angle
+    if e.spindle_lead_error.amplitude_um != 0.0:
+        error = sin(e.spindle_lead_error.order_per_turn * angle + e.spindle_lead_error.phase_rad)
+        angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error
+    half = 0.5 * e.backlash.play_rad
+    s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
+    x = s.driven_angle + grown(p, s) - p.contact_angle
+    s.static_force = static_curve(p, x)
+    hysteresis = e.stiffness_hysteresis
+    if hysteresis.share != 0.0:
+        travel = max(x, 0.0) - max(s.past_contact, 0.0)
+        s.slip = min(max(s.slip + travel / hysteresis.slip_angle_rad, -1.0), 1.0)
+    s.past_contact = x
+    drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip)
+    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque
+    excitation = drive
+    if e.second_relaxation.share != 0.0:
+        s.slow = _settle(s.slow, s.drive, drive, e.second_relaxation.time_constant_s)
+        excitation += e.second_relaxation.share * (s.slow - drive)
+    if e.clamp_creep.share != 0.0:
+        s.creep = _settle(s.creep, s.drive, drive, e.clamp_creep.time_constant_s)
+        excitation += e.clamp_creep.share * (s.creep - drive)
+    force = _settle(s.force, s.excitation, excitation, p.relaxation_time)
+    s.force_rate = (force - s.force) / SUBSTEP_S
+    s.force, s.drive, s.excitation = force, drive, excitation
+
+
+@njit
+def delayed_angle(p, s):
+    """What the resolver is about to measure: the motor angle as it was ``signal_delay`` ago."""
+    steps = min(max(p.effects.signal_delay.delay_s / SUBSTEP_S, 0.0), HISTORY - 2.0)
+    whole = int(steps)
+    share = steps - whole
+    newer = s.angle_history[(s.history_at - whole) % HISTORY]
+    return (1.0 - share) * newer + share * s.angle_history[(s.history_at - whole - 1) % HISTORY]

@@ -1,0 +1,442 @@
+"""The car: one to four brakes, longitudinal motion, training motion on request, and everything that it says on the bus."""
+
+from math import cos, pi
+
+import numpy as np
+
+from emb_daemon.jit import njit
+from emb_daemon.plant.brake import clamp, delayed_angle, grown, move_motor, static_angle
+from emb_daemon.plant.controller import current_demand, set_target
+from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
+from emb_daemon.plant.records import (
+    ANGLE,
+    CAR,
+    COMMAND,
+    CYCLE_NS,
+    DRIVE,
+    HISTORY,
+    PAD_DEPTHS_M,
+    PARK_APPLIED,
+    PARK_RELEASED,
+    PLANT,
+    PLANT_STATE,
+    RELEASE,
+    SUBSTEP_S,
+    SUBSTEPS,
+    TRAINING,
+    TRUTH,
+)
+from emb_daemon.resources import resource
+from emb_daemon.wire import layout as wire
+from emb_daemon.wire.e2e import COUNTER_MODULO, protect
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import SIGNAL, pack, unpack
+
+CYCLE_S = 1e-9 * CYCLE_NS
+PULSES_PER_TURN = 96
+#: Period of the slow clamp and release of training motion, and the time in which a corner joins it from where it stands.
+TRAINING_PERIOD_S = 20.0
+_JOINING_S = 1.0
+#: Without a request for this many cycles training ends: the daemon has gone.
+_SILENCE_CYCLES = 25
+#: A request's low force of zero means the clearance, this far before contact.
+_BEFORE_CONTACT_RAD = 2.0
+_SLOW_NS, _STATUS_NS, _REFERENCE_SLOW_NS = 10_000_000, 100_000_000, 100_000_000
+#: When the slow messages leave after their sample, and the rig's instruments after the resolver's frame.
+_AFTER_NS, _REFERENCE_AFTER_NS = 900_000, 400_000
+#: Frames that one cycle can hold with four corners and reference instruments.
+FRAMES_PER_TICK = 32
+
+#: Layouts of the rig's own messages: force, inner pad, outer pad; ``id[kind, corner]``.
+REFERENCE_WIRES = np.dtype([("signal", SIGNAL, (3, 4)), ("id", "i8", (3, 4))], align=True)
+
+
+def _reference_wires() -> np.ndarray:
+    database = wire.load_database(resource("dbc/rig.dbc"))
+    wires = np.zeros(1, REFERENCE_WIRES)
+    depths = (2, 4, 6, 8)
+    kinds = (
+        ("Force", ("ClampForceRef", "BrakeTorqueRef", "DiscTempRef")),
+        ("InnerPad", tuple(f"InnerPadTemp{depth}mm" for depth in depths)),
+        ("OuterPad", tuple(f"OuterPadTemp{depth}mm" for depth in depths)),
+    )
+    for kind, (name, signals) in enumerate(kinds):
+        for corner, label in enumerate(wire.CORNERS):
+            message = f"RIG_{label}_{name}"
+            wires[0]["signal"][kind, : len(signals)] = wire.signal_columns(database, message, signals)
+            wires[0]["id"][kind, corner] = database.get_message_by_name(message).frame_id
+    return wires
+
+
+@njit
+def _train(p, s, training, command, drive, standing):
+    """The command that training motion puts in the place of ``command``; changes ``training``."""
+    allowed = drive.park_brake == PARK_APPLIED and drive.brake_request == 0 and standing
+    training.silent += 1
+    if training.silent > _SILENCE_CYCLES:
+        training.requested = False
+    if not (training.requested and allowed):
+        training.running = False
+        return command.mode, command.target, command.rate
+    if not training.running:
+        training.running, training.tick, training.start = True, 0, s.angle
+    time = training.tick * CYCLE_S
+    training.tick += 1
+    after = _training_angle(training, time + CYCLE_S)
+    now = _training_angle(training, time)
+    return ANGLE, now, (after - now) / CYCLE_S
+
+
+@njit
+def _training_angle(training, time):
+    slow = training.low + (training.high - training.low) * 0.5 * (1.0 - cos(2.0 * pi * time / TRAINING_PERIOD_S))
+    if time < _JOINING_S:
+        share = 0.5 * (1.0 + cos(pi * time / _JOINING_S))
+        slow += share * (training.start - slow)
+    return slow + training.amplitude * np.sin(2.0 * pi * training.frequency * time)
+
+
+@njit
+def _corner_cycle(p, s, mode, target, rate, wheel_speed, wheel_gain, ambient, rng):
+    """One 4 ms cycle of one corner; the wheel runs from ``wheel_speed`` and gains ``wheel_gain`` rad/s in it."""
+    set_target(p, s, mode, target, rate)
+    current = 0.0
+    for step in range(SUBSTEPS):
+        s.wheel_angle += SUBSTEP_S * (wheel_speed + wheel_gain * (step + 0.5) / SUBSTEPS)
+        move_motor(p, s, current_demand(p, s))
+        clamp(p, s)
+        current += s.current
+        s.history_at = (s.history_at + 1) % HISTORY
+        s.angle_history[s.history_at] = s.angle
+    s.mean_current = current / SUBSTEPS
+    # Ornstein-Uhlenbeck noise of the current sensor at four points of the cycle, averaged as the sensor does.
+    decay = np.exp(-0.25 * CYCLE_S / p.current_noise_time)
+    spread = p.current_noise * np.sqrt(1.0 - decay * decay)
+    error = 0.0
+    for _ in range(4):
+        s.current_error = decay * s.current_error + spread * rng.standard_normal()
+        error += 0.25 * s.current_error
+    s.mean_current_error = error
+    heat_cycle(p, s, wheel_speed + wheel_gain, ambient)
+
+
+@njit
+def _put(frames, count, time_ns, can_id, data):
+    """Insert a frame in order of time; returns the new count."""
+    place = count
+    while place > 0 and frames[place - 1].time_ns > time_ns:
+        frames[place] = frames[place - 1]
+        place -= 1
+    frame = frames[place]
+    frame.time_ns, frame.can_id, frame.data, frame.length, frame.flags = time_ns, can_id, data, 8, 0
+    return count + 1
+
+
+@njit
+def _say(car, slot, payload, ids, frames, count, time_ns):
+    """A protected message of the car."""
+    counter = car.counter[slot]
+    car.counter[slot] = (counter + 1) % COUNTER_MODULO
+    return _put(frames, count, time_ns, ids[slot], protect(ids[slot], payload, counter, 0))
+
+
+@njit
+def _fast_frames(car, p, s, corner, wires, ids, rng, frames, count):
+    """Resolver and current of one sample share their counter."""
+    base = wire.CORNER_MESSAGES * corner
+    noisy = p.released_angle + delayed_angle(p, s) + p.angle_noise * rng.standard_normal()
+    # Resolver-to-digital converters have hysteresis, so that a standing motor reads as standing.
+    if abs(noisy - s.angle_reading) > 0.5 * p.angle_count + p.angle_hysteresis:
+        s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
+    speed = s.speed + p.speed_noise * rng.standard_normal()
+    payload = pack(s.angle_reading, wires.received[base, 0]) | pack(speed, wires.received[base, 1])
+    sent = car.time_ns + np.int64(1e9 * car.jitter * rng.random())
+    count = _say(car, base + wire.RESOLVER, payload, ids, frames, count, sent)
+    slot = base + wire.CURRENT
+    current = s.mean_current + s.mean_current_error - p.effects.current_offset.offset_A
+    payload = pack(current, wires.received[slot, 0]) | pack(0.15 * rng.standard_normal(), wires.received[slot, 1])
+    payload |= pack(car.supply_voltage, wires.received[slot, 2])
+    sent = car.time_ns + np.int64(1e9 * car.jitter * (0.5 + rng.random()))
+    return _say(car, slot, payload, ids, frames, count, sent)
+
+
+@njit
+def _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, count, due_ns):
+    """Thermocouples, wheels and, ten times a second, the vehicle's status; sampled at ``due_ns``, within this cycle."""
+    for row in range(len(corners)):
+        p, s = plants[row], states[row]
+        slot = wire.CORNER_MESSAGES * corners[row] + wire.THERMOCOUPLE
+        payload = pack(s.plate_reading[0] + p.temperature_noise * rng.standard_normal(), wires.received[slot, 0])
+        payload |= pack(s.plate_reading[1] + p.temperature_noise * rng.standard_normal(), wires.received[slot, 1])
+        payload |= pack(s.caliper + p.temperature_noise * rng.standard_normal(), wires.received[slot, 2])
+        sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
+        count = _say(car, slot, payload, ids, frames, count, sent)
+    speeds, pulses = np.uint64(0), np.uint64(0)
+    elapsed = 1e-9 * (due_ns - car.time_ns)
+    for corner in range(4):
+        speeds |= pack(car.wheel_speed, wires.received[wire.WHEEL_SPEED, corner])
+        angle = states[0].wheel_angle
+        for row in range(len(corners)):
+            if corners[row] == corner:
+                angle = states[row].wheel_angle
+        angle += elapsed * car.wheel_speed
+        pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % 4096
+        pulses |= pack(float(pulse), wires.received[wire.WHEEL_PULSE, corner])
+    sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
+    count = _say(car, wire.WHEEL_SPEED, speeds, ids, frames, count, sent)
+    sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
+    count = _say(car, wire.WHEEL_PULSE, pulses, ids, frames, count, sent)
+    if due_ns % _STATUS_NS == 0:
+        signals = wires.received[wire.VEHICLE_STATUS]
+        payload = pack(float(drive.park_brake), signals[0]) | pack(float(drive.brake_request), signals[1])
+        payload |= pack(drive.ambient, signals[2]) | pack(car.speed, signals[3])
+        sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * (0.5 + rng.random()))
+        count = _say(car, wire.VEHICLE_STATUS, payload, ids, frames, count, sent)
+    return count
+
+
+@njit
+def _reference_frames(car, p, s, corner, reference, rng, frames, count, slow):
+    """What a rig's instruments add; they carry neither counter nor CRC."""
+    signal = reference.signal
+    force = s.force + p.force_lead * s.force_rate + p.force_noise * rng.standard_normal()
+    torque = s.brake_torque + p.brake_torque_noise * rng.standard_normal()
+    payload = pack(force, signal[0, 0]) | pack(torque, signal[0, 1])
+    payload |= pack(s.disc + p.temperature_noise * rng.standard_normal(), signal[0, 2])
+    sent = car.time_ns + _REFERENCE_AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
+    count = _put(frames, count, sent, reference.id[0, corner], payload)
+    if slow:
+        for side in range(2):
+            payload = np.uint64(0)
+            for index in range(len(PAD_DEPTHS_M)):
+                reading = pad_at(p, s, side, PAD_DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
+                payload |= pack(reading, signal[1 + side, index])
+            count = _put(frames, count, sent, reference.id[1 + side, corner], payload)
+    return count
+
+
+@njit
+def _record(car, p, s, corner, counter, drive, training, truth):
+    truth.time_ns, truth.corner, truth.counter = car.time_ns, corner, counter
+    truth.force, truth.static_force = s.force, s.static_force
+    truth.angle, truth.speed, truth.current = p.released_angle + s.angle, s.speed, s.mean_current
+    truth.contact_angle = p.released_angle + p.contact_angle - grown(p, s)
+    truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
+    for side in range(2):
+        truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
+        for index in range(len(PAD_DEPTHS_M)):
+            inside = PAD_DEPTHS_M[index] <= p.pad_thickness
+            truth.depth[side, index] = pad_at(p, s, side, PAD_DEPTHS_M[index]) if inside else np.nan
+    truth.caliper, truth.disc = s.caliper, s.disc
+    truth.wheel_speed, truth.wheel_angle, truth.vehicle_speed = car.wheel_speed, s.wheel_angle, car.speed
+    truth.wear, truth.training = s.wear, training.running
+    truth.park_brake, truth.brake_request = drive.park_brake, drive.brake_request
+
+
+@njit
+def _drive(car, states, drive):
+    """Longitudinal motion over one cycle; returns the wheel speed at its start."""
+    before = car.wheel_speed
+    if not np.isnan(drive.wheel_speed):
+        car.wheel_speed = drive.wheel_speed
+        car.speed = car.wheel_speed * car.wheel_radius
+        return before
+    force = -car.drag * car.speed * car.speed
+    if car.speed > 0.0:
+        force -= car.rolling
+    for row in range(len(states)):
+        force -= states[row].brake_torque / car.wheel_radius
+    acceleration = force / car.mass
+    if not np.isnan(drive.target_speed):
+        wanted = 2.0 * (drive.target_speed - car.speed)
+        acceleration += min(max(wanted - acceleration, 0.0), car.acceleration)
+    # Brakes and drag stop a car; they do not push it back.
+    car.speed = max(car.speed + CYCLE_S * acceleration, 0.0)
+    car.wheel_speed = car.speed / car.wheel_radius
+    return before
+
+
+@njit
+def _tick(car, plants, states, trainings, corners, commands, drive, wires, ids, reference, rng, frames, truth):
+    """Advance everything by one cycle and write its frames in order of time; returns their number."""
+    wheel_speed = _drive(car, states, drive)
+    car.time_ns += CYCLE_NS
+    car.tick += 1
+    slow_reference = car.time_ns // _REFERENCE_SLOW_NS != (car.time_ns - CYCLE_NS) // _REFERENCE_SLOW_NS
+    count = 0
+    for row in range(len(corners)):
+        p, s, corner = plants[row], states[row], corners[row]
+        mode, target, rate = _train(p, s, trainings[row], commands[row], drive, car.speed == 0.0)
+        _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, rng)
+        _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, trainings[row], truth[row])
+        count = _fast_frames(car, p, s, corner, wires, ids, rng, frames, count)
+        if car.reference:
+            count = _reference_frames(car, p, s, corner, reference, rng, frames, count, slow_reference)
+    due = (car.time_ns + _SLOW_NS - 1) // _SLOW_NS * _SLOW_NS
+    if due < car.time_ns + CYCLE_NS:
+        count = _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, count, due)
+    return count
+
+
+@njit
+def _run(car, plants, states, trainings, corners, commands, drives, wires, ids, reference, rng, frames, truth):
+    total = 0
+    for tick in range(len(drives)):
+        total += _tick(
+            car,
+            plants,
+            states,
+            trainings,
+            corners,
+            commands[tick],
+            drives[tick],
+            wires,
+            ids,
+            reference,
+            rng,
+            frames[total:],
+            truth[tick],
+        )
+    return total
+
+
+@njit
+def _hear(frames, corners, plants, trainings, wires):
+    """Take adaptation requests out of what is on the bus."""
+    signals = wires.sent[wire.ADAPT_REQUEST]
+    for index in range(len(frames)):
+        frame = frames[index]
+        for row in range(len(corners)):
+            if np.int64(frame.can_id) != wires.sent_id[wire.ADAPT_REQUEST, corners[row]]:
+                continue
+            training, p = trainings[row], plants[row]
+            training.silent = 0
+            training.requested = unpack(frame.data, signals[0]) == 1.0
+            low = 1e3 * unpack(frame.data, signals[3])
+            training.low = p.contact_angle + (static_angle(p, low) if low > 0.0 else -_BEFORE_CONTACT_RAD)
+            training.high = p.contact_angle + static_angle(p, 1e3 * unpack(frame.data, signals[4]))
+            training.amplitude = unpack(frame.data, signals[5])
+            training.frequency = unpack(frame.data, signals[6])
+
+
+class Car:
+    """A car with brakes on ``corners``, standing, cold and released.
+
+    Args:
+        plants: PLANT array, one record per corner, in the order of ``corners``.
+        corners: which corners they are.
+        seed: of every random number from here on.
+        reference: send the rig instruments' RIG_* frames too.
+        start_ns: time of the first sample, less one cycle.
+        ambient: degC; everything starts at this temperature.
+        jitter_s: frames leave up to this late after their sample.
+
+    Attributes:
+        truth: TRUTH array, one row per corner, of the last tick.
+        states, trainings, motion: PLANT_STATE and TRAINING arrays by corner, CAR array of shape (1,).
+    """
+
+    def __init__(
+        self,
+        plants: np.ndarray,
+        corners: tuple[str, ...] = ("FL",),
+        seed: int = 0,
+        reference: bool = False,
+        start_ns: int = 0,
+        ambient: float = 22.0,
+        jitter_s: float = 150e-6,
+    ):
+        if len(plants) != len(corners):
+            raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
+        self.plants = np.ascontiguousarray(plants, PLANT)
+        self.corners = tuple(corners)
+        self._corners = np.array([wire.CORNERS.index(corner) for corner in corners])
+        self.states = np.zeros(len(plants), PLANT_STATE)
+        for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
+            self.states[field] = ambient
+        self.states["stiffness_factor"] = 1.0
+        variation = self.plants["effects"]["disc_thickness_variation"]
+        self.states["uneven_disc"] = [any(row) for row in variation.tolist()]
+        self.states["angle_reading"] = self.plants["released_angle"]
+        self.states["past_contact"] = -self.plants["contact_angle"]
+        self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
+        self.trainings = np.zeros(len(plants), TRAINING)
+        self.truth = np.zeros(len(plants), TRUTH)
+        self._rng = np.random.default_rng(seed)
+        self.motion = np.zeros(1, CAR)
+        motion = self.motion[0]
+        # A middle-sized car; brakes that are not simulated carry their own quarter.
+        motion["mass"], motion["wheel_radius"] = 400.0 * len(corners), 0.31
+        motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
+        motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
+        motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
+        self.states["wheel_angle"] = self._rng.uniform(0.0, 4096 / PULSES_PER_TURN * 2.0 * pi, len(plants))
+        motion["counter"] = self._rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
+        for corner in range(4):
+            # Both frames of a sample share their counter.
+            base = wire.CORNER_MESSAGES * corner
+            motion["counter"][base + wire.CURRENT] = motion["counter"][base + wire.RESOLVER]
+        self._wires = wire.default_layout()
+        slots = self._wires["slot"][0]
+        self._ids = np.zeros(wire.SLOTS, np.int64)
+        for can_id in np.flatnonzero(slots >= 0):
+            self._ids[slots[can_id]] = can_id
+        self._reference = _reference_wires()
+        self._frames = np.zeros(FRAMES_PER_TICK, FRAME)
+
+    def tick(self, commands: np.ndarray, drive: np.void) -> np.ndarray:
+        """One 4 ms cycle under COMMAND rows (one per corner) and a DRIVE record.
+
+        Returns the cycle's frames in order of time, as a FRAME array valid until the next call."""
+        count = _tick(
+            self.motion[0],
+            self.plants,
+            self.states,
+            self.trainings,
+            self._corners,
+            commands,
+            drive,
+            self._wires[0],
+            self._ids,
+            self._reference[0],
+            self._rng,
+            self._frames,
+            self.truth,
+        )
+        return self._frames[:count]
+
+    def run(self, commands: np.ndarray, drives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Many cycles at once: COMMAND array (cycles, corners) and DRIVE array (cycles,).
+
+        Returns (FRAME array, TRUTH array of shape (cycles, corners))."""
+        frames = np.zeros(len(drives) * FRAMES_PER_TICK, FRAME)
+        truth = np.zeros((len(drives), len(self.corners)), TRUTH)
+        count = _run(
+            self.motion[0],
+            self.plants,
+            self.states,
+            self.trainings,
+            self._corners,
+            commands,
+            drives,
+            self._wires[0],
+            self._ids,
+            self._reference[0],
+            self._rng,
+            frames,
+            truth,
+        )
+        return frames[:count].copy(), truth
+
+    def hear(self, frames: np.ndarray) -> None:
+        """Take what the daemon says: EMB_c_AdaptRequest starts and ends training motion."""
+        _hear(frames, self._corners, self.plants, self.trainings, self._wires[0])
+
+
+def idle(corners: int, ambient: float = 22.0) -> tuple[np.ndarray, np.ndarray]:
+    """(COMMAND array of shape (corners,), DRIVE array of shape (1,)) of a car that stands, released."""
+    commands = np.zeros(corners, COMMAND)
+    commands["mode"] = RELEASE
+    drive = np.zeros(1, DRIVE)
+    drive[0] = (np.nan, 0.0, ambient, PARK_RELEASED, 0)
+    return commands, drive

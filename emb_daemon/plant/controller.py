@@ -1,0 +1,62 @@
+"""The brake controller of one corner: force over position over speed over current, on true signals.
+
+It is a controller, not an estimator under test: it may use what no car can measure, so that the motion is clean and the
+daemon is judged on its own.
+"""
+
+from emb_daemon.jit import njit
+from emb_daemon.plant.brake import static_angle
+from emb_daemon.plant.records import ANGLE, FORCE, SUBSTEP_S
+
+_POSITION_GAIN = 40.0
+_SPEED_GAIN = 250.0
+_SPEED_INTEGRAL = 8000.0
+#: Largest acceleration asked of the motor, rad/s^2.
+_ACCELERATION = 8000.0
+_AT_TARGET_RAD = 0.02
+_FORCE_INTEGRAL = 2.0
+_LARGEST_CORRECTION_RAD = 4.0
+#: Force error that is left alone: 20 N and half a percent.
+_FORCE_BAND_N, _FORCE_BAND = 20.0, 0.005
+
+
+@njit
+def set_target(p, s, mode, target, rate):
+    """Position target for the coming cycle from a command."""
+    s.target_rate = 0.0
+    if mode == ANGLE:
+        s.position_target, s.target_rate, s.force_correction = target, rate, 0.0
+    elif mode == FORCE and target > 0.0:
+        goal = static_angle(p, target)
+        slope = target / max(goal, 0.5)
+        error = target - s.force
+        band = _FORCE_BAND_N + _FORCE_BAND * target
+        if abs(error) > band and abs(s.position_target - s.angle) < 0.5:
+            correction = s.force_correction + 0.004 * _FORCE_INTEGRAL * error / slope
+            s.force_correction = min(max(correction, -_LARGEST_CORRECTION_RAD), _LARGEST_CORRECTION_RAD)
+        # Wear and growth are followed, as a controller does that finds contact at each application; the disc's thickness
+        # over the turn is not, or it would not show in the force.
+        thicker = 1e-6 * p.effects.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
+        s.position_target = p.contact_angle - thicker / p.gear_gain + goal + s.force_correction
+    else:
+        s.position_target, s.force_correction = 0.0, 0.0
+
+
+@njit
+def current_demand(p, s):
+    """Current (A) that the position and speed loops ask for, one sub-step."""
+    error = s.position_target - s.angle
+    if abs(error) <= _AT_TARGET_RAD:
+        error = 0.0
+    else:
+        error -= _AT_TARGET_RAD if error > 0.0 else -_AT_TARGET_RAD
+    speed = min(max(_POSITION_GAIN * error + s.target_rate, -p.maximum_speed), p.maximum_speed)
+    lag = speed - s.speed
+    acceleration = _SPEED_GAIN * lag
+    if abs(acceleration) < _ACCELERATION:
+        # Outside of its linear range the integral would wind up.
+        s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
+    acceleration = min(max(acceleration, -_ACCELERATION), _ACCELERATION)
+    torque = p.gear_gain * s.force + p.inertia * acceleration + s.speed_integral
+    s.position_target += SUBSTEP_S * s.target_rate
+    return torque / p.torque_constant

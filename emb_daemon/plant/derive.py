@@ -1,0 +1,136 @@
+"""Plants from calibrations: the same kind of brake, but not the same unit."""
+
+import numpy as np
+
+from emb_daemon.calibration.types import Calibration, curve_at
+from emb_daemon.plant.records import EFFECTS, PLANT
+
+#: Standard deviations between what a calibration says and what a unit is, relative where nothing else is said: a well
+#: calibrated unit, some time later.
+_SCATTER = {
+    "torque_constant": 0.002,
+    "inertia": 0.01,
+    "load_friction": 0.03,
+    "offset_friction": 0.05,
+    "presliding_angle": 0.1,
+    "relaxation_time": 0.01,
+    "softening": 0.05,
+    "softening_history": 0.05,
+    "history_time": 0.05,
+    "specific_heat": 0.02,
+    "conductivity": 0.03,
+    "heat_share": 0.05,
+    "contact_conductance": 0.05,
+    "gap_conductance": 0.05,
+    "plate_conductance": 0.05,
+    "disc_heat_capacity": 0.01,
+    "disc_cooling": 0.03,
+    "disc_cooling_per_speed": 0.03,
+    "friction_coefficient": 0.02,
+}
+_CURVE_SCATTER = 0.003
+_CONTACT_SCATTER_RAD = 0.01
+_EFFECT_SCATTER = 0.03
+#: The released position reads anything.
+_RELEASED_RANGE_RAD = (-200.0, 200.0)
+
+
+def _friction_plane(calibration: Calibration) -> np.ndarray:
+    """Least squares of the calibration's friction table: value at 20 degC, slopes over temperature, speed and force."""
+    table = calibration.thermal.friction
+    force, speed, temperature = np.meshgrid(
+        table.force_N, table.disc_speed_rad_per_s, table.surface_temperature_C, indexing="ij"
+    )
+    coefficient = np.array(table.coefficient)
+    terms = np.stack([np.ones(coefficient.size), temperature.ravel() - 20.0, speed.ravel(), force.ravel()], axis=1)
+    return np.linalg.lstsq(terms, coefficient.ravel(), rcond=None)[0]
+
+
+def plant_from_calibration(
+    calibration: Calibration,
+    seed: int | None = None,
+    scatter: float = 1.0,
+    effects: dict[str, dict[str, float]] | None = None,
+    pad_thickness_mm: float | None = None,
+) -> np.void:
+    """A PLANT record of the kind of brake that a calibration describes.
+
+    Args:
+        seed: of the unit-to-unit scatter; None gives the calibration's own numbers.
+        scatter: 1 for `_SCATTER`, more for a calibration that fits worse.
+        effects: effects to switch on, with their parameters (`records.EFFECTS`); a parameter left out is zero. They stand
+            beside those of the calibration, and replace one of the same name.
+        pad_thickness_mm: of the pads mounted, if not the calibration's.
+
+    Raises:
+        InputError: the thickness is too far outside of what was measured.
+        KeyError: no such effect or parameter.
+    """
+    c = calibration
+    thickness = c.pad_thickness_mm if pad_thickness_mm is None else pad_thickness_mm
+    pad, disc, soft = c.thermal.pad, c.thermal.disc, c.thermal.softening
+    p = np.zeros(1, PLANT)[0]
+    p["torque_constant"] = c.motor.torque_constant_Nm_per_A
+    p["inertia"] = c.motor.inertia_kg_m2
+    p["gear_gain"] = c.motor.gear_gain_m_per_rad
+    p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
+    # Enough to hold the largest force against friction, and to accelerate.
+    p["maximum_current"] = 1.5 * c.motor.gear_gain_m_per_rad * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
+    p["current_time"] = 0.001
+    p["magnet_heating"], p["magnet_time"] = 0.02, 60.0
+    p["load_friction"] = c.friction.load_m_per_rad
+    p["offset_friction"] = c.friction.offset_Nm
+    p["presliding_angle"] = c.friction.presliding_angle_rad
+    p["presliding_damping"] = 0.004
+    p["curve"] = curve_at(c.stiffness.curves, thickness)
+    p["relaxation_time"] = c.stiffness.relaxation_time_s
+    p["contact_angle"] = c.contact.clearance_rad
+    p["curve_temperature"] = 22.0
+    p["softening"], p["softening_history"], p["history_time"] = soft.per_K, soft.history_per_K, soft.history_time_s
+    p["pad_thickness"] = 1e-3 * thickness
+    p["pad_area"] = pad.area_m2
+    p["density"] = pad.density_kg_per_m3
+    p["specific_heat"], p["specific_heat_rise"] = pad.specific_heat_J_per_kgK, pad.specific_heat_rise_per_K
+    p["conductivity"], p["conductivity_rise"] = pad.conductivity_W_per_mK, pad.conductivity_rise_per_K
+    p["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
+    p["contact_conductance"] = pad.contact_conductance_W_per_m2K
+    p["gap_conductance"] = pad.gap_conductance_W_per_m2K
+    p["touching_force"] = 50.0
+    p["plate_conductance"] = pad.backplate_conductance_W_per_m2K
+    p["plate_heat_capacity"], p["plate_loss"] = 17500.0, (93.0, 69.0)
+    p["caliper_heat_capacity"], p["caliper_loss"] = 3600.0, 4.0
+    p["disc_heat_capacity"] = disc.heat_capacity_J_per_K
+    p["disc_cooling"] = disc.cooling_W_per_K
+    p["disc_cooling_per_speed"] = disc.cooling_per_speed_J_per_rad_K
+    p["disc_radiating_area"] = disc.radiating_area_m2
+    p["effective_radius"] = disc.effective_radius_m
+    names = ("friction_coefficient", "friction_per_K", "friction_per_speed", "friction_per_force")
+    for name, value in zip(names, _friction_plane(c), strict=True):
+        p[name] = value
+    p["current_noise"], p["current_noise_time"] = c.noise.current_A, c.noise.current_correlation_s
+    p["speed_noise"] = c.noise.speed_rad_per_s
+    count = 2.0 * np.pi / 4096
+    p["angle_noise"], p["angle_count"], p["angle_hysteresis"] = 0.1 * count, count, 0.5 * count
+    p["temperature_noise"], p["force_noise"], p["brake_torque_noise"] = 0.25, 25.0, 0.6
+    p["force_lead"] = 0.0
+    chosen = {name: dict(values) for name, values in c.effects.items() if name in EFFECTS} | (effects or {})
+    for name, values in chosen.items():
+        known = [field.name for field in EFFECTS[name]]
+        for key, value in values.items():
+            if key not in known:
+                raise KeyError(f"effect {name} has no parameter {key}; expected {', '.join(known)}")
+            p["effects"][name][key] = value
+    if seed is not None:
+        _scatter(p, np.random.default_rng(seed), scatter, set(c.effects) - set(effects or {}))
+    return p
+
+
+def _scatter(p: np.void, rng: np.random.Generator, scatter: float, scattered_effects: set[str]) -> None:
+    for name, sigma in _SCATTER.items():
+        p[name] = p[name] * (1.0 + scatter * sigma * rng.standard_normal(p[name].shape))
+    p["curve"] *= 1.0 + scatter * _CURVE_SCATTER * rng.standard_normal()
+    p["contact_angle"] += scatter * _CONTACT_SCATTER_RAD * rng.standard_normal()
+    p["released_angle"] = rng.uniform(*_RELEASED_RANGE_RAD)
+    for name in sorted(scattered_effects & set(EFFECTS)):
+        for field in EFFECTS[name]:
+            p["effects"][name][field.name] *= 1.0 + scatter * _EFFECT_SCATTER * rng.standard_normal()

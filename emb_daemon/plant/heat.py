@@ -1,0 +1,117 @@
+"""Heat of pads, disc, backing plates and caliper: explicit finite volumes, cells of equal width, centred temperatures.
+
+The estimator solves the same physics implicitly on graded nodes with measured backing plates; here the plates and the caliper
+are states of their own.
+"""
+
+from math import ceil
+
+from emb_daemon.jit import njit
+from emb_daemon.plant.records import CELLS, CYCLE_NS
+
+_STEFAN_BOLTZMANN = 5.670374419e-8
+_KELVIN = 273.15
+_REFERENCE_C = 20.0
+_CELL_M = 0.0004
+_STEP_S = 1e-9 * CYCLE_NS
+
+
+@njit
+def cell_count(p):
+    """Cells in use through one pad: near 0.4 mm each."""
+    return min(max(int(ceil(p.pad_thickness / _CELL_M)), 5), CELLS)
+
+
+@njit
+def pad_mean(p, s, side):
+    """Mean temperature of one pad."""
+    cells = cell_count(p)
+    total = 0.0
+    for cell in range(cells):
+        total += s.pads[side, cell]
+    return total / cells
+
+
+@njit
+def pad_at(p, s, side, depth):
+    """Temperature ``depth`` m below a pad's friction surface, linear between surface, cell centres and the plate's face;
+    the pad's own plate face beyond its thickness."""
+    cells = cell_count(p)
+    width = p.pad_thickness / cells
+    position = depth / width - 0.5
+    if position <= 0.0:
+        return s.surface[side] + (s.pads[side, 0] - s.surface[side]) * (position + 0.5) / 0.5
+    lower = min(int(position), cells - 1)
+    if lower == cells - 1:
+        return s.pads[side, cells - 1]
+    return s.pads[side, lower] + (position - lower) * (s.pads[side, lower + 1] - s.pads[side, lower])
+
+
+@njit
+def friction_of_pads(p, s, wheel_speed):
+    """Friction coefficient between pads and disc."""
+    surface = 0.5 * (s.surface[0] + s.surface[1])
+    value = p.friction_coefficient + p.friction_per_K * (surface - _REFERENCE_C)
+    value += p.friction_per_speed * wheel_speed + p.friction_per_force * s.force
+    fade = p.effects.friction_coefficient_fade
+    if fade.fade_per_K != 0.0:
+        value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
+    return max(value, 0.2 * p.friction_coefficient)
+
+
+@njit
+def heat_cycle(p, s, wheel_speed, ambient):
+    """One 4 ms cycle of all temperatures, and of what depends on them: friction torque, wear, softening."""
+    e, dt = p.effects, _STEP_S
+    s.brake_torque = 0.0
+    if wheel_speed > 0.0:
+        s.brake_torque = 2.0 * friction_of_pads(p, s, wheel_speed) * p.effective_radius * s.force
+    power = s.brake_torque * wheel_speed
+    s.friction_heat += power * dt
+    s.wear += 1e-12 * e.pad_wear.wear_um_per_MJ * power * dt
+    cells = cell_count(p)
+    width = p.pad_thickness / cells
+    conductance = p.gap_conductance
+    conductance += (p.contact_conductance - p.gap_conductance) * s.force / (s.force + p.touching_force)
+    into_disc = (1.0 - p.heat_share[0] - p.heat_share[1]) * power
+    into_caliper = 0.0
+    for side in range(2):
+        pad = s.pads[side]
+        direct = p.heat_share[side] * power / p.pad_area
+        half = 2.0 * p.conductivity * (1.0 + p.conductivity_rise * (pad[0] - _REFERENCE_C)) / width
+        # The surface holds no heat: what enters it leaves it.
+        surface = (direct + conductance * s.disc + half * pad[0]) / (conductance + half)
+        s.surface[side] = surface
+        from_disc = conductance * (s.disc - surface)
+        into_disc -= p.pad_area * from_disc
+        flux = direct + from_disc
+        for cell in range(cells):
+            if cell < cells - 1:
+                between = 0.5 * (pad[cell] + pad[cell + 1])
+                onward = p.conductivity * (1.0 + p.conductivity_rise * (between - _REFERENCE_C)) / width
+                onward *= pad[cell] - pad[cell + 1]
+            else:
+                half = 2.0 * p.conductivity * (1.0 + p.conductivity_rise * (pad[cell] - _REFERENCE_C)) / width
+                onward = (pad[cell] - s.plate[side]) * half * p.plate_conductance / (half + p.plate_conductance)
+            heat = p.density * p.specific_heat * (1.0 + p.specific_heat_rise * (pad[cell] - _REFERENCE_C)) * width
+            pad[cell] += dt * (flux - onward) / heat
+            flux = onward
+        lost = p.plate_loss[side] * (s.plate[side] - s.caliper)
+        into_caliper += p.pad_area * lost
+        s.plate[side] += dt * (flux - lost) / p.plate_heat_capacity
+        lag = e.thermocouple_lag.lag_s
+        s.plate_reading[side] += (s.plate[side] - s.plate_reading[side]) * dt / (lag + dt)
+    hot, cold = s.disc + _KELVIN, ambient + _KELVIN
+    area = p.disc_radiating_area + e.disc_radiation.area_m2
+    loss = (p.disc_cooling + p.disc_cooling_per_speed * wheel_speed) * (s.disc - ambient)
+    loss += area * _STEFAN_BOLTZMANN * (hot**4 - cold**4)
+    s.disc += dt * (into_disc - loss) / p.disc_heat_capacity
+    caliper_loss = p.caliper_loss * (s.caliper - ambient)
+    s.caliper += dt * (into_caliper - caliper_loss) / p.caliper_heat_capacity
+    s.heat_lost += dt * (loss + caliper_loss)
+    s.magnet_rise += dt / p.magnet_time * (p.magnet_heating * s.current * s.current - s.magnet_rise)
+    rise = 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1)) - p.curve_temperature
+    s.softening_memory += dt / p.history_time * (rise - s.softening_memory)
+    factor = 1.0 - p.softening * rise - p.softening_history * s.softening_memory
+    factor *= 1.0 - e.caliper_softening.per_K * (s.caliper - 22.0)
+    s.stiffness_factor = max(factor, 0.1)

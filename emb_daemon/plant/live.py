@@ -1,0 +1,71 @@
+"""The simulated car in real time on a bus."""
+
+import threading
+import time
+
+from emb_daemon.plant.car import Car
+from emb_daemon.plant.records import CYCLE_NS
+from emb_daemon.plant.scenarios import Schedule, commands_of
+
+#: Frames of a cycle that the machine has held up for longer than this are lost, as they would be on a real bus; the car's
+#: time and counters go on with the clock.
+_LOST_NS = 2 * CYCLE_NS
+
+
+class LiveCar:
+    """Drives a schedule, over and over, one cycle every 4 ms, and listens to the daemon between two cycles.
+
+    Attributes:
+        ticks: cycles run.
+        late: cycles that left more than half a cycle after their time, the machine's doing.
+        lost: cycles whose frames were not sent at all because their time had passed.
+    """
+
+    def __init__(self, car: Car, bus, schedule: Schedule):
+        self.car = car
+        self._bus = bus
+        self._drives = schedule.drives
+        self._commands = commands_of(schedule, car.corners)
+        self.ticks = self.late = self.lost = 0
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what a cycle calls; the car stays as it is."""
+        spare = Car(self.car.plants, self.car.corners)
+        spare.hear(spare.tick(self._commands[0], self._drives[0]))
+
+    def run(self, stop: threading.Event, seconds: float | None = None, sent=None, heard=None) -> None:
+        """Run until ``stop`` is set or ``seconds`` are over.
+
+        ``sent(time_ns, truth)`` is called after each cycle has left, with its TRUTH rows and when it left, 0 if it was lost;
+        ``heard(frames)`` with whatever came from the bus since. Both views are valid during the call only.
+        """
+        last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
+        deadline = time.monotonic_ns()
+        while not stop.is_set() and self.ticks != last:
+            row = self.ticks % len(self._drives)
+            frames = self.car.tick(self._commands[row], self._drives[row])
+            self.ticks += 1
+            now = time.monotonic_ns()
+            lost = now - deadline > _LOST_NS
+            self.lost += lost
+            if not lost:
+                self._bus.send(frames)
+                now = time.monotonic_ns()
+                self.late += now - deadline > CYCLE_NS // 2
+            if sent is not None:
+                sent(0 if lost else now, self.car.truth)
+            deadline += CYCLE_NS
+            self._listen(deadline, heard)
+
+    def _listen(self, deadline: int, heard) -> None:
+        while True:
+            remaining = deadline - time.monotonic_ns()
+            if remaining > 0:
+                self._bus.wait(1e-9 * remaining)
+            frames = self._bus.drain()
+            if len(frames):
+                self.car.hear(frames)
+                if heard is not None:
+                    heard(frames)
+            if remaining <= 0:
+                return

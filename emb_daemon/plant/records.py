@@ -1,0 +1,301 @@
+"""Records of the plant. SI units, temperatures in degC; every field of a table states its unit and meaning."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+#: Integration steps in one 4 ms cycle.
+SUBSTEPS = 16
+CYCLE_NS = 4_000_000
+SUBSTEP_S = 1e-9 * CYCLE_NS / SUBSTEPS
+#: Cells through one pad at most.
+CELLS = 30
+#: Sub-steps of motor angle that are kept, for late resolvers.
+HISTORY = 64
+CURVE_TERMS = 5
+PAD_DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
+
+
+class Field(NamedTuple):
+    """One number, or array of numbers, of a record."""
+
+    name: str
+    unit: str
+    meaning: str
+    shape: tuple[int, ...] = ()
+
+
+#: Effects that a plant can have, all off at zero. The first group carries the catalogue's names and parameters; the second
+#: has no catalogue entry, so that a diagnosis can be tested on what nobody has thought of.
+EFFECTS: dict[str, tuple[Field, ...]] = {
+    "disc_thickness_variation": tuple(
+        Field(f"order_{order}_{part}_um", "um", f"{part} of {order} per turn, over the angle that wheel pulses count")
+        for order in range(1, 5)
+        for part in ("cosine", "sine")
+    ),
+    "disc_thermal_expansion": (Field("growth_um_per_K", "um/K", "disc and pads grow with the disc's temperature"),),
+    "pad_wear": (Field("wear_um_per_MJ", "um/MJ", "both pads together, by friction energy"),),
+    "torque_constant_fade": (
+        Field("fade_per_K", "1/K", "relative loss of torque constant as the magnets warm over 25 degC"),
+        Field("disc_share", "1", "where the motor's surroundings lie between caliper and disc"),
+    ),
+    "current_offset": (Field("offset_A", "A", "flows but is not measured"),),
+    "viscous_friction": (Field("viscous_Nms_per_rad", "N m s/rad", "friction torque per motor speed"),),
+    "stribeck_friction": (
+        Field("rise", "1", "friction at standstill over sliding friction, minus one"),
+        Field("speed_rad_per_s", "rad/s", "motor speed at which the rise has fallen to 1/e"),
+    ),
+    "friction_asymmetry": (Field("asymmetry", "1", "share by which friction is more when clamping, less when releasing"),),
+    "gear_mesh_ripple": (
+        Field("cosine", "1", "of the torque that the clamp force needs"),
+        Field("sine", "1", "likewise"),
+        Field("order_per_turn", "1", "ripples per motor turn"),
+    ),
+    "cogging_torque": (
+        Field("cosine_Nm", "N m", "torque that turning takes whatever the load"),
+        Field("sine_Nm", "N m", "likewise"),
+        Field("order_per_turn", "1", "teeth per motor turn"),
+    ),
+    "stiffness_hysteresis": (
+        Field("share", "1", "half width of the loop over the clamp force"),
+        Field("slip_angle_rad", "rad", "motor angle over which the slip element stretches"),
+    ),
+    "second_relaxation": (
+        Field("share", "1", "share of the force that settles slowly"),
+        Field("time_constant_s", "s", "its time constant"),
+    ),
+    "signal_delay": (Field("delay_s", "s", "age of the measured motor angle, up to 15 ms"),),
+    "backlash": (Field("play_rad", "rad", "motor angle lost at each reversal"),),
+    "friction_coefficient_fade": (
+        Field("fade_per_K", "1/K", "relative loss of pad friction above the onset"),
+        Field("onset_C", "degC", "pad surface temperature at which it begins"),
+    ),
+    "disc_radiation": (Field("area_m2", "m2", "radiating area times emissivity, in addition to the plant's own"),),
+    "thermocouple_lag": (Field("lag_s", "s", "first-order lag of the backplate thermocouples"),),
+    # Outside of the catalogue.
+    "clamp_creep": (
+        Field("share", "1", "share of the force that creeps in"),
+        Field("time_constant_s", "s", "its time constant, tens of seconds"),
+    ),
+    "brake_torque_coupling": (Field("per_Nm", "1/(N m)", "relative gain of clamp force with brake torque"),),
+    "caliper_softening": (Field("per_K", "1/K", "relative loss of stiffness as the caliper warms over 22 degC"),),
+    "spindle_lead_error": (
+        Field("amplitude_um", "um", "travel error over the spindle's turn"),
+        Field("order_per_turn", "1", "periods per motor turn"),
+        Field("phase_rad", "rad", "phase"),
+    ),
+    "cold_grease": (Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),),
+}
+
+EFFECT_VALUES = np.dtype(
+    [(name, np.dtype([(f.name, "f8") for f in fields], align=True)) for name, fields in EFFECTS.items()], align=True
+)
+
+#: Parameters of one corner's brake.
+PLANT_FIELDS = (
+    Field("torque_constant", "N m/A", "motor torque per torque-producing current at 25 degC"),
+    Field("inertia", "kg m2", "motor and gear, at the motor shaft"),
+    Field("gear_gain", "m/rad", "clamp travel per motor angle; torque per clamp force"),
+    Field("maximum_speed", "rad/s", "motor speed at which the supply's voltage is used up"),
+    Field("maximum_current", "A", "inverter limit"),
+    Field("current_time", "s", "time constant of the current controller"),
+    Field("magnet_heating", "K/A2", "steady rise of the magnets over the caliper per squared current"),
+    Field("magnet_time", "s", "its time constant"),
+    Field("load_friction", "m/rad", "gear friction torque per clamp force (thesis mu_g)"),
+    Field("offset_friction", "N m", "gear friction torque without load (thesis eta_g)"),
+    Field("presliding_angle", "rad", "Dahl's transition angle"),
+    Field("presliding_damping", "N m s/rad", "damping of the friction spring, none while sliding"),
+    Field("curve", "N/rad^n", "characteristic curve, n = 1 to 5, cold", (CURVE_TERMS,)),
+    Field("relaxation_time", "s", "first relaxation of the clamp force"),
+    Field("contact_angle", "rad", "clearance: motor angle from the released position to contact, cold and unworn"),
+    Field("released_angle", "rad", "what the resolver reads in the released position: its zero is arbitrary"),
+    Field("curve_temperature", "degC", "pad temperature at which the curve holds"),
+    Field("softening", "1/K", "loss of stiffness per rise of the mean pad temperature"),
+    Field("softening_history", "1/K", "loss of stiffness per rise as remembered"),
+    Field("history_time", "s", "time constant of that memory"),
+    Field("pad_thickness", "m", "one pad's friction material"),
+    Field("pad_area", "m2", "one pad's friction surface"),
+    Field("density", "kg/m3", "of the friction material"),
+    Field("specific_heat", "J/(kg K)", "at 20 degC"),
+    Field("specific_heat_rise", "1/K", "relative"),
+    Field("conductivity", "W/(m K)", "at 20 degC"),
+    Field("conductivity_rise", "1/K", "relative"),
+    Field("heat_share", "1", "of the friction power into inner and outer pad directly", (2,)),
+    Field("contact_conductance", "W/(m2 K)", "pad surface to disc under full contact"),
+    Field("gap_conductance", "W/(m2 K)", "pad surface to disc when released"),
+    Field("touching_force", "N", "clamp force at which contact conducts half as well as it can"),
+    Field("plate_conductance", "W/(m2 K)", "pad to backing plate"),
+    Field("plate_heat_capacity", "J/(m2 K)", "backing plate per friction area"),
+    Field("plate_loss", "W/(m2 K)", "backing plate to caliper, inner and outer", (2,)),
+    Field("caliper_heat_capacity", "J/K", "caliper"),
+    Field("caliper_loss", "W/K", "caliper to surroundings"),
+    Field("disc_heat_capacity", "J/K", "disc"),
+    Field("disc_cooling", "W/K", "disc to surroundings at rest"),
+    Field("disc_cooling_per_speed", "J/(rad K)", "gain of that with wheel speed"),
+    Field("disc_radiating_area", "m2", "times emissivity"),
+    Field("effective_radius", "m", "where the pads act"),
+    Field("friction_coefficient", "1", "pad on disc at 20 degC, no speed, no force"),
+    Field("friction_per_K", "1/K", "its slope over pad surface temperature"),
+    Field("friction_per_speed", "s/rad", "its slope over wheel speed"),
+    Field("friction_per_force", "1/N", "its slope over clamp force"),
+    Field("current_noise", "A", "standard deviation of the cycle's mean current, coloured"),
+    Field("current_noise_time", "s", "correlation time of that noise"),
+    Field("speed_noise", "rad/s", "standard deviation of the measured motor speed, white"),
+    Field("angle_noise", "rad", "of the resolver before quantisation"),
+    Field("angle_count", "rad", "resolver's least count"),
+    Field("angle_hysteresis", "rad", "beyond half a count, that the angle moves before the converter's reading follows"),
+    Field("temperature_noise", "K", "thermocouples"),
+    Field("force_noise", "N", "reference force sensor of the rig"),
+    Field("force_lead", "s", "time by which the reference force is younger than the resolver's sample"),
+    Field("brake_torque_noise", "N m", "reference torque sensor of the rig"),
+)
+
+PLANT = np.dtype(
+    [(f.name, "f8", f.shape) if f.shape else (f.name, "f8") for f in PLANT_FIELDS] + [("effects", EFFECT_VALUES)], align=True
+)
+
+#: State of one corner. Angles are past the released position; temperatures degC; works and heats in J since the start.
+PLANT_STATE = np.dtype(
+    [
+        ("angle", "f8"),
+        ("speed", "f8"),
+        ("current", "f8"),
+        ("friction", "f8"),
+        # Clamp: backlash output, travel past contact, slip element, drive of the relaxations and their states.
+        ("driven_angle", "f8"),
+        ("past_contact", "f8"),
+        ("slip", "f8"),
+        ("drive", "f8"),
+        ("slow", "f8"),
+        ("creep", "f8"),
+        ("excitation", "f8"),
+        ("force", "f8"),
+        ("force_rate", "f8"),
+        ("static_force", "f8"),
+        ("stiffness_factor", "f8"),
+        # Controller.
+        ("position_target", "f8"),
+        ("target_rate", "f8"),
+        ("speed_integral", "f8"),
+        ("force_correction", "f8"),
+        # Wheel (its zero is where its pulses count from) and heat.
+        ("wheel_angle", "f8"),
+        ("uneven_disc", "?"),
+        ("brake_torque", "f8"),
+        ("pads", "f8", (2, CELLS)),
+        ("surface", "f8", (2,)),
+        ("plate", "f8", (2,)),
+        ("plate_reading", "f8", (2,)),
+        ("caliper", "f8"),
+        ("disc", "f8"),
+        ("magnet_rise", "f8"),
+        ("softening_memory", "f8"),
+        ("wear", "f8"),
+        # Sensors.
+        ("current_error", "f8"),
+        ("mean_current", "f8"),
+        ("mean_current_error", "f8"),
+        ("angle_history", "f8", (HISTORY,)),
+        ("history_at", "i8"),
+        ("angle_reading", "f8"),
+        # Books.
+        ("motor_work", "f8"),
+        ("friction_loss", "f8"),
+        ("clamp_work", "f8"),
+        ("friction_heat", "f8"),
+        ("heat_lost", "f8"),
+    ],
+    align=True,
+)
+
+#: What the brake controller of a corner is told for one cycle: RELEASE, ANGLE (``target`` rad past the released position,
+#: moving at ``rate`` rad/s) or FORCE (``target`` N).
+RELEASE, ANGLE, FORCE = range(3)
+COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=True)
+
+#: Wire values of ParkBrake.
+PARK_RELEASED, PARK_APPLIED, PARK_IN_TRANSITION = range(3)
+
+#: What the driver (or the rig) does for one cycle. ``wheel_speed`` rad/s prescribes the discs' speed as a rig's drive does,
+#: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.
+DRIVE = np.dtype(
+    [
+        ("wheel_speed", "f8"),
+        ("target_speed", "f8"),
+        ("ambient", "f8"),
+        ("park_brake", "i8"),
+        ("brake_request", "i8"),
+    ],
+    align=True,
+)
+
+#: Training motion of a corner (thesis Fig. 3-9): slow clamp and release between two angles (rad past the released position)
+#: with a small fast sinusoid. ``start`` is where it set out from, ``tick`` cycles it has run, ``silent`` cycles since the
+#: request was last heard.
+TRAINING = np.dtype(
+    [
+        ("requested", "?"),
+        ("running", "?"),
+        ("low", "f8"),
+        ("high", "f8"),
+        ("amplitude", "f8"),
+        ("frequency", "f8"),
+        ("start", "f8"),
+        ("tick", "i8"),
+        ("silent", "i8"),
+    ],
+    align=True,
+)
+
+#: The car's longitudinal motion and what its messages need.
+CAR = np.dtype(
+    [
+        ("time_ns", "i8"),
+        ("tick", "i8"),
+        ("speed", "f8"),
+        ("wheel_speed", "f8"),
+        # kg carried by the simulated corners, m, N/(m/s)^2, N, m/s^2
+        ("mass", "f8"),
+        ("wheel_radius", "f8"),
+        ("drag", "f8"),
+        ("rolling", "f8"),
+        ("acceleration", "f8"),
+        ("supply_voltage", "f8"),
+        # s; messages leave up to this late after their sample.
+        ("jitter", "f8"),
+        ("counter", "i8", (15,)),
+        ("reference", "?"),
+    ],
+    align=True,
+)
+
+#: What was true at each resolver sample. Angles are the resolver's, contact and zero included; index 0 is the inner pad.
+TRUTH = np.dtype(
+    [
+        ("time_ns", "i8"),
+        ("corner", "i8"),
+        ("counter", "i8"),
+        ("force", "f8"),
+        ("static_force", "f8"),
+        ("angle", "f8"),
+        ("speed", "f8"),
+        ("current", "f8"),
+        ("contact_angle", "f8"),
+        ("stiffness_factor", "f8"),
+        ("brake_torque", "f8"),
+        ("surface", "f8", (2,)),
+        ("mean", "f8", (2,)),
+        ("depth", "f8", (2, len(PAD_DEPTHS_M))),
+        ("plate", "f8", (2,)),
+        ("caliper", "f8"),
+        ("disc", "f8"),
+        ("wheel_speed", "f8"),
+        ("wheel_angle", "f8"),
+        ("vehicle_speed", "f8"),
+        ("wear", "f8"),
+        ("park_brake", "i8"),
+        ("brake_request", "i8"),
+        ("training", "?"),
+    ],
+    align=True,
+)

@@ -1,0 +1,276 @@
+"""What driver, rig operator and brake controller do: schedules of one row per 4 ms cycle, and their building blocks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.plant.brake import static_angle
+from emb_daemon.plant.car import CYCLE_S, Car
+from emb_daemon.plant.records import (
+    ANGLE,
+    COMMAND,
+    DRIVE,
+    FORCE,
+    PARK_APPLIED,
+    PARK_IN_TRANSITION,
+    PARK_RELEASED,
+    RELEASE,
+)
+
+#: A request is signalled while the demanded force is above this, N.
+_REQUEST_N = 200.0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Commands (COMMAND, one row per cycle, every corner alike) and drives (DRIVE, one row per cycle)."""
+
+    commands: np.ndarray
+    drives: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.drives)
+
+    def __add__(self, other: "Schedule") -> "Schedule":
+        return Schedule(np.concatenate([self.commands, other.commands]), np.concatenate([self.drives, other.drives]))
+
+    @property
+    def seconds(self) -> float:
+        return len(self) * CYCLE_S
+
+    def first(self, seconds: float) -> "Schedule":
+        """The schedule from its start, repeated as often as ``seconds`` needs."""
+        rows = np.arange(round(seconds / CYCLE_S)) % len(self)
+        return Schedule(self.commands[rows], self.drives[rows])
+
+
+def rest(seconds: float, wheel_speed: float = np.nan, target_speed: float = 0.0, ambient: float = 22.0) -> Schedule:
+    """Released; ``wheel_speed`` rad/s turns the disc as a rig does, NaN leaves it to the car at ``target_speed`` m/s."""
+    count = round(seconds / CYCLE_S)
+    commands, drives = np.zeros(count, COMMAND), np.zeros(count, DRIVE)
+    commands["mode"] = RELEASE
+    drives["wheel_speed"], drives["target_speed"], drives["ambient"] = wheel_speed, target_speed, ambient
+    return Schedule(commands, drives)
+
+
+def _angles(schedule: Schedule, angle: np.ndarray) -> Schedule:
+    """Command angles past the released position (rad), smoothly."""
+    schedule.commands["mode"] = ANGLE
+    schedule.commands["target"] = angle
+    schedule.commands["rate"][:-1] = np.diff(angle) / CYCLE_S
+    return schedule
+
+
+def _forces(schedule: Schedule, force: np.ndarray) -> Schedule:
+    schedule.commands["mode"] = np.where(force > 0.0, FORCE, RELEASE)
+    schedule.commands["target"] = force
+    schedule.drives["brake_request"] = force > _REQUEST_N
+    return schedule
+
+
+def _approach(angle: np.ndarray, start: float = 0.0, seconds: float = 0.5) -> np.ndarray:
+    """Join a motion from ``start``, and leave it to the same again."""
+    time = CYCLE_S * np.arange(len(angle))
+    share = np.clip(np.minimum(time, time[-1] - time) / seconds, 0.0, 1.0)
+    share = 0.5 * (1.0 - np.cos(np.pi * share))
+    return start + share * (angle - start)
+
+
+def angle_at(plant: np.void, force_N: float) -> float:
+    """Motor angle past the released position (rad) at which the cold static force is ``force_N``."""
+    return float(plant["contact_angle"] + static_angle(plant, force_N))
+
+
+def curve(plant: np.void, force_N: float = 25000.0, seconds: float = 40.0, strokes: int = 1) -> Schedule:
+    """Slow clamp and release over the whole characteristic curve (thesis 2.1)."""
+    schedule = rest(seconds)
+    time = CYCLE_S * np.arange(len(schedule))
+    shape = 0.5 * (1.0 - np.cos(2.0 * np.pi * strokes * time / seconds))
+    return _angles(schedule, angle_at(plant, force_N) * shape)
+
+
+def random_angle(
+    plant: np.void, seconds: float, rng: np.random.Generator, low_N: float = 0.0, high_N: float = 15000.0, hold: float = 0.1
+) -> Schedule:
+    """A uniform random motor angle every ``hold`` seconds (thesis 3.3.2)."""
+    schedule = rest(seconds)
+    cycles = round(hold / CYCLE_S)
+    targets = rng.uniform(angle_at(plant, low_N), angle_at(plant, high_N), len(schedule) // cycles + 1)
+    schedule.commands["mode"] = ANGLE
+    schedule.commands["target"] = np.repeat(targets, cycles)[: len(schedule)]
+    schedule.drives["brake_request"] = 1
+    return schedule + rest(0.5)
+
+
+def training(
+    plant: np.void,
+    seconds: float = 42.0,
+    high_N: float = 15000.0,
+    period: float = 20.0,
+    amplitude: float = 0.8,
+    frequency: float = 6.0,
+) -> Schedule:
+    """Park brake applied; slow clamp and release with a small fast sinusoid on top (thesis Fig. 3-9)."""
+    schedule = rest(seconds)
+    time = CYCLE_S * np.arange(len(schedule))
+    low, high = plant["contact_angle"] - 2.0, angle_at(plant, high_N) - amplitude
+    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * time / period))
+    angle += amplitude * np.sin(2.0 * np.pi * frequency * time)
+    schedule.drives["park_brake"] = PARK_APPLIED
+    return _angles(schedule, _approach(angle)) + rest(0.5)
+
+
+def sinusoid(plant: np.void, frequency: float, seconds: float, low_N: float = 1000.0, high_N: float = 8000.0) -> Schedule:
+    """A sinusoid in motor angle, for the frequency response (thesis 3.3.1)."""
+    schedule = rest(seconds)
+    time = CYCLE_S * np.arange(len(schedule))
+    low, high = angle_at(plant, low_N), angle_at(plant, high_N)
+    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * time))
+    return _angles(schedule, _approach(angle)) + rest(0.5)
+
+
+def rig_stop(force_N: float, wheel_speed: float, clamp_seconds: float = 3.0, cycle_seconds: float = 9.0) -> Schedule:
+    """On the rig: the disc is brought to ``wheel_speed`` rad/s, braked to a stand and held a moment."""
+    schedule = rest(cycle_seconds)
+    time = CYCLE_S * np.arange(len(schedule))
+    begin = cycle_seconds - clamp_seconds - 1.5
+    stop = begin + 0.85 * clamp_seconds
+    schedule.drives["wheel_speed"] = wheel_speed * np.clip(
+        np.minimum(time / (0.7 * begin), (stop - time) / (stop - begin)), 0, 1
+    )
+    force = force_N * np.clip((time - begin) / 0.2, 0.0, 1.0) * (time < begin + clamp_seconds)
+    return _forces(schedule, force)
+
+
+def rig_drag(force_N: float, wheel_speed: float, seconds: float) -> Schedule:
+    """On the rig: a long brake application at constant disc speed."""
+    force = np.full(round(seconds / CYCLE_S), force_N)
+    return _forces(rest(seconds, wheel_speed), force * np.clip(CYCLE_S * np.arange(len(force)) / 0.5, 0.0, 1.0)) + rest(
+        2.0, wheel_speed
+    )
+
+
+def rig_cooling(wheel_speed: float, seconds: float) -> Schedule:
+    """On the rig: released, the disc turning."""
+    return rest(seconds, wheel_speed)
+
+
+def rig_campaign(plant: np.void, rng: np.random.Generator, stops: int = 24, drag_seconds: float = 45.0) -> Schedule:
+    """What the diagnosis logs hold: training, random angle, stops on a rotating disc, a long drag, random angle again."""
+    schedule = training(plant) + random_angle(plant, 22.0, rng)
+    for _ in range(stops):
+        force = float(np.exp(rng.uniform(np.log(2000.0), np.log(25000.0))))
+        schedule += rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.5), rng.uniform(7.0, 11.0))
+    schedule += rig_drag(3500.0, 31.4, drag_seconds)
+    return schedule + random_angle(plant, 20.0, rng)
+
+
+def accelerate(speed: float, seconds: float) -> Schedule:
+    """The car reaches and holds ``speed`` m/s."""
+    return rest(seconds, target_speed=speed)
+
+
+def stop(force_N: float, seconds: float, rise: float = 0.25) -> Schedule:
+    """The car is braked with ``force_N`` at each corner, comes to a stand if the time is enough, and is released."""
+    schedule = rest(seconds, target_speed=np.nan)
+    time = CYCLE_S * np.arange(len(schedule))
+    return _forces(schedule, force_N * np.clip(np.minimum(time / rise, (seconds - 0.3 - time) / 0.15), 0.0, 1.0))
+
+
+def drag(force_N: float, speed: float, seconds: float) -> Schedule:
+    """The car rolls downhill at ``speed`` m/s against its brakes."""
+    schedule = stop(force_N, seconds)
+    schedule.drives["target_speed"] = speed
+    return schedule
+
+
+def park(force_N: float, seconds: float) -> Schedule:
+    """The standing car is parked and, half a second before the end, released."""
+    schedule = rest(seconds, target_speed=0.0)
+    time = CYCLE_S * np.arange(len(schedule))
+    ramp = np.clip(np.minimum(time / 1.0, (seconds - 0.5 - time) / 0.3), 0.0, 1.0)
+    _forces(schedule, force_N * ramp)
+    schedule.drives["brake_request"] = 0
+    parked = np.where(ramp >= 1.0, PARK_APPLIED, PARK_IN_TRANSITION)
+    schedule.drives["park_brake"] = np.where(ramp > 0.0, parked, PARK_RELEASED)
+    return schedule
+
+
+def city_drive() -> Schedule:
+    """Thirty seconds: two stops with a cruise between them, a hard one, parking."""
+    return (
+        rest(1.0)
+        + accelerate(12.0, 4.0)
+        + stop(7000.0, 4.0)
+        + accelerate(16.0, 4.5)
+        + drag(1500.0, 16.0, 3.0)
+        + accelerate(18.0, 1.5)
+        + stop(16000.0, 3.5)
+        + park(14000.0, 7.5)
+        + rest(1.0)
+    )
+
+
+SCENARIOS = {
+    "drive": (city_drive, "two stops, a cruise, parking: 30 s, over and over"),
+    "stops": (
+        lambda: rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0),
+        "brake stops from 20 and 14 m/s",
+    ),
+    "cruise": (
+        lambda: rest(1.0) + accelerate(22.0, 30.0) + drag(2500.0, 22.0, 20.0) + accelerate(22.0, 30.0) + stop(6000.0, 9.0),
+        "driving with a long slight brake application",
+    ),
+    "park": (lambda: rest(1.0) + park(12000.0, 120.0) + rest(2.0), "parked: training motion when the daemon asks for it"),
+}
+
+
+def scenario(name: str) -> Schedule:
+    """A named scenario.
+
+    Raises:
+        InputError: no such scenario.
+    """
+    if name not in SCENARIOS:
+        raise InputError(f"scenario {name}: expected one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name][0]()
+
+
+#: Share of the demanded force at a rear brake.
+_REAR_SHARE = 0.6
+
+
+def commands_of(schedule: Schedule, corners: tuple[str, ...]) -> np.ndarray:
+    """COMMAND array (cycles, corners): every corner as scheduled, rear brakes with less force."""
+    commands = np.repeat(schedule.commands[:, None], len(corners), axis=1)
+    for row, corner in enumerate(corners):
+        if corner.startswith("R"):
+            commands["target"][:, row] *= np.where(commands["mode"][:, row] == FORCE, _REAR_SHARE, 1.0)
+    return commands
+
+
+def simulate_log(
+    plants: np.ndarray | np.void,
+    schedule: Schedule,
+    seconds: float | None = None,
+    seed: int = 0,
+    corners: tuple[str, ...] = ("FL",),
+    reference: bool = True,
+    **car_options,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A whole log at once, reproducible from its seed.
+
+    Args:
+        plants: PLANT record, or array with one record per corner.
+        seconds: the schedule is cut or repeated to this length; None takes it as it is.
+        reference: with the rig instruments' frames.
+        car_options: more of `Car`.
+
+    Returns:
+        (FRAME array in order of time, TRUTH array of shape (cycles, corners)).
+    """
+    car = Car(np.atleast_1d(plants), corners, seed, reference, **car_options)
+    if seconds is not None:
+        schedule = schedule.first(seconds)
+    return car.run(commands_of(schedule, corners), schedule.drives)
