@@ -758,13 +758,8 @@ def _judge(result: Identification, folds: list[Fold]) -> None:
 
 
 def _with_gear(calibration: Calibration, fit: TorqueFit) -> Calibration:
-    return msgspec.structs.replace(
-        calibration,
-        motor=msgspec.structs.replace(
-            calibration.motor, torque_constant_Nm_per_A=fit.torque_constant, inertia_kg_m2=fit.inertia
-        ),
-        friction=_friction(fit),
-    )
+    """Wear changes friction; motor and inertia stay."""
+    return msgspec.structs.replace(calibration, friction=_friction(fit))
 
 
 def _friction(fit: TorqueFit) -> Friction:
