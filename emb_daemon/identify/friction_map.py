@@ -14,7 +14,15 @@ _LEAST_FORCE_N = 500.0
 _LEAST_SPEED_RAD_PER_S = 1.0
 #: Rows before and after that must brake as well, so that none averages over an edge.
 _MARGIN = 2
-_LEAST_ROWS = 100
+#: Time over which rows are averaged: noise of the force would pass for a friction that falls with force.
+_AVERAGE_S = 1.0
+_LEAST_ROWS = 30
+#: What a second's coefficient is worth, errors lasting for longer than that, and what is expected of its dependence on force
+#: (1/N), speed (s/rad) and temperature (1/K): a log that varies one of them little says nothing of it.
+_ROW_SIGMA = 0.01
+_EXPECTED_SLOPES = (1e-5, 3e-3, 1e-3)
+#: Bend with temperature that is expected, 1/K^2.
+_EXPECTED_BEND = 5e-6
 #: Pieces of the data that are left out in turn.
 _PIECES = 8
 #: By how much an added term must lower the error on pieces left out.
@@ -55,17 +63,30 @@ def _rows(r: Recording, parameters: np.ndarray) -> np.ndarray:
     for shift in range(1, _MARGIN + 1):
         steady[shift:] &= braking[:-shift]
         steady[:-shift] &= braking[shift:]
+    together = max(round(_AVERAGE_S / r.step_s), 1)
+    whole = len(steady) // together * together
+    steady = steady[:whole].reshape(-1, together).all(axis=1)
+
+    def averaged(values):
+        return values[:whole].reshape(-1, together).mean(axis=1)[steady]
+
     radius = float(parameters["effective_radius"][0])
-    coefficient = r.power[steady] / (2.0 * radius * r.force[steady] * r.speed[steady])
-    return np.array([r.force[steady], r.speed[steady], surface[steady], coefficient])
+    force, speed = averaged(r.force), averaged(r.speed)
+    return np.array([force, speed, averaged(surface), averaged(r.power) / (2.0 * radius * averaged(r.force * r.speed))])
 
 
-def _solve(design, coefficient, weight):
-    return np.linalg.lstsq(design * weight[:, None], coefficient * weight, rcond=None)[0]
+def _solve(design, coefficient, weight, expected):
+    """Weighted least squares; each term but the first pulled to zero by what is expected of it."""
+    pull = np.diag(1.0 / expected)
+    left = np.concatenate([design * (weight / _ROW_SIGMA)[:, None], pull])
+    right = np.concatenate([coefficient * weight / _ROW_SIGMA, np.zeros(len(expected))])
+    return np.linalg.lstsq(left, right, rcond=None)[0]
 
 
 def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> FrictionFit:
     """Friction coefficient from brake torque, clamp force and the modelled surface temperature (mean of both pads).
+
+    The friction power of a recording stands for torque times speed.
 
     A smooth model tabulated, because a table filled from data has empty corners: linear in force, speed and temperature, and
     bent in temperature where pieces of data left out in turn say so. Rows are weighted by force, the torque sensor's noise
@@ -89,16 +110,24 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
         u = [(f - centre[0]) / width[0], (w - centre[1]) / width[1], (t - centre[2]) / width[2]]
         return np.stack([np.ones_like(u[0]), *u] + ([u[2] ** 2 - 1.0] if bent else []), axis=-1)
 
+    weight = force / force.max()
+
+    def expected(bent):
+        bend = [_EXPECTED_BEND * width[2] ** 2] if bent else []
+        return np.array([1e3, *(_EXPECTED_SLOPES * width), *bend])
+
     piece = np.arange(len(force)) * _PIECES // len(force)
     errors, leave_out = {}, {}
     for bent in (False, True):
         columns = design(force, speed, temperature, bent)
-        left = [_solve(columns[piece != k], coefficient[piece != k], force[piece != k]) for k in range(_PIECES)]
+        left = [
+            _solve(columns[piece != k], coefficient[piece != k], weight[piece != k], expected(bent)) for k in range(_PIECES)
+        ]
         predicted = np.array([columns[row] @ left[k] for row, k in enumerate(piece)])
         errors[bent], leave_out[bent] = np.average((predicted - coefficient) ** 2, weights=force**2), left
     bent = errors[True] < _WORTH_IT**2 * errors[False]
     columns = design(force, speed, temperature, bent)
-    terms = _solve(columns, coefficient, force)
+    terms = _solve(columns, coefficient, weight, expected(bent))
     deviation = columns @ (np.array(leave_out[bent]) - terms).T
     sigma = np.sqrt((_PIECES - 1) / _PIECES * np.mean(np.sum(deviation**2, axis=1)))
 
