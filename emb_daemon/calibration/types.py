@@ -273,6 +273,38 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
     return below + share * (above - below)
 
 
+def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
+    """Write the thermal part into a THERMAL record."""
+    pad, disc = thermal.pad, thermal.disc
+    t["conductivity"] = pad.conductivity_W_per_mK
+    t["conductivity_rise"] = pad.conductivity_rise_per_K
+    t["density"] = pad.density_kg_per_m3
+    t["specific_heat"] = pad.specific_heat_J_per_kgK
+    t["specific_heat_rise"] = pad.specific_heat_rise_per_K
+    t["area"] = pad.area_m2
+    t["thickness"] = pad_thickness_m
+    t["node_position"] = mesh(pad_thickness_m)
+    t["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
+    t["contact_conductance"] = pad.contact_conductance_W_per_m2K
+    t["gap_conductance"] = pad.gap_conductance_W_per_m2K
+    t["surface_cooling_per_speed"] = pad.surface_cooling_per_speed_J_per_rad_m2K
+    t["backplate_conductance"] = pad.backplate_conductance_W_per_m2K
+    t["disc_heat_capacity"] = disc.heat_capacity_J_per_K
+    t["disc_cooling"] = disc.cooling_W_per_K
+    t["disc_cooling_per_speed"] = disc.cooling_per_speed_J_per_rad_K
+    t["disc_radiating_area"] = disc.radiating_area_m2
+    t["effective_radius"] = disc.effective_radius_m
+    t["friction_force"] = thermal.friction.force_N
+    t["friction_speed"] = thermal.friction.disc_speed_rad_per_s
+    t["friction_temperature"] = thermal.friction.surface_temperature_C
+    t["friction_coefficient"] = thermal.friction.coefficient
+    t["softening"] = thermal.softening.per_K
+    t["softening_history"] = thermal.softening.history_per_K
+    t["history_time"] = thermal.softening.history_time_s
+    t["reference"] = thermal.softening.reference_C
+    t["sigma"] = thermal.sigma_K
+
+
 def to_parameters(calibration: Calibration) -> np.void:
     """The estimator's PARAMETERS record of a calibration."""
     c = calibration
@@ -298,34 +330,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["speed_sigma"] = c.noise.speed_rad_per_s
     p["presliding_sigma"] = c.noise.presliding
     p["torque_relative_sigma"] = c.noise.torque_relative
-    pad, disc, t = c.thermal.pad, c.thermal.disc, p["thermal"]
-    t["conductivity"] = pad.conductivity_W_per_mK
-    t["conductivity_rise"] = pad.conductivity_rise_per_K
-    t["density"] = pad.density_kg_per_m3
-    t["specific_heat"] = pad.specific_heat_J_per_kgK
-    t["specific_heat_rise"] = pad.specific_heat_rise_per_K
-    t["area"] = pad.area_m2
-    t["thickness"] = 1e-3 * c.pad_thickness_mm
-    t["node_position"] = mesh(1e-3 * c.pad_thickness_mm)
-    t["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
-    t["contact_conductance"] = pad.contact_conductance_W_per_m2K
-    t["gap_conductance"] = pad.gap_conductance_W_per_m2K
-    t["surface_cooling_per_speed"] = pad.surface_cooling_per_speed_J_per_rad_m2K
-    t["backplate_conductance"] = pad.backplate_conductance_W_per_m2K
-    t["disc_heat_capacity"] = disc.heat_capacity_J_per_K
-    t["disc_cooling"] = disc.cooling_W_per_K
-    t["disc_cooling_per_speed"] = disc.cooling_per_speed_J_per_rad_K
-    t["disc_radiating_area"] = disc.radiating_area_m2
-    t["effective_radius"] = disc.effective_radius_m
-    t["friction_force"] = c.thermal.friction.force_N
-    t["friction_speed"] = c.thermal.friction.disc_speed_rad_per_s
-    t["friction_temperature"] = c.thermal.friction.surface_temperature_C
-    t["friction_coefficient"] = c.thermal.friction.coefficient
-    t["softening"] = c.thermal.softening.per_K
-    t["softening_history"] = c.thermal.softening.history_per_K
-    t["history_time"] = c.thermal.softening.history_time_s
-    t["reference"] = c.thermal.softening.reference_C
-    t["sigma"] = c.thermal.sigma_K
+    fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
     for name, values in c.effects.items():
         for key, value in values.items():
             p["effects"][name][key] = value

@@ -8,6 +8,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import Noise
 from emb_daemon.identify.torque import TorqueFit, unexplained_current
+from emb_daemon.jit import njit
 from emb_daemon.offline import Log
 from emb_daemon.pipeline import CYCLE_S
 
@@ -67,23 +68,40 @@ def speed_noise(logs: list[Log]) -> float | None:
     return float(np.sqrt(squares / count)) if count else None
 
 
+@njit
+def _innovation_cost(residual, variance, decay, white):
+    """Mean negative log likelihood (without constants) of first-order noise under white noise, by its Kalman filter."""
+    state, spread, cost = 0.0, variance, 0.0
+    for value in residual:
+        total = spread + white
+        innovation = value - state
+        cost += np.log(total) + innovation * innovation / total
+        gain = spread / total
+        state = decay * (state + gain * innovation)
+        spread = decay * decay * (1.0 - gain) * spread + (1.0 - decay * decay) * variance
+    return cost
+
+
 def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, float]:
-    """First-order coloured noise of the current: (standard deviation in A, correlation time in s).
+    """First-order coloured noise of the current by maximum likelihood: (standard deviation in A, correlation time in s).
 
     Args:
         residuals: unexplained current, gap-free stretches.
-        white: standard deviation in A that the speed's noise alone leaves in it through the inertia; it is independent from
-            sample to sample in the speed, hence minus half its variance at the first lag.
+        white: standard deviation in A of the white noise that the filter takes the speed's noise for.
     """
-    covariance = autocorrelation(residuals, 6)
-    covariance[0] -= white**2
-    covariance[1] += 0.5 * white**2
-    usable = covariance[1:4]
-    if covariance[0] <= 0.0 or np.any(usable <= 0.0):
-        return float(np.sqrt(max(covariance[0], 1e-6))), 0.5 * CYCLE_S
-    slope = np.polyfit(np.arange(1, 4), np.log(usable), 1)[0]
-    time = CYCLE_S / max(-slope, 1e-3)
-    return float(np.sqrt(covariance[0])), float(np.clip(time, 0.5 * CYCLE_S, 1.0))
+    from scipy.optimize import minimize
+
+    total = float(np.mean(np.concatenate(residuals) ** 2))
+    samples = sum(len(r) for r in residuals)
+
+    def cost(p):
+        decay = float(np.exp(-CYCLE_S / np.exp(p[1])))
+        return sum(_innovation_cost(r, float(np.exp(2.0 * p[0])), decay, white**2) for r in residuals) / samples
+
+    start = [0.5 * np.log(max(total - white**2, 0.1 * total)), np.log(2.0 * CYCLE_S)]
+    bounds = [(start[0] - 5.0, start[0] + 2.0), (np.log(0.25 * CYCLE_S), np.log(1.0))]
+    found = minimize(cost, start, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-7})
+    return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
 
 
 def torque_levels(held_out: list[tuple[Log, TorqueFit]], gear_gain: float, speed_sigma: float) -> dict[str, float]:

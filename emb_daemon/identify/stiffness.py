@@ -142,6 +142,12 @@ def with_dynamics(values: dict[str, float]) -> np.ndarray:
     return parameters
 
 
+def is_slow(log: Log) -> bool:
+    """Whether the motor passes its travel less than once in four seconds: a slow clamp, no random motion."""
+    angle = log.samples["angle"]
+    return float(np.sum(np.abs(np.diff(angle)))) < 0.25 * float(np.ptp(angle)) * log.time_s[-1]
+
+
 def contact_guess(log: Log, noise_N: float) -> float:
     """Motor angle at which the reference force first stands clear of its noise, on the log's own zero."""
     clear = np.flatnonzero(log.force_N > 8.0 * max(noise_N, 1e-9))
@@ -264,7 +270,7 @@ def fit_dynamics(
         effects: which of `OPTIONAL` take part.
         start: dynamics to start from, by name.
         curves: curves to start from, one per group.
-        fraction: share of each log that is fitted, from its beginning, where it moves randomly (more than one turn a second).
+        fraction: share that is fitted of each log that is not slow, from its beginning.
         fixed: keep the dynamics at ``start`` and fit curves and contact angles alone.
     """
     start = dict(start or starting_values(groups))
@@ -327,7 +333,7 @@ def fit_dynamics(
     def block(index):
         g, log = logs[index]
         rows = len(log.samples)
-        if fraction < 1.0 and _is_fast(log):
+        if fraction < 1.0 and not is_slow(log):
             rows = int(fraction * rows)
         samples, force = log.samples[:rows], log.force_N[:rows]
         known = np.isfinite(force)
@@ -346,11 +352,6 @@ def fit_dynamics(
     return _unpack(
         solution, groups, logs, [] if fixed else names, start if fixed else {}, powers, spans, shared, first_contact
     )
-
-
-def _is_fast(log: Log) -> bool:
-    angle = log.samples["angle"]
-    return float(np.sum(np.abs(np.diff(angle)))) > 0.5 * float(np.ptp(angle)) * log.time_s[-1]
 
 
 def _unpack(solution: Solution, groups, logs, names, held, powers, spans, shared, first_contact) -> DynamicsFit:

@@ -1,0 +1,158 @@
+"""Figures of the reports: few colours with one meaning each, time axes that zoom together, data reduced for the screen."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+ACCENT = "#0b5cad"
+INK = "#1d2430"
+MUTED = "#6b7480"
+GRID = "#e6e9ee"
+_WARM = "#c2662d"
+_PALE = "#9aa4b1"
+
+#: Points that a trace may have on the page; more cannot be told apart on a screen.
+SCREEN_POINTS = 3000
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a trace looks, by what it is."""
+
+    colour: str
+    width: float = 1.4
+    dash: str = "solid"
+    mode: str = "lines"
+
+
+REFERENCE = Style(INK, 1.6)
+MODEL = Style(ACCENT, 1.4)
+THESIS = Style(_WARM, 1.2, "dot")
+PALE = Style(_PALE, 1.0)
+MARKS = Style(ACCENT, mode="markers")
+#: Between a trace and the one before it lies a pale band; give lower and upper edge in this style, lower first.
+BAND = Style("rgba(11,92,173,0.18)", 0.0)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One line or set of points. ``sigma`` draws error bars of one standard deviation."""
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    style: Style = MODEL
+    sigma: np.ndarray | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes; those of a figure stand under each other."""
+
+    title: str
+    unit: str
+    traces: list[Trace]
+    height: int = 260
+    logarithmic: bool = False
+
+
+def decimate(x: np.ndarray, y: np.ndarray, points: int = SCREEN_POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """At most about ``points`` of a curve, smallest and largest of every bucket, so that no peak is lost.
+
+    NaN stays as a gap where a whole bucket is NaN."""
+    x, y = np.asarray(x), np.asarray(y, dtype=float)
+    if len(y) <= points:
+        return x, y
+    buckets = points // 2
+    edges = np.linspace(0, len(y), buckets + 1).astype(np.int64)
+    rows = []
+    for begin, end in pairwise(edges):
+        part = y[begin:end]
+        if np.isnan(part).all():
+            rows.append(begin)
+            continue
+        rows += sorted({begin + int(np.nanargmin(part)), begin + int(np.nanargmax(part))})
+    rows = np.array(sorted({0, *rows, len(y) - 1}))
+    return x[rows], y[rows]
+
+
+def shades(count: int) -> list[str]:
+    """``count`` shades of the accent, light to dark, for a quantity in order."""
+    light, dark = np.array([147, 190, 232]), np.array([6, 44, 92])
+    shares = np.linspace(0.0, 1.0, count) if count > 1 else [1.0]
+    return [f"rgb({','.join(str(round(v)) for v in light + s * (dark - light))})" for s in shares]
+
+
+def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, shared: bool):
+    from plotly.graph_objects import Figure, Scatter
+    from plotly.subplots import make_subplots
+
+    heights = [panel.height for panel in panels]
+    gap = 46
+    total = sum(heights) + gap * (len(panels) - 1)
+    figure = make_subplots(
+        rows=len(panels), cols=1, shared_xaxes=shared, vertical_spacing=gap / total if len(panels) > 1 else 0.0,
+        row_heights=heights, subplot_titles=[panel.title for panel in panels],
+    ) if panels else Figure()  # fmt: skip
+    shown: set[str] = set()
+    for row, panel in enumerate(panels, start=1):
+        band_open = False
+        for trace in panel.traces:
+            x, y = np.asarray(trace.x), np.asarray(trace.y, dtype=float)
+            if reduce and trace.style.mode == "lines":
+                x, y = decimate(x, y)
+            style, is_band = trace.style, trace.style is BAND
+            figure.add_trace(
+                Scatter(
+                    x=np.asarray(x, dtype=np.float64),
+                    # Single precision is beyond what an eye resolves and halves the file.
+                    y=y.astype(np.float32),
+                    name=trace.name,
+                    mode=style.mode,
+                    line={"color": style.colour, "width": style.width, "dash": style.dash},
+                    marker={"color": style.colour, "size": 7},
+                    fill="tonexty" if is_band and band_open else None,
+                    fillcolor=style.colour if is_band else None,
+                    hoverinfo="skip" if is_band else None,
+                    error_y={"type": "data", "array": trace.sigma, "thickness": 1, "width": 3} if trace.sigma is not None
+                    else None,
+                    legendgroup=trace.name,
+                    showlegend=bool(trace.name) and trace.name not in shown and not (is_band and not band_open),
+                ),
+                row=row,
+                col=1,
+            )  # fmt: skip
+            if not (is_band and not band_open):
+                shown.add(trace.name)
+            band_open = is_band and not band_open
+        figure.update_yaxes(title_text=panel.unit, type="log" if panel.logarithmic else "linear", row=row, col=1)
+        if x_log:
+            figure.update_xaxes(type="log", row=row, col=1)
+    figure.update_xaxes(title_text=x_title, row=len(panels), col=1)
+    axis = {"gridcolor": GRID, "zeroline": False, "linecolor": "#b8c0ca", "ticks": "outside", "tickcolor": "#b8c0ca"}
+    figure.update_xaxes(**axis)
+    figure.update_yaxes(**axis, title_standoff=8)
+    figure.update_layout(
+        height=total + 110,
+        margin={"l": 64, "r": 16, "t": 40, "b": 48},
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        font={"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12.5, "color": INK},
+        legend={"orientation": "h", "yanchor": "bottom", "y": 1.0 + 24.0 / total, "xanchor": "right", "x": 1.0},
+        hovermode="x unified" if shared else "closest",
+        hoverlabel={"font": {"size": 12}},
+    )
+    for annotation in figure.layout.annotations:
+        annotation.update(font={"size": 13, "color": MUTED}, x=0.0, xanchor="left")
+    return figure
+
+
+def time_figure(panels: list[Panel], x_title: str = "time / s"):
+    """Panels over one time axis; zooming one zooms all. Data are decimated keeping peaks."""
+    return _figure(panels, x_title, reduce=True, x_log=False, shared=True)
+
+
+def xy_figure(panels: list[Panel], x_title: str, *, x_log: bool = False, reduce: bool = False):
+    """Panels over a quantity other than time. ``reduce`` decimates lines whose x ascends."""
+    return _figure(panels, x_title, reduce=reduce, x_log=x_log, shared=len(panels) > 1)

@@ -1,0 +1,385 @@
+"""Thermal identification finds what a plant, integrated independently and finer, was built with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.types import Thermal, fill_thermal
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import PARAMETERS, SAMPLE, THERMAL
+from emb_daemon.identify.friction_map import constant_friction, fit_friction
+from emb_daemon.identify.heat import (
+    UNKNOWNS,
+    Nominal,
+    Recording,
+    check_excitation,
+    fit_heat,
+    nominal_parameters,
+    simulate,
+)
+from emb_daemon.identify.softening import fit_softening
+from emb_daemon.identify.stiffness import simulate as stiffness_force
+from emb_daemon.identify.thermal import ThermalLogs, identify_thermal
+from emb_daemon.jit import njit
+from emb_daemon.models.thermal import friction_power
+from emb_daemon.models.thesis_pad import thesis_nodes, thesis_profiles
+from emb_daemon.offline import Log
+
+NOMINAL = Nominal(
+    pad_thickness_m=0.010,
+    pad_area_m2=0.0046,
+    pad_density_kg_per_m3=2450.0,
+    pad_specific_heat_J_per_kgK=1200.0,
+    pad_conductivity_W_per_mK=1.2,
+    disc_mass_kg=5.6,
+    disc_specific_heat_J_per_kgK=480.0,
+    disc_effective_radius_m=0.131,
+    disc_cooling_area_m2=0.19,
+    disc_conductivity_W_per_mK=50.0,
+    friction_coefficient=0.39,
+)
+STEP_S = 0.2
+AMBIENT_C = 22.0
+CELLS = 60
+
+
+@njit
+def _plant(p, dt, every, power, touching, speed, out):
+    """Explicit heat balance of 2 x 60 cells with their own backing plates: another mesh, another time scheme.
+
+    ``out`` (rows, 13): pads at 2, 4, 6, 8 mm (inner, outer), disc, backing plates, pad means.
+    """
+    cell = p.thickness / CELLS
+    store = p.density * p.specific_heat * cell
+    pads = np.full((2, CELLS), 22.0)
+    plates = np.full(2, 22.0)
+    flux = np.empty(CELLS + 1)
+    disc = 22.0
+    for row in range(len(power)):
+        for side in range(2):
+            for depth in range(4):
+                # 2 mm is the face between two cells.
+                face = 12 * (depth + 1)
+                out[row, 4 * side + depth] = 0.5 * (pads[side, face - 1] + pads[side, face])
+            out[row, 9 + side] = plates[side]
+            out[row, 11 + side] = pads[side].mean()
+        out[row, 8] = disc
+        contact = p.contact_conductance if touching[row] else p.gap_conductance
+        air = 0.0 if touching[row] else p.surface_cooling_per_speed * speed[row]
+        for _ in range(every):
+            gain = (1.0 - p.heat_share[0] - p.heat_share[1]) * power[row]
+            gain -= (p.disc_cooling + p.disc_cooling_per_speed * speed[row]) * (disc - 22.0)
+            gain -= p.disc_radiating_area * 5.670374419e-8 * ((disc + 273.15) ** 4 - 295.15**4)
+            for side in range(2):
+                t = pads[side]
+                k0 = p.conductivity * (1.0 + p.conductivity_rise * (t[0] - 20.0))
+                # The half cell between its middle and the friction surface carries friction, disc and air.
+                half = 2.0 * k0 / cell
+                heat = p.heat_share[side] * power[row] / p.area
+                surface = (half * t[0] + contact * disc + air * 22.0 + heat) / (half + contact + air)
+                flux[0] = half * (surface - t[0])
+                gain -= p.area * contact * (disc - surface)
+                for face in range(1, CELLS):
+                    k = p.conductivity * (1.0 + p.conductivity_rise * (0.5 * (t[face - 1] + t[face]) - 20.0))
+                    flux[face] = k * (t[face - 1] - t[face]) / cell
+                kn = p.conductivity * (1.0 + p.conductivity_rise * (t[CELLS - 1] - 20.0))
+                series = 1.0 / (0.5 * cell / kn + 1.0 / p.backplate_conductance)
+                flux[CELLS] = series * (t[CELLS - 1] - plates[side])
+                for index in range(CELLS):
+                    t[index] += dt / store * (flux[index] - flux[index + 1])
+                plates[side] += dt / 17500.0 * (flux[CELLS] - 80.0 * (plates[side] - 22.0))
+            disc += dt * gain / p.disc_heat_capacity
+
+
+def run_plant(parameters, power, touching, speed, noise=0.0, rng=None, name="plant"):
+    """(Recording with what its thermocouples say, mean temperature of both pads)."""
+    out = np.empty((len(power), 13))
+    _plant(parameters[0], STEP_S / 50, 50, power, touching, speed, out)
+    measured = out[:, :9].T.copy()
+    if noise:
+        measured += noise * rng.standard_normal(measured.shape)
+    force = np.where(touching, 3000.0, 0.0)
+    ambient = np.full(len(power), AMBIENT_C)
+    inputs = (out[:, 9].copy(), out[:, 10].copy(), ambient, power, touching, speed, force)
+    return Recording(name, STEP_S, *inputs, measured, dense=True), out[:, 11:13].mean(axis=1)
+
+
+def _drag(seconds):
+    t = STEP_S * np.arange(round(seconds / STEP_S))
+    speed = 19.0 * (1.0 - np.cos(2.0 * np.pi * t / 60.0))
+    return 280.0 * speed, np.ones(len(t), bool), speed
+
+
+def _cooling(speed, braked_s=120.0, released_s=400.0):
+    braked, released = round(braked_s / STEP_S), round(released_s / STEP_S)
+    speeds = np.concatenate([np.full(braked, 20.0), np.full(released, speed)])
+    touching = np.concatenate([np.ones(braked, bool), np.zeros(released, bool)])
+    return np.where(touching, 280.0 * speeds, 0.0), touching, speeds
+
+
+def _campaign(truth, rng):
+    scenarios = [_drag(420.0), *(_cooling(speed) for speed in (0.0, 6.0, 18.0, 36.0))]
+    return [run_plant(truth, *scenario, 0.25, rng)[0] for scenario in scenarios]
+
+
+def _draw(rng, **fixed):
+    truth = nominal_parameters(NOMINAL)
+    for u in UNKNOWNS:
+        known = u.spread < 0.1
+        factor = np.exp(rng.uniform(-0.07, 0.07) if known else rng.uniform(-0.35, 0.35))
+        if u.index is None:
+            truth[u.field] *= factor
+        else:
+            truth[u.field][0, u.index] *= factor
+    for name, value in fixed.items():
+        truth[name] = value
+    return truth
+
+
+def _values(parameters):
+    return {u.key: float(parameters[u.field][0] if u.index is None else parameters[u.field][0, u.index]) for u in UNKNOWNS}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_pads_and_disc_are_found_within_three_sigma(seed):
+    rng = np.random.default_rng(seed)
+    truth = _draw(rng)
+    fit = fit_heat(_campaign(truth, rng), NOMINAL)
+    found, expected = _values(fit.parameters), _values(truth)
+    off = {key: (found[key] - expected[key]) / fit.sigmas[key] for key in expected}
+    assert max(map(abs, off.values())) < 3.0, off
+    # An honest sigma is small where the logs speak: the disc is weighed to a per cent.
+    assert fit.sigmas["disc.heat_capacity_J_per_K"] < 0.02 * expected["disc.heat_capacity_J_per_K"]
+    # What both models say of a log that fitted nothing.
+    r, _ = run_plant(truth, *_cooling(12.0, 200.0, 200.0))
+    assert np.sqrt(np.mean((simulate(fit.parameters, r)[:, :8] - r.measured[:8].T) ** 2)) < 0.3
+
+
+def test_no_radiation_is_found_where_there_is_none():
+    rng = np.random.default_rng(3)
+    truth = _draw(rng, disc_radiating_area=0.0)
+    fit = fit_heat(_campaign(truth, rng), NOMINAL)
+    area = float(fit.parameters["disc_radiating_area"][0])
+    assert 0.0 <= area < 3.0 * fit.sigmas["disc.radiating_area_m2"] + 1e-9
+    assert area < 0.1 * NOMINAL.disc_cooling_area_m2
+
+
+def test_logs_without_a_release_say_so():
+    """What only a release can tell stays where it started, and is named."""
+    rng = np.random.default_rng(4)
+    fit = fit_heat([run_plant(_draw(rng), *_drag(300.0), 0.25, rng)[0]], NOMINAL)
+    assert "pad.gap_conductance_W_per_m2K" in fit.unexcited
+    assert "disc.heat_capacity_J_per_K" not in fit.unexcited
+
+
+def test_a_cold_log_is_named_with_what_was_needed():
+    rows = 500
+    still = np.zeros(rows)
+    r, _ = run_plant(nominal_parameters(NOMINAL), still, still > 0, still, name="cold.log")
+    with pytest.raises(InputError, match=r"cold\.log: pads rise by 0 K; at least 30 K by braking"):
+        check_excitation(r)
+
+
+def test_nothing_at_all_is_an_input_error():
+    with pytest.raises(InputError, match=r"thermal\.tune"):
+        identify_thermal(ThermalLogs(), NOMINAL)
+
+
+def _friction_recording(law, truth, seconds=600.0):
+    """Braking at changing force and speed whose torque follows ``law`` (force N, speed rad/s, surface degC)."""
+    t = STEP_S * np.arange(round(seconds / STEP_S))
+    force = 2500.0 + 1500.0 * np.sign(np.sin(2.0 * np.pi * t / 37.0))
+    speed = 18.0 + 14.0 * np.sign(np.sin(2.0 * np.pi * t / 101.0))
+    touching = np.ones(len(t), bool)
+    radius = NOMINAL.disc_effective_radius_m
+    power = 2.0 * 0.35 * radius * force * speed * 0.5
+    for _ in range(6):
+        plain, _ = run_plant(truth, power, touching, speed)
+        surface = simulate(truth, plain)[:, 9:11].mean(axis=1)
+        power = 2.0 * law(force, speed, surface) * radius * force * speed
+    r, _ = run_plant(truth, power, touching, speed)
+    return Recording(r.name, STEP_S, r.inner, r.outer, r.ambient, power, touching, speed, force, r.measured, dense=True)
+
+
+@pytest.mark.parametrize("bend", [0.0, 4e-7])
+def test_friction_table_reproduces_the_law_it_was_made_with(bend):
+    def law(force, speed, surface):
+        return 0.42 - 4e-6 * force - 7e-4 * speed - 2e-4 * (surface - 150.0) - bend * (surface - 150.0) ** 2
+
+    truth = nominal_parameters(NOMINAL)
+    fit = fit_friction([_friction_recording(law, truth)], truth)
+    truth["friction_force"], truth["friction_speed"] = fit.table.force_N, fit.table.disc_speed_rad_per_s
+    truth["friction_temperature"], truth["friction_coefficient"] = fit.table.surface_temperature_C, fit.table.coefficient
+    for quantile in (0.1, 0.5, 0.9):
+        force, speed = np.quantile(fit.force_N, quantile), np.quantile(fit.speed_rad_per_s, 1.0 - quantile)
+        surface = np.quantile(fit.temperature_C, quantile)
+        expected = 2.0 * law(force, speed, surface) * NOMINAL.disc_effective_radius_m * force * speed
+        assert friction_power(truth[0], force, speed, surface) == pytest.approx(expected, rel=0.01)
+
+
+def test_noise_of_the_force_is_not_taken_for_friction():
+    """At one force its noise appears on both sides of torque over force; the slope over force must stay physical."""
+    truth = nominal_parameters(NOMINAL)
+    rng = np.random.default_rng(5)
+    power, touching, speed = _drag(420.0)
+    speed = np.maximum(speed, 0.1)
+    force = np.full(len(power), 3000.0)
+    power = 2.0 * 0.4 * NOMINAL.disc_effective_radius_m * force * speed
+    r, _ = run_plant(truth, power, touching, speed)
+    noisy = force + 40.0 * rng.standard_normal(len(force))
+    r = Recording(r.name, STEP_S, r.inner, r.outer, r.ambient, power, touching, speed, noisy, r.measured, dense=True)
+    table = fit_friction([r], truth).table
+    assert np.ptp(np.array(table.coefficient)[:, 2, 4]) < 0.08
+
+
+def _softening_log(bursts_s, mean_C, law, parameters, rng, duration_s):
+    """(log, factors) of 5 s bursts of clamps on pads whose mean temperature is ``mean_C`` every STEP_S."""
+    reference = mean_C[0]
+    per_K, history_per_K, time_constant = law
+    history, lag = np.empty(len(mean_C)), 0.0
+    for row, temperature in enumerate(mean_C):
+        # Independent of the estimator's exact lag: twenty Euler steps per row.
+        for _ in range(20):
+            lag += STEP_S / 20 / time_constant * (temperature - reference - lag)
+        history[row] = lag
+    factor = 1.0 - per_K * (mean_C - reference) - history_per_K * history
+    grid = STEP_S * np.arange(len(mean_C))
+    burst = np.arange(0.0, 10.0, 0.004)
+    times = np.concatenate([[0.0], *(start + burst for start in bursts_s), [duration_s]])
+    samples = np.zeros(len(times), SAMPLE)
+    samples["dt"] = np.diff(times, prepend=times[0])
+    for start in bursts_s:
+        rows = (times >= start) & (times < start + 10.0)
+        samples["angle"][rows] = 9.0 - 9.0 * np.cos(2.0 * np.pi * 0.2 * (times[rows] - start))
+    samples["wheel_speed"] = 0.0
+    forces = stiffness_force(samples, float(parameters["clearance"][0]), parameters, np.interp(times, grid, factor))
+    forces += 25.0 * rng.standard_normal(len(forces))
+    return Log(Path("bursts.log"), "FL", samples, np.round(1e9 * times).astype(np.int64), None, forces)
+
+
+def _stiffness_parameters():
+    p = np.zeros(1, PARAMETERS)
+    p["curve"][0, :3] = 230.0, 27.0, 0.45
+    p["relaxation_time"] = 0.028
+    p["clearance"] = 5.0
+    return p
+
+
+@pytest.fixture(scope="module")
+def cooled():
+    """Braked for three minutes, then parked for two hours: (recording, mean temperature)."""
+    truth = nominal_parameters(NOMINAL)
+    power, touching, speed = _cooling(0.0, 180.0, 7000.0)
+    start = round(30.0 / STEP_S)
+    rest = np.zeros(start)
+    power, speed = np.concatenate([rest, power]), np.concatenate([rest, speed])
+    touching = np.concatenate([rest > 0, touching])
+    return run_plant(truth, power, touching, speed)
+
+
+@pytest.mark.parametrize(("law", "seed"), [((5e-4, 1.2e-3, 1500.0), 6), ((3e-4, 8e-4, 3000.0), 7)])
+def test_softening_and_its_history_are_found(cooled, law, seed):
+    r, mean_C = cooled
+    p = _stiffness_parameters()
+    bursts = [5.0, *np.arange(240.0, 7000.0, 400.0)]
+    log = _softening_log(bursts, mean_C, law, p, np.random.default_rng(seed), r.time_s[-1])
+    fit = fit_softening(log, r, nominal_parameters(NOMINAL), p)
+    found = (fit.softening.per_K, fit.softening.history_per_K, fit.softening.history_time_s)
+    for value, expected, sigma in zip(found, law, fit.sigmas.values(), strict=True):
+        # The heat model's own error, a tenth of a kelvin in a hundred, comes on top of the bursts' noise.
+        assert abs(value - expected) < 3.0 * sigma + 2e-3 * expected, (found, law, fit.sigmas)
+    # 25 N is the sensor; the thesis's moving window cannot forget as the pads do.
+    assert fit.ours_N < 27.0 < fit.thesis_N < fit.uncorrected_N * 1.5
+
+
+def test_softening_without_history_gets_none(cooled):
+    r, mean_C = cooled
+    p = _stiffness_parameters()
+    bursts = [5.0, *np.arange(240.0, 7000.0, 400.0)]
+    log = _softening_log(bursts, mean_C, (6e-4, 0.0, 1000.0), p, np.random.default_rng(8), r.time_s[-1])
+    fit = fit_softening(log, r, nominal_parameters(NOMINAL), p)
+    assert fit.softening.per_K == pytest.approx(6e-4, rel=0.02)
+    assert abs(fit.softening.history_per_K) * np.ptp(fit.rise_K) < 2e-3
+
+
+def test_too_few_bursts_are_named():
+    r, mean_C = run_plant(nominal_parameters(NOMINAL), *_cooling(0.0, 100.0, 100.0))
+    log = _softening_log([5.0, 120.0], mean_C, (5e-4, 0.0, 1000.0), _stiffness_parameters(), np.random.default_rng(9), 199.0)
+    with pytest.raises(InputError, match=r"bursts\.log: 2 bursts of clamps; at least"):
+        fit_softening(log, r, nominal_parameters(NOMINAL), _stiffness_parameters())
+
+
+def test_calibration_of_an_unknown_brake_is_complete():
+    """Every value that the record holds has a place in the calibration, and comes back from it."""
+    p = np.zeros(1, THERMAL)
+    fill_thermal(p[0], _some_thermal(), 0.010)
+    for name in THERMAL.names:
+        assert np.all(np.isfinite(p[name])), name
+    assert p["surface_cooling_per_speed"][0] == 0.2
+    assert p["reference"][0] == 25.0
+
+
+def _some_thermal():
+    import msgspec
+
+    return msgspec.convert(
+        {
+            "pad": {
+                "area_m2": 0.0046,
+                "density_kg_per_m3": 2450.0,
+                "conductivity_W_per_mK": 1.2,
+                "specific_heat_J_per_kgK": 1200.0,
+                "inner_heat_share": 0.04,
+                "outer_heat_share": 0.04,
+                "contact_conductance_W_per_m2K": 1500.0,
+                "gap_conductance_W_per_m2K": 300.0,
+                "surface_cooling_per_speed_J_per_rad_m2K": 0.2,
+                "backplate_conductance_W_per_m2K": 5000.0,
+            },
+            "disc": {
+                "heat_capacity_J_per_K": 2700.0,
+                "effective_radius_m": 0.131,
+                "cooling_W_per_K": 1.7,
+                "cooling_per_speed_J_per_rad_K": 0.4,
+            },
+            "friction": msgspec.to_builtins(constant_friction(0.4)),
+            "softening": {"reference_C": 25.0},
+        },
+        Thermal,
+    )
+
+
+def _thesis_parameters():
+    p = nominal_parameters(NOMINAL)
+    p["conductivity_rise"] = 0.0
+    return p
+
+
+def test_thesis_pad_conducts():
+    """Surface flux, fixed backing plate: in the end a straight line of slope q/k."""
+    rows = 6000
+    flux = np.full(rows, 5e3)
+    plate = np.full(rows, 30.0)
+    profile = thesis_profiles(_thesis_parameters(), plate, plate, flux, np.ones(rows, bool), np.zeros(rows), 0.2)[-1]
+    assert len(profile) == thesis_nodes(0.010) == 6
+    assert profile == pytest.approx(30.0 + 5e3 / 1.2 * (0.010 - np.linspace(0.0, 0.010, 6)), abs=0.05)
+
+
+def test_thesis_pad_holds_its_surface_while_braking_and_follows_the_disc_after():
+    rows = 1500
+    braking = np.arange(rows) < 1000
+    flux = np.where(np.arange(rows) < 500, 3e4, 0.0)
+    plate = np.full(rows, 22.0)
+    rate = np.full(rows, 0.004)
+    surface = thesis_profiles(_thesis_parameters(), plate, plate, flux, braking, rate, 0.2)[:, 0]
+    assert np.all(surface[501:1001] == surface[501])
+    elapsed = 0.2 * np.arange(rows - 1001)
+    assert surface[1001:] - 22.0 == pytest.approx((surface[1001] - 22.0) * np.exp(-0.004 * elapsed), rel=1e-6)
+
+
+def test_datasheet_start_is_the_datasheet():
+    p = nominal_parameters(NOMINAL)
+    assert float(p["disc_heat_capacity"][0]) == pytest.approx(5.6 * 480.0)
+    assert float(p["specific_heat"][0]) == 1200.0
+    assert p["node_position"][0, -1] == pytest.approx(0.010)
