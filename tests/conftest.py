@@ -21,3 +21,17 @@ def shared() -> Path:
 def rig(shared: Path) -> Path:
     """Logs of the simulated rig."""
     return shared / "rig"
+
+
+@pytest.fixture
+def parameters():
+    """PARAMETERS array (4,) of the shipped calibration, for tests to change."""
+    from emb_daemon.calibration.configuration import Setup
+
+    return Setup(_ROOT / "config" / "emb.yaml").parameters.copy()
+
+
+@pytest.fixture
+def thermal(parameters):
+    """THERMAL record of the shipped calibration, for tests to change."""
+    return parameters[0]["thermal"]
