@@ -56,7 +56,8 @@ def test_filter_is_consistent_on_data_of_its_own_model():
             truth = truth * [decay, 1.0, 1.0, noise_decay] + drive
             predict_errors(x, P, decay, 1e-6 * 0.004, 4e-12, noise_decay, noise)
             to_force = np.array([40.0, -slope, 0.0, 0.0])
-            h = 4e-5 * (to_force + [0.0, 0.0, force, 0.0]) + [0.0, 0.0, 0.0, 1.0]
+            h = 4e-5 * to_force
+            h[2], h[3] = 4e-5 * force, 1.0
             innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x
             s = update_errors(x, P, gain, innovation, h, variance)
             nis.append(innovation**2 / s)
