@@ -30,7 +30,7 @@ from emb_daemon.wire.receive import (
     receive,
 )
 
-#: The wire contract: message, first id, ids are one per corner, cycle (ms), signals as start|length, sign, factor, offset, unit.
+#: The wire contract: message, id of its first corner, cycle (ms), signals as start|length, sign, factor, offset, unit.
 _CONTRACT = (
     ("EMB_{}_Resolver", 0x100, 4, "MotorAngle 16|24 s 0.0002 0 rad; MotorSpeed 40|16 s 0.02 0 rad/s"),
     ("EMB_{}_Current", 0x110, 4, "CurrentQ 16|16 s 0.01 0 A; CurrentD 32|16 s 0.01 0 A; DcBusVoltage 48|8 u 0.25 0 V"),
@@ -40,14 +40,14 @@ _CONTRACT = (
     ("VEH_WheelPulse", 0x181, 10, "; ".join(f"WheelPulse{c} {16 + 12 * k}|12 u 1 0 -" for k, c in enumerate(CORNERS))),
     ("VEH_Status", 0x182, 100, "ParkBrake 16|2 u 1 0 -; BrakeRequest 18|1 u 1 0 -; AmbientTemp 24|16 s 0.1 0 degC; "
      "VehicleSpeed 40|16 u 0.01 0 m/s"),
-    ("EMB_{}_ClampForce", 0x200, 4, "ClampForce 16|16 u 0.001 0 kN; ClampForceSigma 32|16 u 0.001 0 kN; InputCounter 48|4 u 1 0 -; "
-     "ForceSource 52|4 u 1 0 -; InputAge 56|8 u 1 0 ms"),
+    ("EMB_{}_ClampForce", 0x200, 4, "ClampForce 16|16 u 0.001 0 kN; ClampForceSigma 32|16 u 0.001 0 kN; "
+     "InputCounter 48|4 u 1 0 -; ForceSource 52|4 u 1 0 -; InputAge 56|8 u 1 0 ms"),
     ("EMB_{}_PadTemp", 0x210, 20, "InnerSurfaceTemp 16|12 u 0.25 -40 degC; InnerMeanTemp 28|12 u 0.25 -40 degC; "
      "OuterSurfaceTemp 40|12 u 0.25 -40 degC; OuterMeanTemp 52|12 u 0.25 -40 degC"),
-    ("EMB_{}_EstimatorStatus", 0x220, 100, "Mode 16|4 u 1 0 -; StiffnessFactor 20|12 u 0.0005 0 -; ContactAngle 32|16 s 0.1 0 rad; "
-     "DegradedReasons 48|16 u 1 0 -"),
-    ("EMB_{}_AdaptRequest", 0x230, 20, "Request 16|2 u 1 0 -; Progress 18|7 u 1 0 %; Result 25|4 u 1 0 -; LowForce 32|8 u 0.25 0 kN; "
-     "HighForce 40|8 u 0.25 0 kN; DitherAmplitude 48|8 u 0.02 0 rad; DitherFrequency 56|8 u 0.1 0 Hz"),
+    ("EMB_{}_EstimatorStatus", 0x220, 100, "Mode 16|4 u 1 0 -; StiffnessFactor 20|12 u 0.0005 0 -; "
+     "ContactAngle 32|16 s 0.1 0 rad; DegradedReasons 48|16 u 1 0 -"),
+    ("EMB_{}_AdaptRequest", 0x230, 20, "Request 16|2 u 1 0 -; Progress 18|7 u 1 0 %; Result 25|4 u 1 0 -; "
+     "LowForce 32|8 u 0.25 0 kN; HighForce 40|8 u 0.25 0 kN; DitherAmplitude 48|8 u 0.02 0 rad; DitherFrequency 56|8 u 0.1 0 Hz"),
 )  # fmt: skip
 _MESSAGES = [
     (template.format(corner), can_id + index, cycle, signals)
