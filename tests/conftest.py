@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Compiling is not the code's own time; a failure must come back on the next run.
+settings.register_profile("project", deadline=None, derandomize=True, max_examples=60)
+settings.load_profile("project")
 
 _ROOT = Path(__file__).parent.parent
 
@@ -21,3 +26,17 @@ def shared() -> Path:
 def rig(shared: Path) -> Path:
     """Logs of the simulated rig."""
     return shared / "rig"
+
+
+@pytest.fixture
+def parameters():
+    """PARAMETERS array (4,) of the shipped calibration, for tests to change."""
+    from emb_daemon.calibration.configuration import Setup
+
+    return Setup(_ROOT / "config" / "emb.yaml").parameters.copy()
+
+
+@pytest.fixture
+def thermal(parameters):
+    """THERMAL record of the shipped calibration, for tests to change."""
+    return parameters[0]["thermal"]

@@ -227,6 +227,8 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     gain_error = p.torque_relative_sigma * mean_force
     out.torque_sigma = sqrt((white + current_torque * current_torque) / (leverage * leverage) + gain_error * gain_error)
     if np.isfinite(torque):
+        # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
+        white += (friction_torque * s.friction_variance) ** 2 / (_DISSOLVING_PER_S * m.dt)
         h[0], h[1], h[2], h[3] = leverage * spread, -leverage * s.slope, leverage * mean_force, 1.0
         innovation = torque - leverage * mean_force
         for i in range(STATES):

@@ -1,0 +1,79 @@
+"""Friction and the torque balance: what they say while the motor slides, and that they do not while it stands."""
+
+import brake
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.models.torque import friction_state
+from emb_daemon.offline import estimate
+
+_PRESLIDING = 0.028
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-5.0, 5.0))
+def test_friction_never_exceeds_coulombs(state, travel):
+    after, mean, _ = friction_state(state, 1.0, travel, _PRESLIDING, 0.05, 0.004)
+    assert -1.0 <= after <= 1.0
+    low, high = sorted((state, after))
+    assert low - 1e-12 <= mean <= high + 1e-12
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-0.05, 0.05), st.integers(2, 20))
+def test_friction_depends_on_the_path_not_on_how_it_is_sampled(state, travel, parts):
+    once, _, _ = friction_state(state, 0.5, travel, _PRESLIDING, 0.0, 0.004)
+    stepwise = state
+    for _ in range(parts):
+        stepwise, _, _ = friction_state(stepwise, 0.5, travel / parts, _PRESLIDING, 0.0, 0.004)
+    assert stepwise == pytest.approx(once, abs=1e-9)
+
+
+def test_a_reversal_passes_continuously():
+    """No jump of friction where the motion turns: over a small travel it changes by a small share."""
+    angle = 0.3 * np.sin(np.linspace(0.0, 4.0 * np.pi, 20_000))
+    state, states = 0.0, []
+    for travel in np.diff(angle):
+        state, _, _ = friction_state(state, 0.0, travel, _PRESLIDING, 0.0, 0.004)
+        states.append(state)
+    states = np.array(states)
+    assert states.max() > 0.99 and states.min() < -0.99
+    assert np.abs(np.diff(states)).max() <= 2.0 * np.abs(np.diff(angle)).max() / _PRESLIDING
+
+
+def test_standstill_forgets_and_sliding_knows():
+    _, _, variance = friction_state(0.0, 1.0, 10.0 * _PRESLIDING, _PRESLIDING, 0.05, 0.004)
+    assert variance < 1e-6
+    standing = []
+    state = 1.0
+    for _ in range(1500):
+        state, mean, variance = friction_state(state, variance, 0.0, _PRESLIDING, 0.05, 0.004)
+        standing.append(variance)
+        assert mean == state == 1.0
+    assert np.all(np.diff(standing) > 0.0)
+    assert standing[-1] == pytest.approx(0.3, rel=0.01)
+
+
+def test_the_torque_balance_claims_little_at_standstill(parameters):
+    """Holding: friction may be anything inside its bounds, so the torque path's sigma grows to them and sigma with it."""
+    p = parameters[0]
+    up = brake.clamp(p, 18.0, 1.0)
+    rows, force = brake.samples(p, np.concatenate([up, np.full(7500, up[-1])]))
+    estimates = estimate(rows, p)
+    sliding, held = estimates[245], estimates[-1]
+    bound = (p["load_friction"] * force[-1] + p["offset_friction"]) / (p["gear_gain"] + p["load_friction"])
+    assert held["torque_sigma"] > 0.9 * bound > 2.0 * sliding["torque_sigma"]
+    assert held["sigma"] > sliding["sigma"]
+
+
+@pytest.mark.parametrize("friction", [-1.0, 0.0, 1.0])
+def test_friction_at_standstill_does_not_move_the_estimate_beyond_its_sigma(parameters, friction):
+    """A hold during which vibration lets friction drift from full to anywhere inside its band."""
+    p = parameters[0]
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    up = brake.clamp(p, 18.0, 1.0)
+    share = np.concatenate([np.ones(len(up)), np.linspace(1.0, friction, 10_000)])
+    rows, force = brake.samples(p, np.concatenate([up, np.full(10_000, up[-1])]), friction=share)
+    estimates = estimate(rows, p)
+    error = np.abs(estimates["force"] - force)[len(up) :]
+    assert np.all(error < 2.0 * estimates["sigma"][len(up) :])

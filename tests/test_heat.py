@@ -1,0 +1,140 @@
+"""Heat conduction against analytic solutions, its energy balance, its mesh error and its stability."""
+
+import naive
+import numpy as np
+import pytest
+
+from emb_daemon.models.thermal import CHAIN, NODES, at_depth, heat_step, mean_temperature
+
+
+@pytest.fixture
+def slab(thermal):
+    """Pads of constant properties that touch nothing but their backing plates."""
+    thermal["conductivity_rise"] = thermal["specific_heat_rise"] = 0.0
+    thermal["contact_conductance"] = thermal["gap_conductance"] = 0.0
+    thermal["heat_share"] = 1.0, 0.0
+    return thermal
+
+
+def _diffusivity(p):
+    return p["conductivity"] / (p["density"] * p["specific_heat"])
+
+
+def _march(p, pads, seconds, dt, power=0.0, disc=20.0, backplate=20.0, braking=False, wheel_speed=0.0, ambient=20.0):
+    work = np.empty((4, CHAIN))
+    for _ in range(round(seconds / dt)):
+        disc = heat_step(p, pads, disc, backplate, backplate, ambient, power, braking, wheel_speed, dt, work)
+    return disc
+
+
+def test_semi_infinite_solid_under_constant_flux(slab):
+    """T(0, t) - T0 = 2 q/k sqrt(a t/pi) (Carslaw and Jaeger, Conduction of Heat in Solids, 2.9) while the heat is shallow."""
+    flux = 2e5
+    pads = np.full((2, NODES), 20.0)
+    for seconds, passed in ((1.0, 1.0), (2.0, 3.0), (3.0, 6.0)):
+        _march(slab, pads, seconds, 0.004, flux * slab["area"])
+        rise = 2.0 * flux / slab["conductivity"] * np.sqrt(_diffusivity(slab) * passed / np.pi)
+        assert pads[0, 0] - 20.0 == pytest.approx(rise, rel=0.015)
+    assert np.all(pads[1] == pytest.approx(20.0))
+
+
+def test_slab_in_steady_state(slab):
+    """Fixed backing plate: the profile is a straight line of slope q/k, above the drop at the contact."""
+    flux = 5e4
+    pads = np.full((2, NODES), 20.0)
+    _march(slab, pads, 3000.0, 1.0, flux * slab["area"], backplate=80.0)
+    depth = slab["thickness"] - slab["node_position"]
+    expected = 80.0 + flux / slab["backplate_conductance"] + flux * depth / slab["conductivity"]
+    np.testing.assert_allclose(pads[0], expected, rtol=1e-9)
+
+
+def test_first_eigenmode_decays_at_its_rate(slab):
+    """Insulated surface, fixed backing plate: cos(pi x/2L) decays with a (pi/2L)^2."""
+    slab["backplate_conductance"] = 1e9
+    mode = np.cos(0.5 * np.pi * slab["node_position"] / slab["thickness"])
+    pads = np.array([20.0 + 100.0 * mode, np.full(NODES, 20.0)])
+    _march(slab, pads, 60.0, 0.02)
+    rate = -np.log((pads[0, 0] - 20.0) / 100.0) / 60.0
+    assert rate == pytest.approx(_diffusivity(slab) * (0.5 * np.pi / slab["thickness"]) ** 2, rel=0.01)
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.02, 0.5])
+def test_energy_is_conserved(thermal, dt):
+    """What friction brings in is stored or leaves through backing plates and disc, to round-off, with k(T) too."""
+    thermal["specific_heat_rise"] = 0.0
+    thermal["conductivity_rise"] = 1e-3
+    pads, disc, work = np.full((2, NODES), 20.0), 20.0, np.empty((4, CHAIN))
+    worst = 0.0
+    for step in range(200):
+        braking = step < 120
+        power = 9000.0 * braking
+        capacity, _, outside = naive.heat_matrices(thermal, pads, disc, 15.0, braking, 30.0)
+        before = np.concatenate([pads[0], pads[1], [disc]])
+        disc = heat_step(thermal, pads, disc, 40.0, 35.0, 15.0, power, braking, 30.0, dt, work)
+        after = np.concatenate([pads[0], pads[1], [disc]])
+        stored = capacity @ (after - before)
+        left = dt * (
+            outside[NODES - 1] * (pads[0, -1] - 40.0)
+            + outside[2 * NODES - 1] * (pads[1, -1] - 35.0)
+            + outside[-1] * (disc - 15.0)
+        )
+        worst = max(worst, abs(power * dt - stored - left))
+    assert worst < 1e-9 * thermal["disc_heat_capacity"] * 400.0 * dt
+    assert disc > 20.0 + 5.0 * dt
+
+
+def _profile(pad, positions, disc):
+    depths = [at_depth(pad, positions, depth) for depth in (0.002, 0.004, 0.006, 0.008)]
+    return np.array([pad[0], mean_temperature(pad, positions), *depths, disc])
+
+
+def test_mesh_error_over_a_braking_cycle(thermal):
+    """The mesh that runs in the daemon against one eight times finer: 60 s of braking into 30 s of release.
+
+    The friction surface is hottest where the mesh is finest; inside, what remains is the line drawn between two nodes.
+    """
+    fine = {name: thermal[name] for name in thermal.dtype.names}
+    coarse_nodes = thermal["node_position"]
+    parts = (coarse_nodes[:-1, None] + np.diff(coarse_nodes)[:, None] * np.arange(8) / 8.0).ravel()
+    fine["node_position"] = np.append(parts, coarse_nodes[-1])
+    pads, disc, work = np.full((2, NODES), 20.0), 20.0, np.empty((4, CHAIN))
+    fine_pads, fine_disc = np.full((2, len(fine["node_position"])), 20.0), 20.0
+    names = ("surface", "mean", "2 mm", "4 mm", "6 mm", "8 mm", "disc")
+    worst, hottest, dt = np.zeros(len(names)), 0.0, 0.25
+    for step in range(round(90.0 / dt)):
+        time = step * dt
+        braking, speed = time < 60.0, 37.7 * min(time / 60.0, 1.0)
+        power = 2.0 * 0.4 * thermal["effective_radius"] * 4000.0 * speed * braking
+        arguments = (20.0 + 0.5 * time, 20.0 + 0.5 * time, 20.0, power, braking, speed, dt)
+        disc = heat_step(thermal, pads, disc, *arguments, work)
+        fine_pads, fine_disc = naive.heat_step(fine, fine_pads, fine_disc, *arguments)
+        errors = _profile(pads[0], coarse_nodes, disc) - _profile(fine_pads[0], fine["node_position"], fine_disc)
+        worst = np.maximum(worst, np.abs(errors))
+        hottest = max(hottest, fine_pads.max())
+    errors = dict(zip(names, worst, strict=True))
+    print(f"{NODES} nodes, hottest {hottest:.0f} degC:", *(f"{name} {error:.2f} K" for name, error in errors.items()))
+    assert hottest > 180.0
+    assert errors["disc"] < 0.05 and errors["mean"] < 0.3 and errors["surface"] < 0.5
+    assert max(errors[f"{depth} mm"] for depth in (2, 4, 6, 8)) < 0.7
+
+
+def test_every_sample_time_is_stable_and_agrees(thermal):
+    """From the cycle to the slowest reduced log: the same temperatures after a stop, no oscillation."""
+    ends = {}
+    for dt in (0.004, 0.02, 0.1, 1.0):
+        pads = np.full((2, NODES), 20.0)
+        disc = _march(thermal, pads, 20.0, dt, 8000.0, braking=True, wheel_speed=30.0)
+        assert np.all(np.diff(pads[0]) <= 1e-9), "hotter towards the backing plate than at the surface"
+        ends[dt] = np.array([disc, *pads[0]])
+    for dt, end in ends.items():
+        np.testing.assert_allclose(end - 20.0, ends[0.004] - 20.0, rtol=0.03, atol=0.3, err_msg=f"{dt} s")
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.25, 1.0])
+def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, dt):
+    pads = np.random.default_rng(5).uniform(20.0, 600.0, (2, NODES))
+    disc, work = 600.0, np.empty((4, CHAIN))
+    for step in range(50):
+        low, high = min(pads.min(), disc, 20.0), max(pads.max(), disc)
+        disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work)
+        assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9

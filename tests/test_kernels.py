@@ -1,0 +1,114 @@
+"""Every kernel beside its plain twin. test_unjitted.py runs this file once more without compilation."""
+
+import naive
+import numpy as np
+import pytest
+
+from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
+from emb_daemon.models.thermal import CHAIN, NODES, at_depth, friction_power, heat_step, mean_temperature, stiffness_factor
+from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
+
+
+@pytest.mark.parametrize("x", [-3.0, 0.0, 1e-9, 0.4, 17.0, 40.0])
+@pytest.mark.parametrize("coefficients", [[300.0], [240.0, 28.0, 0.47], [224.0, 25.6, 0.4, -1e-3, 2e-5]])
+def test_characteristic_curve(x, coefficients):
+    assert characteristic_curve(x, np.array(coefficients)) == pytest.approx(
+        naive.characteristic_curve(x, coefficients), rel=1e-13
+    )
+
+
+@pytest.mark.parametrize("time_constant", [1e-3, 0.0284, 5.0, 1e4])
+@pytest.mark.parametrize("dt", [1e-6, 0.004, 0.02, 1.0])
+def test_first_order_lag(dt, time_constant):
+    arguments = (310.0, 250.0, 900.0, dt, time_constant)
+    assert first_order_lag(*arguments) == pytest.approx(naive.first_order_lag(*arguments), rel=1e-10)
+
+
+@pytest.mark.parametrize("state", [-1.0, -0.3, 0.0, 0.9, 1.0])
+@pytest.mark.parametrize("travel", [1e-10, -2e-4, 0.028, -1.0])
+def test_friction_state(state, travel):
+    after, mean, _ = friction_state(state, 0.2, travel, 0.028, 0.05, 0.004)
+    assert (after, mean) == pytest.approx(naive.friction_state(state, travel, 0.028), abs=1e-9)
+
+
+def test_torque_path():
+    """A motor that accelerates, slides and clamps: the balance gives back the force that made its torque."""
+    gain, load, offset, inertia, force = 3.98e-5, 8.3e-6, 0.0336, 1.1e-4, 12_000.0
+    for friction in (-1.0, 0.4, 1.0):
+        torque = gain * force + inertia * 3.0 / 0.004 + friction * (load * force + offset)
+        left = unexplained_torque(torque, inertia, 3.0, 0.004, offset, friction)
+        assert torque_balance(left, gain + load * friction) == pytest.approx(force)
+
+
+def _random_filter(rng):
+    root = rng.normal(size=(STATES, STATES))
+    return rng.normal(size=STATES), root @ root.T, rng.normal(size=STATES)
+
+
+def test_filter_time_update():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        x, P, _ = _random_filter(rng)
+        arguments = rng.uniform(0.1, 1.0, 5)
+        expected = naive.predict_errors(x, P, *arguments)
+        predict_errors(x, P, *arguments)
+        np.testing.assert_allclose(x, expected[0], rtol=1e-12)
+        np.testing.assert_allclose(P, expected[1], rtol=1e-12)
+
+
+def test_filter_measurement_update():
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        x, P, h = _random_filter(rng)
+        innovation, variance = rng.normal(), rng.uniform(0.1, 2.0)
+        expected = naive.update_errors(x, P, innovation, h, variance)
+        assert variance_along(P, h) == pytest.approx(h @ P @ h)
+        s = update_errors(x, P, np.empty(STATES), innovation, h, variance)
+        np.testing.assert_allclose(x, expected[0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(P, expected[1], rtol=1e-8, atol=1e-10)
+        assert s == pytest.approx(expected[2])
+
+
+def test_maximum_likelihood_weighs_by_inverse_variance():
+    weights = 1.0 / np.array([300.0, 600.0]) ** 2
+    force, sigma = maximum_likelihood(5000.0, 300.0, 6000.0, 600.0)
+    assert force == pytest.approx(np.average([5000.0, 6000.0], weights=weights))
+    assert sigma == pytest.approx(weights.sum() ** -0.5)
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.02, 0.3])
+@pytest.mark.parametrize("braking", [False, True])
+def test_heat_chain(thermal, braking, dt):
+    rng = np.random.default_rng(3)
+    pads, disc = rng.uniform(20.0, 400.0, (2, NODES)), 300.0
+    arguments = (40.0, 60.0, 15.0, 8000.0 * braking, braking, 20.0, dt)
+    expected_pads, expected_disc = naive.heat_step(thermal, pads, disc, *arguments)
+    disc = heat_step(thermal, pads, disc, *arguments, np.empty((4, CHAIN)))
+    np.testing.assert_allclose(pads, expected_pads, rtol=1e-11)
+    assert disc == pytest.approx(expected_disc, rel=1e-11)
+
+
+def test_friction_power(thermal):
+    rng = np.random.default_rng(4)
+    thermal["friction_coefficient"] = rng.uniform(0.2, 0.6, thermal["friction_coefficient"].shape)
+    for force, speed, surface in rng.uniform([-500.0, -5.0, -40.0], [20_000.0, 60.0, 700.0], (200, 3)):
+        expected = naive.friction_power(thermal, force, speed, surface)
+        assert friction_power(thermal, force, speed, surface) == pytest.approx(expected, rel=1e-12)
+
+
+def test_profile_of_a_pad(thermal):
+    """Means and depths of a linear profile are those of the line."""
+    positions, thickness = thermal["node_position"], thermal["thickness"]
+    profile = 500.0 - 400.0 * positions / thickness
+    assert mean_temperature(profile, positions) == pytest.approx(300.0)
+    for share in (0.0, 0.2, 0.77, 1.0):
+        assert at_depth(profile, positions, share * thickness) == pytest.approx(500.0 - 400.0 * share)
+    assert np.isnan(at_depth(profile, positions, 1.01 * thickness))
+
+
+def test_stiffness_factor(thermal):
+    thermal["softening"], thermal["softening_history"] = 4.5e-4, 1.3e-3
+    assert stiffness_factor(thermal, 0.0, 0.0) == 1.0
+    assert stiffness_factor(thermal, 100.0, 50.0) == pytest.approx(1.0 - 0.045 - 0.065)
+    assert stiffness_factor(thermal, 1e6, 0.0) > 0.0

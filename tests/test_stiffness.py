@@ -1,0 +1,109 @@
+"""Dynamic stiffness: exact for the time that passed, causal, and the curve when things rest; effects off leave no trace."""
+
+import brake
+import naive
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.effects import REGISTRY
+from emb_daemon.models.stiffness import first_order_lag
+from emb_daemon.offline import estimate
+
+_force = st.floats(-3e4, 3e4)
+_dt = st.floats(1e-6, 2.0)
+
+
+@given(_force, _force, _force, _dt, st.floats(1e-3, 100.0))
+def test_two_steps_are_one_of_twice_the_time(state, before, after, dt, time_constant):
+    middle = 0.5 * (before + after)
+    twice = first_order_lag(first_order_lag(state, before, middle, dt, time_constant), middle, after, dt, time_constant)
+    assert twice == pytest.approx(first_order_lag(state, before, after, 2.0 * dt, time_constant), abs=1e-6, rel=1e-9)
+
+
+@given(_force, _dt, st.floats(0.0, 100.0))
+def test_a_settled_lag_stays(force, dt, time_constant):
+    assert first_order_lag(force, force, force, dt, time_constant) == pytest.approx(force, rel=1e-12, abs=1e-9)
+
+
+def test_no_time_changes_nothing_and_no_time_constant_delays_nothing():
+    assert first_order_lag(5.0, 1.0, 2.0, 0.0, 0.03) == 5.0
+    assert first_order_lag(5.0, 1.0, 2.0, 0.004, 0.0) == 2.0
+
+
+def _stiffness_force(p, angle, dt=0.004):
+    rows, _ = brake.samples(p, angle, dt)
+    return estimate(rows, p)["stiffness_force"]
+
+
+@pytest.fixture
+def plain(parameters):
+    """Parameters of FL without effects, and without torque: the stiffness path alone."""
+    p = parameters[0]
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    p["torque_relative_sigma"] = p["clearance_sigma"] = p["contact_walk"] = 1e-12
+    return p
+
+
+def test_steady_state_is_the_characteristic_curve(plain):
+    for x in (1.0, 7.0, 20.0):
+        angle = np.concatenate([brake.clamp(plain, x, 0.4), np.full(400, plain["clearance"] + x)])
+        expected, _ = naive.characteristic_curve(x, plain["curve"])
+        assert _stiffness_force(plain, angle)[-1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_force_does_not_depend_on_the_sample_time(plain):
+    seconds = 1.2
+    ends = [_stiffness_force(plain, brake.clamp(plain, 15.0, seconds, dt), dt)[-1] for dt in (0.001, 0.004, 0.02)]
+    assert ends[0] > 8000.0
+    assert ends[1] == pytest.approx(ends[0], rel=2e-4)
+    assert ends[2] == pytest.approx(ends[0], rel=2e-3)
+
+
+def test_no_force_in_the_clearance(plain):
+    rows, _ = brake.samples(plain, np.linspace(0.0, 0.99 * plain["clearance"], 200))
+    estimates = estimate(rows, plain)
+    assert np.all(estimates["stiffness_force"] == 0.0)
+
+
+def test_estimates_never_see_the_future(parameters):
+    p = parameters[0]
+    angle = np.concatenate([brake.clamp(p, 15.0, 1.0), brake.clamp(p, 15.0, 1.0)[::-1]])
+    rows, _ = brake.samples(p, angle)
+    other = rows.copy()
+    other["angle"][300:] += 1.0
+    other["current_q"][300:] = -20.0
+    other["inner_backplate"][300:] = 300.0
+    a, b = estimate(rows, p), estimate(other, p)
+    assert a[:300].tobytes() == b[:300].tobytes()
+    assert not np.array_equal(a["force"][300:], b["force"][300:])
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_an_effect_at_zero_is_bit_for_bit_neutral(parameters, effect):
+    """The parameter that scales the effect at zero, its others anywhere: the same bits as without the effect."""
+    p = parameters[0]
+    angle = p["clearance"] + 12.0 + 10.0 * np.sin(np.arange(600) * 0.02 - 2.0)
+    angle = np.concatenate([np.linspace(0.0, angle[0], 100), angle])
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    rows, _ = brake.samples(p, angle)
+    rows["wheel_speed"], rows["wheel_pulse"] = 30.0, np.arange(len(rows)) % 4096
+    without = estimate(rows, p)
+    for number, parameter in enumerate(effect.parameters):
+        p["effects"][effect.name][parameter.name] = 0.0 if number == 0 else 0.5 * (parameter.low + parameter.high)
+    with_zero = estimate(rows, p)
+    for name in without.dtype.names:
+        np.testing.assert_array_equal(with_zero[name], without[name], err_msg=name)
+    p["effects"][effect.name][effect.parameters[0].name] = effect.parameters[0].prior
+    p["effects"][effect.name] = tuple(parameter.prior for parameter in effect.parameters)
+    assert not np.array_equal(estimate(rows, p)["force"], without["force"]), "the effect does nothing at its prior"
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_an_effect_is_described(effect):
+    assert effect.path in ("stiffness", "torque", "thermal")
+    assert effect.equation and effect.source
+    for parameter in effect.parameters:
+        assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
+        assert parameter.unit and parameter.meaning

@@ -1,0 +1,54 @@
+"""The kernels as plain Python give the same: what numba compiles is what is written."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import wirekit
+
+_ESTIMATES = """
+import sys, numpy as np
+from emb_daemon.offline import estimate
+samples, parameters = np.load(sys.argv[1]), np.load(sys.argv[2])
+np.save(sys.argv[3], estimate(samples, parameters[:1]))
+"""
+
+
+def _run(*arguments: str) -> subprocess.CompletedProcess:
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(Path(__file__).parent.parent)}
+    return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True)
+
+
+def test_kernels_pass_without_compilation():
+    done = _run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(Path(__file__).parent / "test_kernels.py"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " passed" in done.stdout and "skipped" not in done.stdout
+
+
+def test_estimates_are_equal_without_compilation(parameters, tmp_path):
+    """A clamp on a turning disc, bit for bit."""
+    from emb_daemon.offline import estimate
+    from emb_daemon.pipeline import Pipeline
+
+    pipeline = Pipeline(parameters, ("FL",), collect=True)
+    pipeline.begin(0)
+    frames = np.concatenate(
+        wirekit.drive(
+            150,
+            angle=lambda t: 30.0 * min(t / 0.3, 1.0),
+            speed=lambda t: 100.0 * (t < 0.3),
+            current=lambda t: 0.5 + 30.0 * t,
+            wheel_speed=30.0,
+        )
+    )
+    _, count = pipeline.consume(frames)
+    for name, array in (("samples", pipeline.samples[:count]), ("parameters", parameters)):
+        np.save(tmp_path / name, array)
+    done = _run("-c", _ESTIMATES, *(str(tmp_path / f"{name}.npy") for name in ("samples", "parameters", "estimates")))
+    assert done.returncode == 0, done.stderr
+    compiled, plain = estimate(pipeline.samples[:count], parameters[:1]), np.load(tmp_path / "estimates.npy")
+    assert plain["force"][-1] > 5000.0
+    for name in plain.dtype.names:
+        np.testing.assert_array_equal(plain[name], compiled[name], err_msg=name)

@@ -1,0 +1,80 @@
+"""Frames as other people's code makes them: cantools for the payload, autosar-e2e for its protection."""
+
+from functools import cache
+
+import cantools
+import numpy as np
+from e2e.p01 import e2e_p01_check, e2e_p01_protect
+
+from emb_daemon.resources import resource
+from emb_daemon.wire.frames import FRAME
+
+MS = 1_000_000
+
+
+@cache
+def database():
+    return cantools.database.load_file(resource("dbc/emb.dbc"))
+
+
+def payload(message: str, counter: int = 0, status: int = 0, **signals) -> bytes:
+    found = database().get_message_by_name(message)
+    values = {signal.name: max(0.0, signal.offset) for signal in found.signals} | {"Counter": counter, "Status": status}
+    data = bytearray(found.encode(values | {"CRC": 0} | signals, strict=False, scaling=True))
+    e2e_p01_protect(data, found.frame_id, increment_counter=False)
+    return bytes(data)
+
+
+def record(time_ns: int, can_id: int, data: bytes, flags: int = 0) -> np.ndarray:
+    """FRAME array of one frame."""
+    return np.array([(time_ns, int.from_bytes(data[:8], "little"), can_id, len(data), flags)], FRAME)
+
+
+def frame(message: str, time_ns: int = 0, counter: int = 0, status: int = 0, **signals) -> np.ndarray:
+    return record(time_ns, database().get_message_by_name(message).frame_id, payload(message, counter, status, **signals))
+
+
+def decode(frame_record) -> tuple[str, dict]:
+    """Message name and signals of a frame, its protection checked."""
+    data = int(frame_record["data"]).to_bytes(8, "little")
+    can_id = int(frame_record["can_id"])
+    assert frame_record["length"] == 8 and e2e_p01_check(bytearray(data), can_id)
+    found = database().get_message_by_frame_id(can_id)
+    return found.name, found.decode(data, decode_choices=False)
+
+
+def drive(
+    cycles: int,
+    corner: str = "FL",
+    start_ns: int = 0,
+    angle=lambda t: 0.0,
+    speed=lambda t: 0.0,
+    current=lambda t: 0.0,
+    wheel_speed: float = 0.0,
+    backplate: float = 25.0,
+    ambient: float = 20.0,
+    first: int = 0,
+) -> list[np.ndarray]:
+    """Frames of one corner and its car for ``cycles`` resolver cycles from cycle ``first`` on; functions of time in s."""
+    frames = []
+    for cycle in range(first, first + cycles):
+        now, t, counter = start_ns + cycle * 4 * MS, 0.004 * cycle, cycle % 15
+        if cycle % 25 == 0:
+            frames.append(frame("VEH_Status", now - 3000, cycle // 25 % 15, AmbientTemp=ambient))
+        if cycle % 5 in (0, 2):
+            slow = (2 * (cycle // 5) + (cycle % 5 > 0)) % 15
+            frames.append(
+                frame(
+                    f"EMB_{corner}_Thermocouple",
+                    now - 2000,
+                    slow,
+                    InnerBackplateTemp=backplate,
+                    OuterBackplateTemp=backplate,
+                    CaliperTemp=backplate,
+                )
+            )
+            frames.append(frame("VEH_WheelSpeed", now - 1000, slow, **{f"WheelSpeed{corner}": wheel_speed}))
+            frames.append(frame("VEH_WheelPulse", now - 500, slow))
+        frames.append(frame(f"EMB_{corner}_Resolver", now, counter, MotorAngle=angle(t), MotorSpeed=speed(t)))
+        frames.append(frame(f"EMB_{corner}_Current", now + 100_000, counter, CurrentQ=current(t)))
+    return frames
