@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.diagnose.channels import Bench, Probe, wheel_angle
-from emb_daemon.diagnose.evidence import NOT_EXCITED, Fit, Moments, Verdict, false_discovery, fit, judge
+from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench, Probe, wheel_angle
+from emb_daemon.diagnose.evidence import NOT_EXCITED, Moments, Verdict, false_discovery, fit, judge
 from emb_daemon.diagnose.knobs import Knob, base_knobs, effect_knob
 from emb_daemon.diagnose.signals import signals, smooth_basis
 from emb_daemon.effects import REGISTRY
@@ -33,6 +33,9 @@ Q_VALUE = 0.01
 #: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference.
 _RESIDUAL_SHARE = 0.1
 _SIGNAL_SHARE = 0.002
+#: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
+_FLOOR_K = 1.5
+_TORQUE_SHARE = 0.08
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
 _OF_MODEL_FREE = 0.6
 _OF_PLACEBO = 0.5
@@ -85,10 +88,12 @@ class Attribution:
     regressors: dict[Knob, np.ndarray]
     recalibrated: dict[str, float]
     signals: dict[str, np.ndarray]
-    fits: dict[str, Fit]
+    penalties: dict[str, np.ndarray]
 
 
-class _Search:
+class Search:
+    """One run of the stepwise search; keeps what the report asks for afterwards."""
+
     def __init__(self, bench: Bench, progress: Callable[[str, float], None]):
         self.bench = bench
         self.progress = progress
@@ -110,13 +115,10 @@ class _Search:
         self.initial = bench.residuals({})
         self.residual = self.initial
         self.columns: dict[Knob, np.ndarray] = {}
-        force = np.concatenate([np.nan_to_num(t.force_N) if t.has_force else np.zeros(len(t.force_N)) for t in bench.trials])
         self.signals = signals(bench, parameters)
-        self.scale = {channel: 0.0 for channel in bench.channels}
-        for channel in ("stiffness", "torque", "innovation"):
-            self.scale[channel] = float(np.sqrt(np.mean(self.signals["clamp_force"] ** 2))) if len(force) else 0.0
-        self.scale["temperature"] = 100.0
-        self.scale["brake_torque"] = float(np.sqrt(np.mean(self.signals["brake_torque"] ** 2)))
+        braking = self.signals["brake_torque"][self.signals["brake_torque"] > 20.0]
+        self.scale = dict.fromkeys(bench.channels, float(np.sqrt(np.mean(self.signals["clamp_force"] ** 2))))
+        self.scale["brake_torque"] = float(np.sqrt(np.mean(braking**2))) if len(braking) else 0.0
 
     def _adopted(self, knob: Knob) -> list[Knob]:
         channel = knob.channel
@@ -153,6 +155,7 @@ class _Search:
 
     def refine(self, channels: set[str]) -> None:
         """Gauss-Newton through the estimator over all knobs of some channels."""
+        channels = set(channels)
         for _ in range(_GAUSS_NEWTON):
             knobs = [knob for knob in self.knobs if knob.channel in channels]
             probes = [Probe(knob) for knob in knobs]
@@ -172,11 +175,12 @@ class _Search:
                 step = np.clip(step, -limit, limit)
                 steps.update(zip(own, np.clip(now + step, low, high) - now, strict=True))
             before = {channel: self.objective(self.residual, self.values, channel) for channel in channels}
-            done = self._advance(steps, before, channels)
-            if done:
+            channels -= self._advance(steps, before, channels)
+            if not channels:
                 break
 
-    def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> bool:
+    def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> set[str]:
+        """Take the steps, shortened where they do not help; returns the channels that have converged."""
         share = dict.fromkeys(channels, 1.0)
         for _ in range(5):
             tried = dict(self.values)
@@ -187,16 +191,19 @@ class _Search:
             worse = {channel for channel in channels if after[channel] > before[channel] * (1.0 + 1e-9)}
             if not worse:
                 self.values, self.residual = tried, residual
-                return all(before[c] - after[c] < 2e-3 * before[c] for c in channels)
+                return {c for c in channels if before[c] - after[c] < 2e-3 * before[c]}
             for channel in worse:
                 share[channel] = 0.0 if share[channel] < 0.1 else 0.3 * share[channel]
-        return True
+        return set(channels)
 
     # -- testing ------------------------------------------------------------------------------------------------------
 
     def floor(self, channel: str) -> float:
         """Least RMS of an effect that matters, in the channel's unit."""
-        return max(_RESIDUAL_SHARE * np.sqrt(self.noise(channel)), _SIGNAL_SHARE * self.scale[channel])
+        if channel == "temperature":
+            return _FLOOR_K
+        share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
+        return max(_RESIDUAL_SHARE * np.sqrt(self.noise(channel)), share * self.scale[channel])
 
     def rms(self, gain: float, channel: str) -> float:
         counted = max(int(np.count_nonzero(self.residual[channel])), 1)
@@ -244,7 +251,8 @@ class _Search:
                 squares = np.bincount(bins, weight[slow] ** 2)
                 centre = angle.min() + (np.arange(len(sums)) + 0.5) * width
                 # One stop's long hold at one angle must not outvote the strokes.
-                cap = np.minimum(1.0, np.median(squares[squares > 0.0]) / np.maximum(squares, 1e-300)) if slow.any() else 1.0
+                typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
+                cap = np.minimum(1.0, typical / np.maximum(squares, typical))
             phase = np.exp(1j * order * centre)
             score[index] = abs((cap * sums) @ phase) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
         if not score.any():
@@ -297,7 +305,7 @@ class _Search:
         """Empty if a tested candidate may be accepted."""
         knobs, _, own, verdict = plan
         effect, channel = finding.effect, finding.channel
-        unit = "N" if channel in ("stiffness", "torque", "innovation") else "K" if channel == "temperature" else "N·m"
+        unit = UNITS.get(channel, "")
         if channel is None:
             return "these logs hold no reference on which it would show"
         if not own or not len(verdict.values):
@@ -338,7 +346,7 @@ class _Search:
 
     def dependence(self, channel: str) -> dict[str, np.ndarray]:
         """Gain on left-out episodes of a smooth function of each signal, episode by episode."""
-        if channel == "temperature":
+        if channel not in FORCE_CHANNELS:
             return {}
         knobs = self.channel_knobs(channel)
         base = [self.columns[knob] for knob in knobs]
@@ -385,11 +393,14 @@ class _Search:
         self.progress("recalibrating", 0.1)
         self.refine(channels)
         recalibrated = self._recalibration()
+        self._free: dict[str, tuple[float, str]] = {}
+        #: Dependence of the residual on each signal before any effect was accepted.
+        self.first = {channel: self.dependence(channel) for channel in self.bench.channels if channel in FORCE_CHANNELS}
         history: dict[str, Finding] = {}
         effects = [effect for effect in REGISTRY if effect.name not in self.calibrated]
         limit = len(effects)
         for number in range(limit):
-            self._free: dict[str, tuple[float, str]] = {}
+            self._free = {}
             left = [effect for effect in effects if effect.name not in self.accepted]
             self.progress(f"testing {len(left)} candidates, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
             tested = self.round(left)
@@ -476,6 +487,36 @@ class _Search:
                     del self.values[knob]
                 self.residual = self.bench.residuals(self.values)
                 self.refine({channel})
+            else:
+                self._prune(finding, knobs)
+
+    def _prune(self, finding: Finding, knobs: list[Knob]) -> None:
+        """Set those orders of a periodic effect to zero that the episodes do not prove."""
+        orders = sorted({knob.name.partition(".order_")[2][0] for knob in knobs if ".order_" in knob.name and not
+                         knob.name.endswith("per_turn")})  # fmt: skip
+        if len(orders) < 2:
+            return
+        channel = finding.channel
+        own = self.channel_knobs(channel)
+        values = np.array([self.values[k] for k in own])
+        restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
+        moments = self.moments(channel, [self.columns[k] for k in own], restored)
+        dropped = []
+        for order in orders:
+            pair = [i for i, k in enumerate(own) if k.name.startswith(f"{finding.effect.name}.order_{order}_")]
+            rest = [i for i in range(len(own)) if i not in pair]
+            verdict = judge(moments, rest, pair, self.penalty(own, channel))
+            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+                dropped += [own[i] for i in pair]
+        if dropped and len(dropped) < len(knobs):
+            for knob in dropped:
+                del self.values[knob]
+                knobs.remove(knob)
+                finding.values[knob.name.partition(".")[2]] = 0.0
+                finding.sigmas[knob.name.partition(".")[2]] = 0.0
+            self.knobs = [knob for knob in self.knobs if knob not in dropped]
+            self.residual = self.bench.residuals(self.values)
+            self.refine({channel})
 
     def _recalibration(self) -> dict[str, float]:
         """Channels in which refitting the base parameters gains on left-out episodes what matters."""
@@ -491,13 +532,19 @@ class _Search:
                 result[channel] = self.rms(gain, channel)
         return result
 
+    def _share(self, channel: str, knobs: list[Knob]) -> float:
+        """Share of the first residual's mean square that comes back when an effect is taken away again."""
+        without = self.bench.residuals({knob: value for knob, value in self.values.items() if knob not in knobs})
+        first, last, bare = (float(r[channel] @ r[channel]) for r in (self.initial, self.residual, without))
+        return float(np.clip((bare - last) / first, 0.0, 1.0)) if first > 0.0 else 0.0
+
     def _outcome(self, history: dict[str, Finding], recalibrated: dict[str, float]) -> Attribution:
         sigmas: dict[Knob, float] = {}
-        fits = {}
+        penalties = {}
         for channel in self.bench.channels:
             own = self.channel_knobs(channel)
             fitted = fit(self.moments(channel, [self.columns[k] for k in own]), self.penalty(own, channel))
-            fits[channel] = fitted
+            penalties[channel] = self.penalty(own, channel)
             sigmas.update(zip(own, np.sqrt(np.diag(fitted.covariance)), strict=True))
         touched = {history[name].channel for name in self.accepted}
         for knob in self.knobs:
@@ -506,6 +553,11 @@ class _Search:
         for name, knobs in self.accepted.items():
             finding = history[name]
             finding.accepted = True
+            finding.share_explained = self._share(finding.channel, knobs)
+            finding.reason = finding.reason or (
+                f"q = {finding.q_value:.1g} over episodes, {finding.gain:.3g} {UNITS[finding.channel]} RMS on left-out episodes"
+                + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
+            )
             for knob in knobs:
                 key = knob.name.partition(".")[2]
                 finding.values[key] = self.values[knob]
@@ -524,7 +576,7 @@ class _Search:
                 history[effect.name] = finding
         return Attribution(
             [history[effect.name] for effect in REGISTRY],
-            self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, fits,
+            self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, penalties,
         )  # fmt: skip
 
 
@@ -539,6 +591,7 @@ def _trust(knob: Knob, now: float) -> float:
     return 3.0 * knob.prior if np.isfinite(knob.prior) else np.inf
 
 
-def attribute(bench: Bench, progress: Callable[[str, float], None] = lambda text, share: None) -> Attribution:
+def attribute_with(bench: Bench, progress: Callable[[str, float], None]) -> tuple[Search, Attribution]:
     """Find the effects that the logs of ``bench`` prove. ``progress`` is told what is being done, and the share done."""
-    return _Search(bench, progress).run()
+    search = Search(bench, progress)
+    return search, search.run()

@@ -14,6 +14,7 @@ import numpy as np
 
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.knobs import Knob
+from emb_daemon.effects import torque_constant_fade
 from emb_daemon.effects.disc_thickness_variation import track
 from emb_daemon.effects.disc_thickness_variation import STATE as WHEEL_STATE
 from emb_daemon.estimator.records import ESTIMATE, new_state
@@ -23,6 +24,7 @@ from emb_daemon.offline import Log
 
 #: Residuals by channel and their unit. `innovation` stands for the paths' reference where a log has none.
 UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
+FORCE_CHANNELS = ("stiffness", "torque", "innovation")
 #: Disc speed (rad/s) below which the brake torque sensor shows static friction.
 _SLIDING = 1.0
 _TOUCHING_N = 300.0
@@ -40,7 +42,12 @@ def _run(samples, p, state, reference_mean, stiffness, torque, power, temperatur
         stiffness[row] = force
         power[row] = s.power
         mean = reference_mean[row] if len(reference_mean) else 0.5 * (before + force)
-        torque[row] = (s.balance - s.leverage * mean) / p[0].torque_constant
+        # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
+        m = samples[row]
+        fade = torque_constant_fade.term(
+            p[0].effects.torque_constant_fade, m.caliper, m.has_thermocouple, s.disc, s.temperature_known
+        )
+        torque[row] = (s.balance - s.leverage * mean) / (p[0].torque_constant * (1.0 + fade))
         before = force
         while next_row < len(rows) and rows[next_row] == row:
             for side in range(2):

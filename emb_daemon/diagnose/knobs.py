@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.effects.base import Effect
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect, Parameter
 
 
 @dataclass(frozen=True)
@@ -158,8 +159,14 @@ def calibrated(calibration: Calibration, values: dict[Knob, float]) -> Calibrati
     if clearance:
         data["contact"]["clearance_rad"] = max(0.0, data["contact"]["clearance_rad"] + float(np.mean(clearance)))
     table = data["thermal"]["friction"]
+    effects = {effect.name: effect for effect in REGISTRY}
     for knob, value in values.items():
         group, _, rest = knob.name.partition(".")
+        if group in effects:
+            parameter = next(p for p in effects[group].parameters if p.name == rest)
+            entry = data.setdefault("effects", {}).setdefault(group, {p.name: _neutral(p) for p in effects[group].parameters})
+            initial = calibration.effects.get(group, {}).get(rest, 0.0)
+            entry[rest] = float(np.clip(initial + value, parameter.low, parameter.high))
         if knob.name.startswith("contact.") or group not in ("stiffness", "thermal", "motor", "friction"):
             continue
         if knob.name.startswith("stiffness.curves"):
@@ -179,6 +186,10 @@ def calibrated(calibration: Calibration, values: dict[Knob, float]) -> Calibrati
             old = target.get(key, 0.0)
             target[key] = float(old * (1.0 + value) if knob.unit == "1" else old + value)
     return msgspec.convert(data, Calibration)
+
+
+def _neutral(parameter: Parameter) -> float:
+    return float(np.clip(0.0, parameter.low, parameter.high))
 
 
 def _moved_table(table: dict, kind: str, value: float) -> list:

@@ -8,6 +8,7 @@ from emb_daemon.offline import estimate
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
 _APPLIED_N = 150.0
+_CYCLE_S = 0.004
 
 
 def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
@@ -16,7 +17,8 @@ def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
     for trial in bench.trials:
         samples = trial.log.samples
         estimates = estimate(samples, parameters)
-        force = np.nan_to_num(trial.force_N) if trial.has_force else estimates["stiffness_force"]
+        # The estimate, not the reference: the reference's noise is part of the residual.
+        force = estimates["stiffness_force"]
         wheel = np.where(samples["has_wheel_speed"], np.nan_to_num(samples["wheel_speed"]), 0.0)
         torque = np.nan_to_num(trial.brake_torque_Nm)
         time = trial.log.time_s
@@ -29,8 +31,8 @@ def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
             "disc_angle": np.mod(wheel_angle(samples), 2.0 * np.pi),
             "motor_angle": samples["angle"] - samples["angle"][0],
             "motor_speed": samples["speed"],
-            "motor_acceleration": np.gradient(samples["speed"], time) if len(time) > 1 else np.zeros(len(time)),
-            "current": np.nan_to_num(samples["current_q"]),
+            "motor_acceleration": _around(samples["speed"], np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])) / (6.0 * _CYCLE_S),
+            "current": _around(np.nan_to_num(samples["current_q"]), np.full(6, 0.5)),
             "clamp_force": force,
             "pad_temperature": np.nan_to_num(estimates["mean"].mean(axis=1), nan=20.0),
             "disc_temperature": np.nan_to_num(estimates["disc"], nan=20.0),
@@ -42,6 +44,14 @@ def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
         for name, column in here.items():
             columns.setdefault(name, []).append(column)
     return {name: np.concatenate(parts) for name, parts in columns.items()}
+
+
+def _around(signal: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted thirds of the neighbours two to four samples away, three on each side: without the sample's own noise."""
+    padded = np.pad(signal, 4, mode="edge")
+    count = len(signal)
+    offsets = (-4, -3, -2, 2, 3, 4)
+    return sum(w * padded[4 + o : 4 + o + count] for w, o in zip(weights, offsets, strict=True)) / 3.0
 
 
 def _time_since(time: np.ndarray, active: np.ndarray) -> np.ndarray:
