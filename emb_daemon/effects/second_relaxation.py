@@ -24,9 +24,11 @@ EFFECT = Effect(
     path="stiffness",
     parameters=(
         Parameter("share", "1", -0.5, 0.5, 0.1, "share of the static force that follows slowly"),
-        Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant"),
+        Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant", (0.3, 1.5, 8.0)),
     ),
     equation="F_r = w (v − F_s),  τ₂ dv/dt + v = F_s",
     source="standard linear solid; Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 1",
     state=STATE,
+    signal="time_clamped",
+    manoeuvre="step the motor and hold: the force creeps with its own time constant",
 )

@@ -16,4 +16,6 @@ EFFECT = Effect(
     parameters=(Parameter("delay_s", "s", -0.01, 0.01, 0.001, "age of the angle"),),
     equation="θ → θ + d ω",
     source="first-order hold of a delayed sample",
+    signal="motor_speed",
+    manoeuvre="fast and slow strokes over the same forces: a delay grows with motor speed, a relaxation does not",
 )

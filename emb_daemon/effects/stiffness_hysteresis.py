@@ -22,9 +22,19 @@ EFFECT = Effect(
     path="stiffness",
     parameters=(
         Parameter("share", "1", 0.0, 0.2, 0.03, "half width of the loop over the clamp force"),
-        Parameter("slip_angle_rad", "rad", 0.05, 10.0, 1.0, "motor angle over which the element stretches before it slips"),
+        Parameter(
+            "slip_angle_rad",
+            "rad",
+            0.05,
+            10.0,
+            1.0,
+            "motor angle over which the element stretches before it slips",
+            (0.3, 1.0, 3.0),
+        ),
     ),
     equation="F_s → F_s (1 + h z),  dz = dθ/θ_slip held to ±1",
     source="Al-Bender, Lampaert, Swevers, The generalized Maxwell-slip model, IEEE Trans. Automatic Control 50(11), 2005",
     state=STATE,
+    signal="clamp_force",
+    manoeuvre="slow strokes both ways: hysteresis stays when the speed goes to zero",
 )

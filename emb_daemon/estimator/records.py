@@ -175,6 +175,8 @@ STATE = np.dtype(
         ("disc", "f8"),
         ("mean", "f8", (2,)),
         ("depth", "f8", (2, len(DEPTHS_M))),
+        # Friction power of both pads over the last cycle, W.
+        ("power", "f8"),
         ("history", "f8"),
         ("ambient", "f8"),
         ("factor", "f8"),

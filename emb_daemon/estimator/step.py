@@ -8,7 +8,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.effects import second_relaxation, signal_delay, stiffness_hysteresis
+from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import (
     CONTACT_UNCERTAIN,
     DEPTHS_M,
@@ -117,7 +117,7 @@ def _tell_temperatures(s, t):
 
 
 @njit
-def _flow(s, t, m):
+def _flow(s, t, e, m):
     """Let the heat of the time since the last heat step flow, and find the stiffness factor anew."""
     dt = s.heat_time
     wheel_speed = s.heat_travel / dt
@@ -128,7 +128,9 @@ def _flow(s, t, m):
     # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
     inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
     outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
+    inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
     s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
+    s.disc += effects.disc_cooling(e, t.disc_heat_capacity, s.disc, ambient, dt)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     forgotten = exp(-dt / t.history_time)
@@ -154,32 +156,33 @@ def _heat(s, p, m):
         return
     touching = s.fused > TOUCHING_N
     if touching != s.touching and s.heat_time > 0.0:
-        _flow(s, t, m)
+        _flow(s, t, p.effects, m)
     s.touching = touching
     wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
     s.heat_time += m.dt
     s.heat_travel += wheel_speed * m.dt
+    s.power = 0.0
     if touching and wheel_speed > TURNING_RAD_PER_S:
         if np.isnan(m.brake_torque):
-            power = friction_power(t, s.fused, wheel_speed, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
+            surface = 0.5 * (s.pads[0, 0] + s.pads[1, 0])
+            s.power = friction_power(t, s.fused, wheel_speed, surface) * effects.friction_factor(p.effects, surface)
         else:
-            power = max(m.brake_torque, 0.0) * wheel_speed
-        s.heat_energy += power * m.dt
+            s.power = max(m.brake_torque, 0.0) * wheel_speed
+        s.heat_energy += s.power * m.dt
     if s.heat_time >= _HEAT_STEP_S:
-        _flow(s, t, m)
+        _flow(s, t, p.effects, m)
 
 
 @njit
 def stiffness_path(s, p, m, factor):
     """Stiffness path: advances the dynamic force and its slope."""
     e, state = p.effects, s.effects
-    angle = m.angle + signal_delay.term(e.signal_delay, m.speed)
-    x = angle - s.contact_angle
+    gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
+    x = m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x
-    drive = factor * static * (1.0 + stiffness_hysteresis.term(e.stiffness_hysteresis, state.stiffness_hysteresis, travel))
-    drive += second_relaxation.term(e.second_relaxation, state.second_relaxation, drive, m.dt)
+    drive = effects.static_force(e, state, factor * static, travel, m.dt)
     s.force = first_order_lag(s.force, s.drive, drive, m.dt, p.relaxation_time)
     s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, m.dt, p.relaxation_time)
     s.drive = drive
@@ -197,10 +200,14 @@ def _torque(s, p, m):
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, travel, p.presliding_angle, _DISSOLVING_PER_S, m.dt
     )
-    leverage = p.gear_gain + p.load_friction * mean
+    e, mean_speed = p.effects, 0.5 * (m.speed + s.speed)
+    gear, friction = effects.gear(e, m.angle, travel, mean_speed, mean)
+    leverage = p.gear_gain * gear + p.load_friction * friction * mean
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain:
         return np.nan, leverage, 1.0
-    torque = unexplained_torque(p.torque_constant * m.current_q, p.inertia, m.speed - s.speed, m.dt, p.offset_friction, mean)
+    motor_torque = effects.motor_torque(e, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
+    offset_friction = p.offset_friction * friction
+    torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)
     return torque, leverage, s.friction_variance + turning * turning
 

@@ -1,0 +1,60 @@
+"""emb-daemon diagnose."""
+
+import argparse
+from pathlib import Path
+
+EXAMPLE = "emb-daemon diagnose fit.log.gz --calibration config/calibration.yaml --validate val.log.gz --output found"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("logs", nargs="+", type=Path, metavar="FIT_LOG", help="logs to find effects in")
+    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration to start from")
+    parser.add_argument(
+        "--validate", nargs="+", type=Path, default=[], metavar="LOG", help="logs that judge only; default: left-out episodes"
+    )
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="calibration.yaml, report.json, report.html")
+    parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import json
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from emb_daemon.atomic import write_atomically
+    from emb_daemon.calibration.files import load_calibration, save_calibration
+    from emb_daemon.diagnose.diagnosis import diagnose, log_paths
+    from emb_daemon.diagnose.page import page
+    from emb_daemon.diagnose.text import table, verdict
+    from emb_daemon.errors import InputError
+    from emb_daemon.offline import corner_index, load_log
+
+    corner_index(arguments.corner)
+    calibration = load_calibration(arguments.calibration)
+    paths = log_paths([*arguments.logs, *arguments.validate])
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{arguments.output}: cannot be a folder for results: {error.strerror}") from None
+    console = Console()
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
+    )
+    with bar:
+        task = bar.add_task("reading logs", total=1.0)
+        logs = [load_log(path, arguments.corner) for path in paths]
+        fit_logs, judges = logs[: len(arguments.logs)], logs[len(arguments.logs) :]
+
+        def progress(text: str, share: float) -> None:
+            bar.update(task, description=text, completed=share)
+
+        diagnosis = diagnose(fit_logs, calibration, judges, progress)
+    save_calibration(diagnosis.calibration, arguments.output / "calibration.yaml")
+    report = json.dumps(diagnosis.report(), indent=1, ensure_ascii=False)
+    write_atomically(arguments.output / "report.json", report.encode())
+    write_atomically(arguments.output / "report.html", page(diagnosis).encode())
+    console.print(verdict(diagnosis))
+    console.print(table(diagnosis))
+    console.print(f"calibration, report.html and report.json are in {arguments.output}", highlight=False)
+    return 0

@@ -1,0 +1,1 @@
+"""Closing the loop: residuals, their cause, a calibration that has it."""

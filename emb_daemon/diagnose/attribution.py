@@ -1,0 +1,597 @@
+"""Which effects of the catalogue do these logs prove?
+
+Stepwise: the base calibration is refitted, then every candidate is tested against what that leaves. A candidate is
+accepted if it passes all of
+
+1. a cluster-robust test over episodes, with the path's base parameters and all accepted effects free, corrected for the
+   shapes tried; false discovery rate over the whole catalogue at most 1 % (Benjamini and Hochberg),
+2. a gain on episodes left out of the fit that matters: a tenth of the residual and two thousandths of the force,
+3. values inside the physical bounds,
+4. placebos: a disturbed wheel phase, foreign orders, a shifted temperature must do much worse,
+5. comparison with what no model at all can say: if a smooth function of a single signal explains much more, the candidate
+   is a shadow of something else.
+
+The best one is added and everything is refitted through the production estimator (Gauss-Newton), until none is left. Then
+each accepted effect is tested once more in the presence of the others. Stepwise selection alone would be greedy where two
+effects only work together (a slow branch without slip gains nothing), so effects that lost are tried again each round.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench, Probe, wheel_angle
+from emb_daemon.diagnose.evidence import NOT_EXCITED, Moments, Verdict, false_discovery, fit, judge
+from emb_daemon.diagnose.knobs import Knob, base_knobs, effect_knob
+from emb_daemon.diagnose.signals import signals, smooth_basis
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect
+
+#: False discovery rate over the catalogue.
+Q_VALUE = 0.01
+#: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference.
+_RESIDUAL_SHARE = 0.1
+_SIGNAL_SHARE = 0.002
+#: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
+_FLOOR_K = 1.5
+_TORQUE_SHARE = 0.08
+#: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
+_OF_MODEL_FREE = 0.6
+_OF_PLACEBO = 0.5
+#: Autocorrelation makes this many samples worth one; weighs priors against data.
+_INFLATION = 30.0
+#: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
+_CONFOUNDED = 0.8
+_GAUSS_NEWTON = 4
+_FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
+
+
+@dataclass
+class Finding:
+    """What became of one effect of the catalogue."""
+
+    effect: Effect
+    channel: str | None
+    accepted: bool = False
+    in_calibration: bool = False
+    share_explained: float = 0.0
+    gain: float = 0.0
+    q_value: float = 1.0
+    p_value: float = 1.0
+    reason: str = ""
+    placebo: float | None = None
+    values: dict[str, float] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    confounded_with: str | None = None
+    manoeuvre: str | None = None
+
+
+@dataclass
+class Attribution:
+    """Outcome of a diagnosis, still in the estimator's terms.
+
+    Attributes:
+        values: knobs as fitted, base and effects, those that are to be applied.
+        sigmas: their standard deviations by the jackknife over episodes.
+        residual, initial: by channel, after everything accepted and before anything.
+        columns: by channel, the knobs whose regressors stand in `regressors`.
+        recalibrated: channels whose base parameters were refitted with a gain that matters, with that gain.
+    """
+
+    findings: list[Finding]
+    values: dict[Knob, float]
+    sigmas: dict[Knob, float]
+    initial: dict[str, np.ndarray]
+    residual: dict[str, np.ndarray]
+    knobs: list[Knob]
+    regressors: dict[Knob, np.ndarray]
+    recalibrated: dict[str, float]
+    signals: dict[str, np.ndarray]
+    penalties: dict[str, np.ndarray]
+
+
+class Search:
+    """One run of the stepwise search; keeps what the report asks for afterwards."""
+
+    def __init__(self, bench: Bench, progress: Callable[[str, float], None]):
+        self.bench = bench
+        self.progress = progress
+        parameters = bench.parameters[0]
+        self.calibrated: set[str] = set()
+        knobs = []
+        for knob in base_knobs(parameters, len(bench.trials)):
+            knobs += self._adopted(knob)
+        for effect in REGISTRY:
+            channel = bench.channel_of(effect.path, effect.name)
+            initial = parameters["effects"][effect.name]
+            if any(initial[p.name] != 0.0 for p in effect.amplitudes):
+                self.calibrated.add(effect.name)
+                if channel:
+                    knobs += [effect_knob(effect, p.name, channel, float(initial[p.name])) for p in effect.parameters]
+        self.knobs: list[Knob] = knobs
+        self.values: dict[Knob, float] = dict.fromkeys(knobs, 0.0)
+        self.accepted: dict[str, list[Knob]] = {}
+        self.initial = bench.residuals({})
+        self.residual = self.initial
+        self.columns: dict[Knob, np.ndarray] = {}
+        self.signals = signals(bench, parameters)
+        braking = self.signals["brake_torque"][self.signals["brake_torque"] > 20.0]
+        self.scale = dict.fromkeys(bench.channels, float(np.sqrt(np.mean(self.signals["clamp_force"] ** 2))))
+        self.scale["brake_torque"] = float(np.sqrt(np.mean(braking**2))) if len(braking) else 0.0
+
+    def _adopted(self, knob: Knob) -> list[Knob]:
+        channel = knob.channel
+        if channel in ("stiffness", "torque") and not self.bench.has_reference:
+            channel = "innovation"
+        if channel not in self.bench.channels:
+            return []
+        return [Knob(**{**knob.__dict__, "channel": channel})]
+
+    # -- fitting ------------------------------------------------------------------------------------------------------
+
+    def channel_knobs(self, channel: str) -> list[Knob]:
+        return [knob for knob in self.knobs if knob.channel == channel]
+
+    def noise(self, channel: str) -> float:
+        """Mean square of the residual where there is one."""
+        residual = self.residual[channel]
+        counted = residual != 0.0
+        return float(np.mean(residual[counted] ** 2)) if counted.any() else 0.0
+
+    def penalty(self, knobs: list[Knob], channel: str) -> np.ndarray:
+        prior = np.array([knob.prior for knob in knobs])
+        return _INFLATION * max(self.noise(channel), 1e-12) / prior**2
+
+    def moments(self, channel: str, columns: list[np.ndarray], residual: np.ndarray | None = None) -> Moments:
+        residual = self.residual[channel] if residual is None else residual
+        table = np.column_stack(columns) if columns else np.zeros((len(residual), 0))
+        return Moments.of(table, residual, self.bench.episode[channel], self.bench.episodes)
+
+    def objective(self, residual: dict[str, np.ndarray], values: dict[Knob, float], channel: str) -> float:
+        knobs = self.channel_knobs(channel)
+        moved = np.array([values[knob] for knob in knobs])
+        return float(residual[channel] @ residual[channel] + self.penalty(knobs, channel) @ moved**2)
+
+    def refine(self, channels: set[str]) -> None:
+        """Gauss-Newton through the estimator over all knobs of some channels."""
+        channels = set(channels)
+        for _ in range(_GAUSS_NEWTON):
+            knobs = [knob for knob in self.knobs if knob.channel in channels]
+            probes = [Probe(knob) for knob in knobs]
+            found = self.bench.regressors(self.values, probes, self.residual)
+            self.columns.update({probe.knob: column for probe, column in found.items()})
+            steps: dict[Knob, float] = {}
+            for channel in channels:
+                own = self.channel_knobs(channel)
+                table = np.column_stack([self.columns[knob] for knob in own])
+                penalty = self.penalty(own, channel)
+                now = np.array([self.values[knob] for knob in own])
+                normal, right = table.T @ table + np.diag(penalty), table.T @ self.residual[channel] - penalty * now
+                size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+                step = np.linalg.solve(normal / np.outer(size, size) + 1e-9 * np.eye(len(own)), right / size) / size
+                low, high = np.array([k.low for k in own]), np.array([k.high for k in own])
+                limit = np.array([_trust(knob, self.values[knob]) for knob in own])
+                step = np.clip(step, -limit, limit)
+                steps.update(zip(own, np.clip(now + step, low, high) - now, strict=True))
+            before = {channel: self.objective(self.residual, self.values, channel) for channel in channels}
+            channels -= self._advance(steps, before, channels)
+            if not channels:
+                break
+
+    def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> set[str]:
+        """Take the steps, shortened where they do not help; returns the channels that have converged."""
+        share = dict.fromkeys(channels, 1.0)
+        for _ in range(5):
+            tried = dict(self.values)
+            for knob, step in steps.items():
+                tried[knob] += share[knob.channel] * step
+            residual = self.bench.residuals(tried)
+            after = {channel: self.objective(residual, tried, channel) for channel in channels}
+            worse = {channel for channel in channels if after[channel] > before[channel] * (1.0 + 1e-9)}
+            if not worse:
+                self.values, self.residual = tried, residual
+                return {c for c in channels if before[c] - after[c] < 2e-3 * before[c]}
+            for channel in worse:
+                share[channel] = 0.0 if share[channel] < 0.1 else 0.3 * share[channel]
+        return set(channels)
+
+    # -- testing ------------------------------------------------------------------------------------------------------
+
+    def floor(self, channel: str) -> float:
+        """Least RMS of an effect that matters, in the channel's unit."""
+        if channel == "temperature":
+            return _FLOOR_K
+        share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
+        return max(_RESIDUAL_SHARE * np.sqrt(self.noise(channel)), share * self.scale[channel])
+
+    def rms(self, gain: float, channel: str) -> float:
+        counted = max(int(np.count_nonzero(self.residual[channel])), 1)
+        return float(np.sqrt(max(gain, 0.0) / counted))
+
+    def variants(self, effect: Effect, channel: str) -> tuple[list[tuple[tuple[Knob, float], ...]], int]:
+        """Shapes in which to test an effect, and how many were looked at to choose them."""
+        shapes = effect.shapes
+        if not shapes:
+            return [()], 1
+        parameter = shapes[0]
+        knob = effect_knob(effect, parameter.name, channel)
+        if effect.placebo == "order":
+            order, tried = self._strongest_order(effect, parameter.starts, channel)
+            return ([((knob, order),)] if order else []), tried
+        return [((knob, start),) for start in parameter.starts], len(parameter.starts)
+
+    def _strongest_order(self, effect: Effect, limits: tuple[float, ...], channel: str) -> tuple[float | None, int]:
+        """Order per turn over which the residual varies most, weighted with the force for a ripple of the gear."""
+        samples = np.concatenate([trial.log.samples for trial in self.bench.trials])
+        angle, travel = samples["angle"], np.abs(samples["speed"]) * samples["dt"]
+        whole = effect.name == "cogging_torque"
+        if whole:
+            orders = np.arange(limits[0], limits[1] + 0.5)
+        else:
+            span = max(np.ptp(angle), 1.0)
+            orders = np.arange(max(limits[0], 4.0 * np.pi / span), limits[1], 0.5 * np.pi / span)
+        knobs = self.channel_knobs(channel)
+        residual = self.residual[channel]
+        weight = np.ones(len(residual)) if whole else self.signals["clamp_force"]
+        columns = [self.columns[knob] for knob in knobs]
+        if columns:
+            table = np.column_stack(columns)
+            normal = table.T @ table + np.diag(self.penalty(knobs, channel) + 1e-12)
+            residual = residual - table @ np.linalg.lstsq(normal, table.T @ residual, rcond=1e-12)[0]
+        score = np.zeros(len(orders))
+        for index, order in enumerate(orders):
+            if index == 0 or order > 1.3 * binned:
+                # Samples that pass more than a fifth of a period smear it; bins are a sixteenth wide.
+                binned = order
+                slow = (travel * order < 1.0) & (residual != 0.0)
+                width = 2.0 * np.pi / (16.0 * 1.3 * order)
+                bins = np.floor((angle[slow] - angle.min()) / width).astype(np.int64)
+                sums = np.bincount(bins, weight[slow] * residual[slow])
+                squares = np.bincount(bins, weight[slow] ** 2)
+                centre = angle.min() + (np.arange(len(sums)) + 0.5) * width
+                # One stop's long hold at one angle must not outvote the strokes.
+                typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
+                cap = np.minimum(1.0, typical / np.maximum(squares, typical))
+            phase = np.exp(1j * order * centre)
+            score[index] = abs((cap * sums) @ phase) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
+        if not score.any():
+            return None, len(orders)
+        return float(orders[np.argmax(score)]), len(orders)
+
+    def round(self, candidates: list[Effect]) -> dict[str, tuple[Finding, tuple]]:
+        """Test all candidates against the present residual."""
+        plans, probes = [], []
+        for effect in candidates:
+            channel = self.bench.channel_of(effect.path, effect.name)
+            finding = Finding(effect, channel)
+            shapes, tried = self.variants(effect, channel) if channel else ([], 1)
+            knobs = [effect_knob(effect, p.name, channel) for p in effect.amplitudes] if channel else []
+            plans.append((finding, knobs, shapes, tried))
+            probes += [Probe(knob, shape) for shape in shapes for knob in knobs]
+        columns = self.bench.regressors(self.values, probes, self.residual)
+        tested = {}
+        for finding, knobs, shapes, tried in plans:
+            best: tuple[Verdict, tuple, list[np.ndarray]] = (NOT_EXCITED, (), [])
+            for shape in shapes:
+                own = [columns[Probe(knob, shape)] for knob in knobs]
+                verdict = self.verdict(finding.channel, own)
+                if not best[2] or (verdict.p_value, -verdict.gain) < (best[0].p_value, -best[0].gain):
+                    best = (verdict, shape, own)
+            verdict, shape, own = best
+            finding.p_value = min(1.0, verdict.p_value * tried)
+            if finding.channel:
+                finding.gain = self.rms(verdict.gain, finding.channel)
+                initial = float(self.initial[finding.channel] @ self.initial[finding.channel])
+                finding.share_explained = max(verdict.gain, 0.0) / initial if initial > 0.0 else 0.0
+            for knob, value, sigma in zip(knobs, verdict.values, verdict.sigmas, strict=False):
+                finding.values[knob.name.partition(".")[2]] = float(value)
+                finding.sigmas[knob.name.partition(".")[2]] = float(sigma)
+            tested[finding.effect.name] = (finding, (knobs, shape, own, verdict))
+        everything = [tested[effect.name][0] for effect in candidates]
+        padded = np.array([f.p_value for f in everything] + [1.0] * (len(REGISTRY) - len(everything)))
+        for finding, q_value in zip(everything, false_discovery(padded), strict=False):
+            finding.q_value = float(q_value)
+        return tested
+
+    def verdict(self, channel: str, own: list[np.ndarray]) -> Verdict:
+        knobs = self.channel_knobs(channel)
+        moments = self.moments(channel, [self.columns[knob] for knob in knobs] + own)
+        penalty = np.concatenate([self.penalty(knobs, channel), np.zeros(len(own))])
+        first = len(knobs)
+        return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
+
+    def why_not(self, finding: Finding, plan: tuple) -> str:
+        """Empty if a tested candidate may be accepted."""
+        knobs, _, own, verdict = plan
+        effect, channel = finding.effect, finding.channel
+        unit = UNITS.get(channel, "")
+        if channel is None:
+            return "these logs hold no reference on which it would show"
+        if not own or not len(verdict.values):
+            return f"not excited by these logs; {effect.manoeuvre}"
+        if finding.q_value > Q_VALUE:
+            return f"not significant over {verdict.clusters:.0f} effective episodes (q = {finding.q_value:.2g})"
+        if verdict.gain <= 0.0:
+            return "no gain on left-out episodes"
+        if finding.gain < self.floor(channel):
+            return f"explains {finding.gain:.3g} {unit} RMS, too little to matter (limit {self.floor(channel):.3g} {unit})"
+        for knob, value, sigma in zip(knobs, verdict.values, verdict.sigmas, strict=True):
+            if not knob.low - 2.0 * sigma <= value <= knob.high + 2.0 * sigma:
+                return f"{knob.name.partition('.')[2]} = {value:.3g} {knob.unit} is outside what physics allows"
+        free, name = self.model_free(channel)
+        if verdict.gain < _OF_MODEL_FREE * free:
+            return (
+                f"explains {finding.gain:.3g} {unit} RMS where a smooth function of {name} explains "
+                f"{self.rms(free, channel):.3g} {unit}: a shadow of something else"
+            )
+        finding.placebo = self.placebo(effect, channel)
+        if finding.placebo is not None and finding.placebo > _OF_PLACEBO * verdict.gain:
+            share = finding.placebo / verdict.gain
+            finding.placebo = share
+            return f"its placebo ({effect.placebo} disturbed) explains {100 * share:.0f} % of the same"
+        if finding.placebo is not None:
+            finding.placebo /= verdict.gain
+        return ""
+
+    def model_free(self, channel: str) -> tuple[float, str]:
+        """Largest gain on left-out episodes of a smooth function of one signal, and that signal."""
+        if channel not in self._free:
+            best = (0.0, "")
+            for name, gain in self.dependence(channel).items():
+                if gain.sum() > best[0]:
+                    best = (float(gain.sum()), name)
+            self._free[channel] = best
+        return self._free[channel]
+
+    def dependence(self, channel: str) -> dict[str, np.ndarray]:
+        """Gain on left-out episodes of a smooth function of each signal, episode by episode."""
+        if channel not in FORCE_CHANNELS:
+            return {}
+        knobs = self.channel_knobs(channel)
+        base = [self.columns[knob] for knob in knobs]
+        keep = self.residual[channel] != 0.0
+        result = {}
+        for name, signal in self.signals.items():
+            basis = smooth_basis(name, signal, self.signals["clamp_force"])
+            if not basis.shape[1]:
+                continue
+            basis = basis * keep[:, None]
+            moments = self.moments(channel, [*base, basis])
+            own = np.einsum("gii->i", moments.products)[len(knobs) : -1]
+            penalty = np.concatenate([self.penalty(knobs, channel), 1e-3 * np.maximum(own, 1e-300) + 1e-12])
+            both = fit(moments, penalty)
+            plain = fit(moments.select(list(range(len(knobs)))), penalty[: len(knobs)])
+            result[name] = plain.left_out - both.left_out
+        return result
+
+    def placebo(self, effect: Effect, channel: str) -> float | None:
+        """Best gain that the effect reaches when what it rests on is disturbed; None where it has no placebo."""
+        clearance = [knob for knob in self.channel_knobs(channel) if knob.name == "contact.clearance_rad"]
+        if not clearance or effect.placebo not in ("wheel_pulse", "disc", "energy") or effect.path != "stiffness":
+            return None
+        lever = np.sum([self.columns[knob] for knob in clearance], axis=0)
+        episode = self.bench.sample_episode
+        trials = []
+        if effect.placebo == "wheel_pulse":
+            angle = np.concatenate([wheel_angle(trial.log.samples) for trial in self.bench.trials])
+            trials += [[lever * np.cos(o * angle), lever * np.sin(o * angle)] for o in _FOREIGN_ORDERS]
+            random = np.random.default_rng(0)
+            shifted = angle + random.uniform(0.0, 2.0 * np.pi, self.bench.episodes)[episode]
+            trials.append([lever * part(order * shifted) for order in (1, 2) for part in (np.cos, np.sin)])
+        else:
+            signal = self.signals["disc_temperature" if effect.placebo == "disc" else "energy"]
+            signal = signal - signal[0]
+            trials += [[lever * np.roll(signal, round(share * len(signal)))] for share in (0.25, 0.5, 0.75)]
+            trials.append([lever * signal[::-1]])
+        return max(self.verdict(channel, own).gain for own in trials)
+
+    # -- the search ---------------------------------------------------------------------------------------------------
+
+    def run(self) -> Attribution:
+        channels = set(self.bench.channels)
+        self.progress("recalibrating", 0.1)
+        self.refine(channels)
+        recalibrated = self._recalibration()
+        self._free: dict[str, tuple[float, str]] = {}
+        #: Dependence of the residual on each signal before any effect was accepted.
+        self.first = {channel: self.dependence(channel) for channel in self.bench.channels if channel in FORCE_CHANNELS}
+        history: dict[str, Finding] = {}
+        effects = [effect for effect in REGISTRY if effect.name not in self.calibrated]
+        limit = len(effects)
+        for number in range(limit):
+            self._free = {}
+            left = [effect for effect in effects if effect.name not in self.accepted]
+            self.progress(f"testing {len(left)} candidates, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
+            tested = self.round(left)
+            for name, (finding, plan) in tested.items():
+                finding.reason = self.why_not(finding, plan)
+                earlier = history.get(name)
+                if earlier is None or not earlier.confounded_with:
+                    history[name] = finding
+            chosen: set[str] = set()
+            for channel in self.bench.channels:
+                passed = [t for t in tested.values() if t[0].channel == channel and not t[0].reason]
+                if not passed:
+                    continue
+                passed.sort(key=lambda t: -t[1][3].gain)
+                winner = passed[0]
+                self._mark_confounded(winner, passed[1:], history)
+                self._accept(winner)
+                chosen.add(channel)
+            if not chosen:
+                break
+            self.refine(chosen)
+        self._revise(history)
+        return self._outcome(history, recalibrated)
+
+    def _accept(self, winner: tuple[Finding, tuple]) -> None:
+        finding, (knobs, shape, _, verdict) = winner
+        shapes = [knob for knob, _ in shape]
+        self.accepted[finding.effect.name] = [*knobs, *shapes]
+        self.knobs += [*knobs, *shapes]
+        for knob, value in zip(knobs, verdict.values, strict=True):
+            self.values[knob] = float(np.clip(value, knob.low, knob.high))
+        for knob, start in shape:
+            # The prior of a shape is centred on its start.
+            self.values[knob] = start
+        self.residual = self.bench.residuals(self.values)
+
+    def _mark_confounded(self, winner: tuple, others: list[tuple], history: dict[str, Finding]) -> None:
+        finding, (_, _, own, verdict) = winner
+        for rival, (_, _, columns, judged) in others:
+            if judged.gain < _CONFOUNDED * verdict.gain:
+                continue
+            with_winner = self.verdict_given(finding.channel, own, columns)
+            if with_winner.p_value < Q_VALUE and with_winner.gain > 0.0:
+                continue
+            without = self.verdict_given(finding.channel, columns, own)
+            separated = without.p_value < Q_VALUE and without.gain > 0.0
+            rival.reason = (
+                f"explained by {finding.effect.name}, which explains more than it"
+                if separated
+                else f"confounded with {finding.effect.name} on these logs; to separate them: {rival.effect.manoeuvre}"
+            )
+            if not separated:
+                rival.confounded_with = finding.effect.name
+                rival.manoeuvre = rival.effect.manoeuvre
+                finding.confounded_with = rival.effect.name
+                finding.manoeuvre = finding.effect.manoeuvre
+            history[rival.effect.name] = rival
+
+    def verdict_given(self, channel: str, given: list[np.ndarray], own: list[np.ndarray]) -> Verdict:
+        knobs = self.channel_knobs(channel)
+        moments = self.moments(channel, [self.columns[knob] for knob in knobs] + given + own)
+        penalty = np.concatenate([self.penalty(knobs, channel), np.zeros(len(given) + len(own))])
+        first = len(knobs) + len(given)
+        return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
+
+    def _revise(self, history: dict[str, Finding]) -> None:
+        """Test each accepted effect once more with all others in place; drop what no longer holds."""
+        for name in list(self.accepted):
+            knobs = self.accepted[name]
+            finding = history[name]
+            channel = finding.channel
+            own = self.channel_knobs(channel)
+            values = np.array([self.values[k] for k in own])
+            restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
+            moments = self.moments(channel, [self.columns[k] for k in own], restored)
+            amplitudes = [i for i, k in enumerate(own) if k in knobs and not _is_shape(finding.effect, k)]
+            rest = [i for i, k in enumerate(own) if k not in knobs]
+            verdict = judge(moments, rest, amplitudes, self.penalty(own, channel))
+            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+                finding.reason = "no longer holds beside the other effects"
+                del self.accepted[name]
+                self.knobs = [k for k in self.knobs if k not in knobs]
+                for knob in knobs:
+                    del self.values[knob]
+                self.residual = self.bench.residuals(self.values)
+                self.refine({channel})
+            else:
+                self._prune(finding, knobs)
+
+    def _prune(self, finding: Finding, knobs: list[Knob]) -> None:
+        """Set those orders of a periodic effect to zero that the episodes do not prove."""
+        orders = sorted({knob.name.partition(".order_")[2][0] for knob in knobs if ".order_" in knob.name and not
+                         knob.name.endswith("per_turn")})  # fmt: skip
+        if len(orders) < 2:
+            return
+        channel = finding.channel
+        own = self.channel_knobs(channel)
+        values = np.array([self.values[k] for k in own])
+        restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
+        moments = self.moments(channel, [self.columns[k] for k in own], restored)
+        dropped = []
+        for order in orders:
+            pair = [i for i, k in enumerate(own) if k.name.startswith(f"{finding.effect.name}.order_{order}_")]
+            rest = [i for i in range(len(own)) if i not in pair]
+            verdict = judge(moments, rest, pair, self.penalty(own, channel))
+            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+                dropped += [own[i] for i in pair]
+        if dropped and len(dropped) < len(knobs):
+            for knob in dropped:
+                del self.values[knob]
+                knobs.remove(knob)
+                finding.values[knob.name.partition(".")[2]] = 0.0
+                finding.sigmas[knob.name.partition(".")[2]] = 0.0
+            self.knobs = [knob for knob in self.knobs if knob not in dropped]
+            self.residual = self.bench.residuals(self.values)
+            self.refine({channel})
+
+    def _recalibration(self) -> dict[str, float]:
+        """Channels in which refitting the base parameters gains on left-out episodes what matters."""
+        result = {}
+        for channel in self.bench.channels:
+            knobs = self.channel_knobs(channel)
+            if not knobs:
+                continue
+            table = np.column_stack([self.columns[knob] for knob in knobs])
+            moments = self.moments(channel, [table], self.initial[channel])
+            gain = float((moments.products[:, -1, -1] - fit(moments, self.penalty(knobs, channel)).left_out).sum())
+            if self.rms(gain, channel) >= self.floor(channel):
+                result[channel] = self.rms(gain, channel)
+        return result
+
+    def _share(self, channel: str, knobs: list[Knob]) -> float:
+        """Share of the first residual's mean square that comes back when an effect is taken away again."""
+        without = self.bench.residuals({knob: value for knob, value in self.values.items() if knob not in knobs})
+        first, last, bare = (float(r[channel] @ r[channel]) for r in (self.initial, self.residual, without))
+        return float(np.clip((bare - last) / first, 0.0, 1.0)) if first > 0.0 else 0.0
+
+    def _outcome(self, history: dict[str, Finding], recalibrated: dict[str, float]) -> Attribution:
+        sigmas: dict[Knob, float] = {}
+        penalties = {}
+        for channel in self.bench.channels:
+            own = self.channel_knobs(channel)
+            fitted = fit(self.moments(channel, [self.columns[k] for k in own]), self.penalty(own, channel))
+            penalties[channel] = self.penalty(own, channel)
+            sigmas.update(zip(own, np.sqrt(np.diag(fitted.covariance)), strict=True))
+        touched = {history[name].channel for name in self.accepted}
+        for knob in self.knobs:
+            if knob.channel not in touched and knob.channel not in recalibrated:
+                self.values[knob] = 0.0
+        for name, knobs in self.accepted.items():
+            finding = history[name]
+            finding.accepted = True
+            finding.share_explained = self._share(finding.channel, knobs)
+            finding.reason = finding.reason or (
+                f"q = {finding.q_value:.1g} over episodes, {finding.gain:.3g} {UNITS[finding.channel]} RMS on left-out episodes"
+                + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
+            )
+            for knob in knobs:
+                key = knob.name.partition(".")[2]
+                finding.values[key] = self.values[knob]
+                finding.sigmas[key] = float(sigmas[knob])
+        for effect in REGISTRY:
+            if effect.name in self.calibrated:
+                channel = self.bench.channel_of(effect.path, effect.name)
+                finding = Finding(effect, channel, in_calibration=True, reason="already in the calibration")
+                initial = self.bench.parameters[0]["effects"][effect.name]
+                finding.values = {p.name: float(initial[p.name]) for p in effect.parameters}
+                for knob in self.knobs:
+                    group, _, key = knob.name.partition(".")
+                    if group == effect.name:
+                        finding.values[key] += self.values[knob]
+                        finding.sigmas[key] = float(sigmas[knob])
+                history[effect.name] = finding
+        return Attribution(
+            [history[effect.name] for effect in REGISTRY],
+            self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, penalties,
+        )  # fmt: skip
+
+
+def _is_shape(effect: Effect, knob: Knob) -> bool:
+    return any(f"{effect.name}.{p.name}" == knob.name for p in effect.shapes)
+
+
+def _trust(knob: Knob, now: float) -> float:
+    """Longest step that Gauss-Newton may take at once."""
+    if knob.unit == "1" and np.isfinite(knob.prior):
+        return max(0.3, 0.5 * abs(now))
+    return 3.0 * knob.prior if np.isfinite(knob.prior) else np.inf
+
+
+def attribute_with(bench: Bench, progress: Callable[[str, float], None]) -> tuple[Search, Attribution]:
+    """Find the effects that the logs of ``bench`` prove. ``progress`` is told what is being done, and the share done."""
+    search = Search(bench, progress)
+    return search, search.run()

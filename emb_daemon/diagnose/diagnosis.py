@@ -1,0 +1,284 @@
+"""The whole of a diagnosis: logs and a calibration in; findings, an augmented calibration and figures out."""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon import __version__
+from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
+from emb_daemon.diagnose.attribution import Attribution, Finding, attribute_with
+from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench
+from emb_daemon.diagnose.evidence import Moments, fit
+from emb_daemon.diagnose.judged import Errors, comparison, errors_of, innovation_errors, joined, judged
+from emb_daemon.diagnose.knobs import Knob, calibrated
+from emb_daemon.diagnose.unexplained import Rest, rests
+from emb_daemon.errors import InputError
+from emb_daemon.offline import Log, estimate
+
+#: Parts into which the episodes are dealt when no validation log is given.
+_FOLDS = 4
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass
+class Diagnosis:
+    """Everything that the report shows.
+
+    Attributes:
+        calibration: the augmented one.
+        before, after: squared errors of the running estimator on ``judged_on``.
+        rests: dependence of what is left, by channel, strongest first.
+    """
+
+    original: Calibration
+    calibration: Calibration
+    bench: Bench
+    attribution: Attribution
+    judged_on: str
+    judged_bench: Bench
+    before: Errors
+    after: Errors
+    rests: dict[str, list[Rest]]
+    rests_before: dict[str, list[Rest]]
+    seconds: float
+
+    @property
+    def accepted(self) -> list[Finding]:
+        """Effects that were found, by share explained."""
+        return sorted((f for f in self.attribution.findings if f.accepted), key=lambda f: -f.share_explained)
+
+    @property
+    def unexplained(self) -> Rest | None:
+        """The strongest rest that matters."""
+        matter = [channel[0] for channel in self.rests.values() if channel and channel[0].matters]
+        return max(matter, key=lambda rest: rest.rms, default=None)
+
+    def figures(self) -> dict:
+        """RMSE before and after with intervals, by path and condition."""
+        return comparison(self.before, self.after)
+
+    def report(self) -> dict:
+        """Contents of report.json."""
+        figures = self.figures()
+        rest = self.unexplained
+        first = max((channel[0] for channel in self.rests.values() if channel), key=lambda r: r.share, default=None)
+        return {
+            "paths": {
+                path: {
+                    "rmse_before_N": part["total"]["rmse_before_N"],
+                    "rmse_after_N": part["total"]["rmse_after_N"],
+                    "interval_before_N": part["total"]["interval_before_N"],
+                    "interval_after_N": part["total"]["interval_after_N"],
+                    "conditions": {name: value for name, value in part.items() if name != "total"},
+                }
+                for path, part in figures.items()
+            },
+            "judged_on": self.judged_on,
+            "reference": "clamp_force" if self.bench.has_reference else "innovation",
+            "effects": [finding_json(finding) for finding in ranked(self.attribution.findings)],
+            "recalibrated": {
+                knob.name: {"change": value, "sigma": self.attribution.sigmas.get(knob, 0.0), "unit": knob.unit}
+                for knob, value in self.attribution.values.items()
+                if value != 0.0 and not _of_effect(knob)
+            },
+            "unexplained": {
+                "present": rest is not None,
+                "share": rest.share if rest else (first.share if first else 0.0),
+                "strongest_dependence": rest.signal if rest else None,
+                "path": rest.channel if rest else None,
+                "rms_N": rest.rms if rest else 0.0,
+            },
+            "residual": {
+                channel: {
+                    "unit": UNITS[channel],
+                    "rms_before": _rms(self.attribution.initial[channel]),
+                    "rms_after": _rms(self.attribution.residual[channel]),
+                    "dependences": [
+                        {"signal": r.signal, "share": r.share, "certainty": r.certainty}
+                        for r in self.rests.get(channel, [])[:6]
+                    ],
+                }
+                for channel in self.bench.channels
+            },
+            "episodes": self.bench.episodes,
+            "seconds": self.seconds,
+        }
+
+
+def ranked(findings: list[Finding]) -> list[Finding]:
+    """Accepted ones first, each group by share explained."""
+    return sorted(findings, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained))
+
+
+def finding_json(finding: Finding) -> dict:
+    """One entry of report.json's ``effects``."""
+    effect = finding.effect
+    parameters = {
+        parameter.name: {
+            "value": finding.values.get(parameter.name, 0.0),
+            "sigma": finding.sigmas.get(parameter.name, 0.0),
+            "unit": parameter.unit,
+        }
+        for parameter in effect.parameters
+        if parameter.name in finding.values
+    }
+    parameters |= amplitudes(finding)
+    entry = {
+        "name": effect.name,
+        "path": effect.path,
+        "accepted": finding.accepted,
+        "share_explained": finding.share_explained,
+        "gain_N": finding.gain if UNITS.get(finding.channel or "") == "N" else 0.0,
+        "q_value": finding.q_value,
+        "parameters": parameters,
+        "equation": effect.equation,
+        "reason": finding.reason,
+        "in_calibration": finding.in_calibration,
+    }
+    if finding.channel and UNITS[finding.channel] != "N":
+        entry["gain"] = {"value": finding.gain, "unit": UNITS[finding.channel]}
+    if finding.placebo is not None:
+        entry["placebo_share"] = finding.placebo
+    if finding.confounded_with:
+        entry["confounded_with"] = finding.confounded_with
+        entry["manoeuvre"] = finding.manoeuvre
+    return entry
+
+
+def amplitudes(finding: Finding) -> dict:
+    """Amplitude of each order out of its cosine and sine."""
+    result = {}
+    for name, cosine in finding.values.items():
+        if "cosine" not in name:
+            continue
+        other = name.replace("cosine", "sine")
+        sine = finding.values.get(other, 0.0)
+        size = float(np.hypot(cosine, sine))
+        if size == 0.0:
+            continue
+        spread = np.hypot(cosine * finding.sigmas.get(name, 0.0), sine * finding.sigmas.get(other, 0.0)) / size
+        parameter = next(p for p in finding.effect.parameters if p.name == name)
+        result[name.replace("cosine", "amplitude")] = {"value": size, "sigma": float(spread), "unit": parameter.unit}
+    return result
+
+
+def _of_effect(knob: Knob) -> bool:
+    return knob.name.partition(".")[0] not in ("contact", "stiffness", "thermal", "motor", "friction")
+
+
+def _rms(residual: np.ndarray) -> float:
+    counted = residual[residual != 0.0]
+    return float(np.sqrt(np.mean(counted**2))) if len(counted) else 0.0
+
+
+def diagnose(
+    fit_logs: Sequence[Log],
+    calibration: Calibration,
+    validate: Sequence[Log] = (),
+    progress: Progress = lambda text, share: None,
+) -> Diagnosis:
+    """Find what the calibration's models lack on ``fit_logs``, add it, and judge on ``validate``.
+
+    Without validation logs the fit logs judge: each quarter of their episodes by parameters from the other three.
+
+    Raises:
+        InputError: the logs cannot tell anything (too short, no motion).
+    """
+    begin = time.monotonic()
+    progress("cutting the logs into episodes", 0.02)
+    bench = Bench(fit_logs, to_parameters(calibration))
+    if bench.episodes < 6:
+        raise InputError(f"{fit_logs[0].path}: only {bench.episodes} episodes, expected at least 6 to tell effect from chance")
+    search, attribution = attribute_with(bench, progress)
+    progress("what is left", 0.85)
+    after_rests = {
+        channel: rests(channel, search.dependence(channel), attribution.residual[channel], search.floor(channel))
+        for channel in bench.channels
+        if channel in FORCE_CHANNELS
+    }
+    before_rests = {
+        channel: rests(channel, gains, attribution.initial[channel], 0.0) for channel, gains in search.first.items()
+    }
+    used = {knob: value for knob, value in attribution.values.items() if value != 0.0}
+    augmented = calibrated(calibration, used) if used else calibration
+    progress("judging", 0.9)
+    if validate:
+        judges = Bench(validate, to_parameters(calibration))
+        before = judged(judges, to_parameters(calibration))
+        after = judged(judges, to_parameters(augmented))
+    else:
+        judges = bench
+        before = judged(bench, to_parameters(calibration))
+        after = _left_out(bench, attribution, calibration)
+    result = Diagnosis(
+        calibration, augmented, bench, attribution, "validate" if validate else "left_out_episodes",
+        judges, before, after, after_rests, before_rests, time.monotonic() - begin,
+    )  # fmt: skip
+    sources = tuple(Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest()) for log in fit_logs)
+    result.calibration = _with_provenance(result, sources)
+    progress("done", 1.0)
+    return result
+
+
+def _left_out(bench: Bench, attribution: Attribution, calibration: Calibration) -> Errors:
+    """Errors of each quarter of the episodes with parameters that the other quarters gave."""
+    fold = np.arange(bench.episodes) % _FOLDS
+    parts: list[Errors] = []
+    of = errors_of if bench.has_reference else innovation_errors
+    for number in range(_FOLDS):
+        values: dict[Knob, float] = {}
+        for channel in bench.channels:
+            own = [knob for knob in attribution.knobs if knob.channel == channel]
+            if not any(attribution.values[knob] for knob in own):
+                continue
+            table = np.column_stack([attribution.regressors[knob] for knob in own])
+            restored = attribution.residual[channel] + table @ np.array([attribution.values[knob] for knob in own])
+            moments = Moments.of(table, restored, bench.episode[channel], bench.episodes)
+            kept = Moments(moments.products[fold != number], moments.counts[fold != number])
+            values.update(zip(own, fit(kept, attribution.penalties[channel]).values, strict=True))
+        parameters = to_parameters(calibrated(calibration, values)) if values else to_parameters(calibration)
+        parts.append(joined([of(trial, estimate(trial.log.samples, parameters)) for trial in bench.trials]))
+    result = parts[0]
+    for number in range(1, _FOLDS):
+        result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
+        result.counts[:, :, fold == number] = parts[number].counts[:, :, fold == number]
+    return result
+
+
+def _with_provenance(diagnosis: Diagnosis, sources: tuple[Source, ...]) -> Calibration:
+    old = diagnosis.calibration.provenance
+    sigmas = dict(old.sigmas) if old else {}
+    for knob, sigma in diagnosis.attribution.sigmas.items():
+        if diagnosis.attribution.values.get(knob, 0.0) != 0.0 and np.isfinite(sigma):
+            sigmas[f"effects.{knob.name}" if _of_effect(knob) else knob.name] = float(sigma)
+    figures = dict(old.figures) if old else {}
+    for path in diagnosis.after.names:
+        figures[f"diagnose.{diagnosis.judged_on}.{path}_rmse_N"] = diagnosis.after.rmse(path)
+    provenance = Provenance(
+        date=datetime.now(UTC).date().isoformat(),
+        tool=f"emb-daemon diagnose {__version__}",
+        campaign=old.campaign if old else "",
+        logs=(old.logs if old else ()) + sources,
+        figures={name: value for name, value in figures.items() if np.isfinite(value)},
+        sigmas=sigmas,
+    )
+    return msgspec.structs.replace(diagnosis.calibration, provenance=provenance)
+
+
+def log_paths(paths: Sequence[Path]) -> list[Path]:
+    """Check that logs exist before hours are spent on the first.
+
+    Raises:
+        InputError: one does not.
+    """
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file")
+    return list(paths)

@@ -1,0 +1,162 @@
+"""Statistics over episodes: least squares, the jackknife's covariance, and what episodes left out say.
+
+A t-test over samples, BIC or AIC count 250 opinions a second and find effects in noise. Here an episode has one voice: the
+covariance comes from leaving episodes out one by one (the jackknife, CR3 of Bell and McCaffrey, Survey Methodology 28,
+2002, which is on the safe side with few clusters), the degrees of freedom from the number of episodes that really carry
+the regressor (Carter, Schnepel, Steigerwald, Rev. Economics and Statistics 99, 2017), and the gain from episodes that took
+no part in the fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Second moments of regressors and residual, one matrix for each episode: all that the statistics below need.
+
+    Attributes:
+        products: shape (episodes, columns + 1, columns + 1); the residual is the last column.
+        counts: samples in each episode.
+    """
+
+    products: np.ndarray
+    counts: np.ndarray
+
+    @classmethod
+    def of(cls, regressors: np.ndarray, residual: np.ndarray, episode: np.ndarray, episodes: int) -> "Moments":
+        """``regressors`` (N, columns), ``residual`` (N,), ``episode`` (N,) ascending."""
+        table = np.column_stack([regressors, residual]) if regressors.size else residual[:, None]
+        bounds = np.searchsorted(episode, np.arange(episodes + 1))
+        products = np.zeros((episodes, table.shape[1], table.shape[1]))
+        for index in range(episodes):
+            part = table[bounds[index] : bounds[index + 1]]
+            products[index] = part.T @ part
+        return cls(products, np.diff(bounds))
+
+    def select(self, columns: list[int]) -> "Moments":
+        """The same for some of the columns."""
+        keep = np.array([*columns, self.products.shape[1] - 1])
+        return Moments(self.products[:, keep[:, None], keep[None, :]], self.counts)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Least squares with everything that leaving episodes out says of it.
+
+    Attributes:
+        values: estimates, shape (columns,).
+        covariance: by the jackknife over episodes.
+        left_out: squared error of each episode, predicted from all others, shape (episodes,).
+        without: estimates without each episode, shape (episodes, columns).
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    left_out: np.ndarray
+    without: np.ndarray
+
+
+def fit(moments: Moments, penalty: np.ndarray) -> Fit:
+    """Penalised least squares; ``penalty`` is added to the diagonal of the normal equations, shape (columns,)."""
+    products = moments.products
+    columns = products.shape[1] - 1
+    total = products.sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(total)[:columns], 1e-300))
+    ridge = np.diag(penalty / scale**2 + 1e-10)
+    outer = np.outer(scale, scale)
+
+    def solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(normal / outer + ridge, right / scale) / scale
+
+    if not columns:
+        return Fit(np.zeros(0), np.zeros((0, 0)), products[:, -1, -1].copy(), np.zeros((len(products), 0)))
+    values = solve(total[:-1, :-1], total[:-1, -1])
+    without = np.empty((len(products), columns))
+    for index, part in enumerate(products):
+        without[index] = solve(total[:-1, :-1] - part[:-1, :-1], total[:-1, -1] - part[:-1, -1]) if part.any() else values
+    left_out = (
+        products[:, -1, -1]
+        - 2.0 * np.einsum("gi,gi->g", without, products[:, :-1, -1])
+        + np.einsum("gi,gij,gj->g", without, products[:, :-1, :-1], without)
+    )
+    informative = products[:, -1, -1] > 0.0
+    count = max(int(informative.sum()), 2)
+    deviation = without[informative] - values
+    covariance = (count - 1) / count * deviation.T @ deviation
+    return Fit(values, covariance, left_out, without)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the episodes say of a candidate.
+
+    Attributes:
+        p_value: of "all its parameters are zero".
+        gain: fall of the squared error summed over left-out episodes.
+        gains: the same, episode by episode.
+        clusters: effective number of episodes that carry it.
+        values, sigmas: of its parameters.
+        alignment: cosine between the candidate's regressors and what the nuisances span, largest of its directions.
+    """
+
+    p_value: float
+    gain: float
+    gains: np.ndarray
+    clusters: float
+    values: np.ndarray
+    sigmas: np.ndarray
+    alignment: float
+
+
+NOT_EXCITED = Verdict(1.0, 0.0, np.zeros(0), 0.0, np.zeros(0), np.zeros(0), 1.0)
+
+
+def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray) -> Verdict:
+    """Test ``candidate`` columns with ``nuisances`` columns free; ``penalty`` as in `fit`, for all columns."""
+    from scipy.stats import f
+
+    base = moments.select(nuisances)
+    both = moments.select(nuisances + candidate)
+    total = both.products.sum(axis=0)
+    first, count = len(nuisances), len(candidate)
+    own = np.diag(total)[first : first + count]
+    if np.any(own <= 0.0) or not np.isfinite(total).all():
+        return NOT_EXCITED
+    fitted = fit(both, penalty[nuisances + candidate])
+    plain = fit(base, penalty[nuisances])
+    gains = plain.left_out - fitted.left_out
+    # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
+    normal = total[:first, :first] + np.diag(penalty[nuisances])
+    shadow = np.linalg.lstsq(normal, total[:first, first:-1], rcond=1e-12)[0] if first else np.zeros((0, count))
+    carried = np.empty((len(both.products), count, count))
+    for index, part in enumerate(both.products):
+        cross = shadow.T @ part[:first, first:-1]
+        carried[index] = part[first:-1, first:-1] - cross - cross.T + shadow.T @ part[:first, :first] @ shadow
+    rest = carried.sum(axis=0)
+    size = np.sqrt(own)
+    kept = np.linalg.eigvalsh(rest / np.outer(size, size))
+    alignment = float(np.sqrt(np.clip(1.0 - kept.max() / count if count > 1 else 1.0 - kept[0], 0.0, 1.0)))
+    if kept[-1] <= 1e-8:
+        return NOT_EXCITED
+    inverse = np.linalg.pinv(rest, rcond=1e-10)
+    leverage = np.maximum(np.einsum("gij,ji->g", carried, inverse), 0.0)
+    clusters = float(leverage.sum() ** 2 / np.maximum((leverage**2).sum(), 1e-300))
+    values, covariance = fitted.values[first:], fitted.covariance[first:, first:]
+    freedom = clusters - count
+    if freedom < 2.0:
+        return Verdict(1.0, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+    statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
+    p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
+    return Verdict(p_value, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+
+
+def false_discovery(p_values: np.ndarray) -> np.ndarray:
+    """q-values of Benjamini and Hochberg (J. Royal Statistical Society B 57, 1995)."""
+    order = np.argsort(p_values)
+    count = len(p_values)
+    ranked = p_values[order] * count / np.arange(1, count + 1)
+    result = np.empty(count)
+    result[order] = np.minimum.accumulate(ranked[::-1])[::-1]
+    return np.minimum(result, 1.0)

@@ -1,0 +1,81 @@
+"""Signals that a residual may depend on, and smooth functions of them: what is left is judged without a model."""
+
+import numpy as np
+
+from emb_daemon.diagnose.channels import Bench, wheel_angle
+from emb_daemon.offline import estimate
+
+#: Knots of a smooth function of one signal.
+_KNOTS = 7
+_APPLIED_N = 150.0
+_CYCLE_S = 0.004
+
+
+def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
+    """Measured and estimated signals at every sample of all logs, under the names of the report."""
+    columns: dict[str, list[np.ndarray]] = {}
+    for trial in bench.trials:
+        samples = trial.log.samples
+        estimates = estimate(samples, parameters)
+        # The estimate, not the reference: the reference's noise is part of the residual.
+        force = estimates["stiffness_force"]
+        wheel = np.where(samples["has_wheel_speed"], np.nan_to_num(samples["wheel_speed"]), 0.0)
+        torque = np.nan_to_num(trial.brake_torque_Nm)
+        time = trial.log.time_s
+        applied = force > _APPLIED_N
+        power = np.maximum(torque, 0.0) * wheel
+        dt = samples["dt"]
+        here = {
+            "brake_torque": torque,
+            "disc_speed": wheel,
+            "disc_angle": np.mod(wheel_angle(samples), 2.0 * np.pi),
+            "motor_angle": samples["angle"] - samples["angle"][0],
+            "motor_speed": samples["speed"],
+            "motor_acceleration": _around(samples["speed"], np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])) / (6.0 * _CYCLE_S),
+            "current": _around(np.nan_to_num(samples["current_q"]), np.full(6, 0.5)),
+            "clamp_force": force,
+            "pad_temperature": np.nan_to_num(estimates["mean"].mean(axis=1), nan=20.0),
+            "disc_temperature": np.nan_to_num(estimates["disc"], nan=20.0),
+            "caliper_temperature": np.where(samples["has_thermocouple"], np.nan_to_num(samples["caliper"]), 20.0),
+            "time_clamped": _time_since(time, applied),
+            "time_since_last_clamp": _time_since(time, ~applied),
+            "energy": np.cumsum(power * dt),
+        }
+        for name, column in here.items():
+            columns.setdefault(name, []).append(column)
+    return {name: np.concatenate(parts) for name, parts in columns.items()}
+
+
+def _around(signal: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted thirds of the neighbours two to four samples away, three on each side: without the sample's own noise."""
+    padded = np.pad(signal, 4, mode="edge")
+    count = len(signal)
+    offsets = (-4, -3, -2, 2, 3, 4)
+    return sum(w * padded[4 + o : 4 + o + count] for w, o in zip(weights, offsets, strict=True)) / 3.0
+
+
+def _time_since(time: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Seconds for which ``active`` has held, 0 where it does not."""
+    begins = np.flatnonzero(active & ~np.concatenate([[False], active[:-1]]))
+    if not len(begins):
+        return np.zeros(len(time))
+    last = begins[np.maximum(np.searchsorted(begins, np.arange(len(time)), side="right") - 1, 0)]
+    return np.where(active, time - time[last], 0.0)
+
+
+def smooth_basis(name: str, signal: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Columns that span smooth functions of a signal, alone and in proportion to the force; none for a constant one."""
+    if name == "disc_angle":
+        shape = np.column_stack([part(order * signal) for order in (1, 2, 3) for part in (np.cos, np.sin)])
+    else:
+        knots = np.unique(np.quantile(signal, np.linspace(0.0, 1.0, _KNOTS)))
+        wide = np.linspace(signal.min(), signal.max(), 4)
+        knots = np.unique(np.concatenate([knots, wide]))
+        if len(knots) < 2 or knots[-1] - knots[0] <= 1e-9 * max(abs(knots[-1]), 1.0):
+            return np.zeros((len(signal), 0))
+        # Knots that nearly coincide would leave a column to a handful of samples.
+        apart = np.concatenate([[True], np.diff(knots) > 0.02 * (knots[-1] - knots[0])])
+        knots = knots[apart]
+        shape = np.column_stack([np.interp(signal, knots, row) for row in np.eye(len(knots))[1:]])
+    scale = np.sqrt(np.mean(force**2))
+    return np.column_stack([shape, shape * (force / scale)[:, None]]) if scale > 0.0 else shape

@@ -1,0 +1,21 @@
+"""Offset of the current measurement."""
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+
+
+@njit
+def term(p):
+    """Current in A that flows but is not measured."""
+    return p.offset_A
+
+
+EFFECT = Effect(
+    name="current_offset",
+    path="torque",
+    parameters=(Parameter("offset_A", "A", -20.0, 20.0, 0.3, "current that flows but is not measured"),),
+    equation="I → I + I₀",
+    source="Hall sensors: offset 0.5 to 1 % of range",
+    signal="current",
+    manoeuvre="slow strokes both ways in the clearance: an offset has one sign, friction two",
+)

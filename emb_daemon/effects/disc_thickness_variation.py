@@ -1,0 +1,87 @@
+"""Disc thickness variation: the disc is a few micrometres thicker at one side than at the other.
+
+The wheel angle comes from the wheel's pulse counter, carried on by the wheel speed between its messages. Its zero is where
+the counter was at power-on, which is arbitrary, so each order has a cosine and a sine.
+"""
+
+from math import cos, pi, sin
+
+import numpy as np
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+
+ORDERS = 4
+PULSES_PER_TURN = 96
+PULSE_MODULO = 4096
+#: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
+_CORRECTION = 0.2
+
+STATE = np.dtype([("known", "?"), ("count", "f8"), ("turned", "f8")], align=True)
+
+
+@njit
+def track(s, pulse, wheel_speed, dt):
+    """Wheel angle in rad: carried on by ``wheel_speed`` rad/s, corrected when the pulse counter has moved."""
+    width = 2.0 * pi / PULSES_PER_TURN
+    if not s.known:
+        s.known = True
+        s.count = pulse
+        s.turned = (pulse + 0.5) * width
+        return s.turned
+    s.turned += wheel_speed * dt
+    moved = (pulse - s.count % PULSE_MODULO + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
+    if moved != 0.0:
+        s.count += moved
+        error = (s.count + 0.5) * width - s.turned
+        # More than two pulses off is no interpolation error: frames were missing.
+        s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
+    return s.turned
+
+
+@njit
+def term(p, s, pulse, has_pulse, wheel_speed, dt):
+    """Disc thickness in m above its mean, where the pads stand."""
+    if (
+        p.order_1_cosine_um == 0.0
+        and p.order_1_sine_um == 0.0
+        and p.order_2_cosine_um == 0.0
+        and p.order_2_sine_um == 0.0
+        and p.order_3_cosine_um == 0.0
+        and p.order_3_sine_um == 0.0
+        and p.order_4_cosine_um == 0.0
+        and p.order_4_sine_um == 0.0
+    ):
+        return 0.0
+    if not has_pulse:
+        s.known = False
+        return 0.0
+    angle = track(s, pulse, wheel_speed, dt)
+    return 1e-6 * (
+        p.order_1_cosine_um * cos(angle)
+        + p.order_1_sine_um * sin(angle)
+        + p.order_2_cosine_um * cos(2.0 * angle)
+        + p.order_2_sine_um * sin(2.0 * angle)
+        + p.order_3_cosine_um * cos(3.0 * angle)
+        + p.order_3_sine_um * sin(3.0 * angle)
+        + p.order_4_cosine_um * cos(4.0 * angle)
+        + p.order_4_sine_um * sin(4.0 * angle)
+    )
+
+
+EFFECT = Effect(
+    name="disc_thickness_variation",
+    path="stiffness",
+    parameters=tuple(
+        Parameter(f"order_{order}_{part}_um", "µm", -60.0, 60.0, 10.0, f"{part} of {order} per turn")
+        for order in range(1, ORDERS + 1)
+        for part in ("cosine", "sine")
+    ),
+    equation="θ → θ + Σ (aₙ cos nφ + bₙ sin nφ) / γ",
+    source="Jacobsson, Aspects of disc brake judder, Proc. IMechE D 217, 2003: 10 to 20 µm, orders 1 to 4 when cold",
+    state=STATE,
+    signal="disc_angle",
+    manoeuvre="hold the clamp force on a turning wheel for several turns",
+    placebo="wheel_pulse",
+    forbidden="standing",
+)

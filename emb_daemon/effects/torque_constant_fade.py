@@ -1,0 +1,37 @@
+"""Torque constant falling with the temperature of the motor's magnets.
+
+The magnets' temperature is not measured. It lies between the caliper's, which is, and the disc's, which heats the motor
+from the other side: a share says where.
+"""
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+
+#: Temperature at which torque constants are stated.
+RATED_C = 25.0
+
+
+@njit
+def term(p, caliper, has_caliper, disc, has_disc):
+    """Relative change of the torque constant."""
+    if p.fade_per_K == 0.0 or not has_caliper:
+        return 0.0
+    temperature = caliper + (p.disc_share * (disc - caliper) if has_disc else 0.0)
+    return -p.fade_per_K * (temperature - RATED_C)
+
+
+EFFECT = Effect(
+    name="torque_constant_fade",
+    path="torque",
+    parameters=(
+        Parameter("fade_per_K", "1/K", -0.005, 0.02, 0.001, "relative loss of torque constant"),
+        Parameter(
+            "disc_share", "1", 0.0, 1.0, 0.0, "where the magnets' temperature lies between caliper and disc", (0.0, 1.0)
+        ),
+    ),
+    equation="K_m → K_m [1 − κ (T_caliper + w (T_disc − T_caliper) − 25 °C)]",
+    source="NdFeB −0.09 to −0.12 %/K: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2",
+    signal="caliper_temperature",
+    manoeuvre="the same strokes with a cold and with a hot caliper",
+    placebo="caliper",
+)

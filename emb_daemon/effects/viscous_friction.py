@@ -1,0 +1,21 @@
+"""Friction proportional to motor speed: lubricant, bearings, eddy currents."""
+
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.jit import njit
+
+
+@njit
+def term(p, mean_speed):
+    """Torque in N m that it takes."""
+    return p.viscous_Nms_per_rad * mean_speed
+
+
+EFFECT = Effect(
+    name="viscous_friction",
+    path="torque",
+    parameters=(Parameter("viscous_Nms_per_rad", "N·m·s/rad", -0.01, 0.05, 1e-4, "torque per motor speed"),),
+    equation="T_f → T_f + b ω",
+    source="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994",
+    signal="motor_speed",
+    manoeuvre="strokes at several constant speeds",
+)
