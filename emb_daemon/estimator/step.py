@@ -250,7 +250,10 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     s.force -= s.slope * x[1]
     x[1] = 0.0
     h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
-    out.force = max(s.force + spread * x[0], 0.0)
+    out.force = s.force + spread * x[0]
+    # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
+    if out.force < 0.0:
+        out.force = 0.0
     out.sigma = sqrt(variance_along(P, h))
 
 

@@ -1,0 +1,212 @@
+"""The loop on a bus inside this process: what goes in comes out, whatever the machine does to it."""
+
+import os
+import shutil
+import socket
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.estimator import records
+from emb_daemon.pipeline import CYCLE_NS, Pipeline
+from emb_daemon.plant.car import Car
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import city_drive, commands_of
+from emb_daemon.runtime.daemon import Daemon, Pacer
+from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.runtime.systemd import ServiceManager
+from emb_daemon.wire.frames import FRAME
+
+CONFIG = Path(__file__).parent.parent / "config"
+CLAMP_FORCE_FL = 0x200
+FAULT, NOT_AVAILABLE = 2, 15
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Setup:
+    for name in ("emb.yaml", "calibration.yaml"):
+        shutil.copy(CONFIG / name, tmp_path)
+    return Setup(tmp_path / "emb.yaml")
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[np.ndarray, np.ndarray]:
+    """Two seconds of the simulated car, one corner: frames, and the index of each tick's first frame."""
+    plant = np.array([plant_from_calibration(load_calibration(CONFIG / "calibration.yaml"), 0)])
+    schedule = city_drive().first(2.0)
+    frames, _ = Car(plant, ("FL",), start_ns=1_000_000_000).run(commands_of(schedule, ("FL",)), schedule.drives)
+    return frames, np.flatnonzero(frames["can_id"] == 0x100)
+
+
+class Running:
+    """A daemon in a thread, and the other end of its bus."""
+
+    def __init__(self, setup: Setup, manager: ServiceManager | None = None):
+        self.bus, theirs = socket_pair()
+        self.daemon = Daemon(setup, theirs, manager)
+        self.daemon.warm_up()
+        self.heard: list[np.ndarray] = []
+        self._thread = threading.Thread(target=self.daemon.run)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.daemon.stop()
+        self._thread.join(10)
+        assert not self._thread.is_alive(), "the loop did not end"
+        self.listen()
+        self.bus.close()
+
+    def listen(self) -> np.ndarray:
+        self.heard.append(self.bus.drain().copy())
+        return np.concatenate(self.heard)
+
+    def wait_for(self, condition, seconds: float = 20.0) -> np.ndarray:
+        """Until ``condition(all frames heard)``; generous, because the machine is shared."""
+        end = time.monotonic() + seconds
+        while not condition(frames := self.listen()):
+            assert time.monotonic() < end, "not heard in time"
+            time.sleep(0.002)
+        return frames
+
+
+def answers(frames: np.ndarray) -> np.ndarray:
+    """Payloads of FL's clamp force frames that answer a resolver sample."""
+    mine = frames[frames["can_id"] == CLAMP_FORCE_FL]
+    source = (mine["data"] >> np.uint64(52)) & np.uint64(15)
+    return mine["data"][source < records.PREDICTED] >> np.uint64(16)
+
+
+def status_of(frames: np.ndarray) -> set[int]:
+    """Status values of FL's clamp force frames."""
+    mine = frames["data"][frames["can_id"] == CLAMP_FORCE_FL]
+    return set(((mine >> np.uint64(12)) & np.uint64(15)).tolist())
+
+
+def test_every_sample_is_answered_as_the_pipeline_answers_it(setup: Setup, drive):
+    frames, samples = drive
+    pipeline = Pipeline(setup.parameters.copy(), ("FL",))
+    pipeline.begin(int(frames["time_ns"][0]))
+    _, count = pipeline.consume(frames)
+    expected = answers(pipeline.broadcast(count).copy())
+    with Running(setup) as running:
+        for first, last in zip(samples, [*samples[1:], len(frames)], strict=True):
+            running.bus.send(frames[first:last])
+            running.listen()
+            time.sleep(0.004)
+        heard = running.wait_for(lambda frames: len(answers(frames)) >= len(expected))
+    np.testing.assert_array_equal(answers(heard), expected)
+
+
+def test_silence_is_told_from_the_first_tick(setup: Setup):
+    with Running(setup) as running:
+        frames = running.wait_for(lambda frames: np.sum(frames["can_id"] == CLAMP_FORCE_FL) > 3)
+    data = frames["data"][frames["can_id"] == CLAMP_FORCE_FL]
+    assert status_of(frames) == {NOT_AVAILABLE}, "a force that nobody knows"
+    assert set((data >> np.uint64(52)) & np.uint64(15)) == {records.INVALID}
+
+
+def test_a_good_calibration_is_taken_and_a_bad_one_is_not(setup: Setup, tmp_path: Path):
+    file = tmp_path / "calibration.yaml"
+    text = file.read_text()
+    with Running(setup) as running:
+        before = running.daemon.pipeline.parameters.copy()
+        file.write_text(text.replace("format: 1", "format: 7"))
+        running.daemon.reload()
+        time.sleep(0.5)
+        assert running.daemon.pipeline.parameters.tobytes() == before.tobytes()
+        ticks = running.daemon.ticks
+        file.write_text(text)
+        calibration = load_calibration(file)
+        thinner = type(calibration)(
+            **{name: getattr(calibration, name) for name in calibration.__struct_fields__} | {"pad_thickness_mm": 9.0}
+        )
+        save_calibration(thinner, file)
+        running.daemon.reload()
+        end = time.monotonic() + 20
+        while running.daemon.pipeline.parameters["curve"][0, 0] == before["curve"][0, 0]:
+            assert time.monotonic() < end, "the new calibration was not taken"
+            time.sleep(0.01)
+        assert running.daemon.ticks > ticks, "the loop stood still meanwhile"
+
+
+def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp_path: Path):
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(path)
+        manager.settimeout(20)
+        environment = {"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "200000", "WATCHDOG_PID": str(os.getpid())}
+        with Running(setup, ServiceManager(environment)):
+            assert manager.recv(4096).startswith(b"READY=1")
+            assert manager.recv(4096) == b"WATCHDOG=1"
+            assert manager.recv(4096) == b"WATCHDOG=1"
+        manager.setblocking(False)
+        messages = []
+        while True:
+            try:
+                messages.append(manager.recv(4096))
+            except BlockingIOError:
+                break
+        assert messages[-1] == b"STOPPING=1"
+
+
+def test_an_estimate_that_is_no_number_is_a_fault_and_not_pinged(setup: Setup, drive):
+    setup.parameters["relaxation_time"] = np.nan
+    frames, samples = drive
+    with Running(setup) as running:
+        running.bus.send(frames[: samples[50]])
+        running.wait_for(lambda frames: FAULT in status_of(frames))
+        pings = []
+        running.daemon._manager.notify = lambda *assignments: pings.extend(assignments)
+        running.daemon._ping()
+    assert "WATCHDOG=1" not in pings
+
+
+def test_frames_beyond_one_batch_are_all_sent_or_counted():
+    near, far = socket_pair()
+    frames = np.zeros(3000, FRAME)
+    frames["can_id"], frames["length"] = 0x123, 8
+    frames["data"] = np.arange(3000)
+    near.send(frames)
+    heard = np.concatenate([far.drain().copy() for _ in range(4)])
+    assert len(heard) + near.unsent == 3000
+    np.testing.assert_array_equal(heard["data"], frames["data"][: len(heard)])
+    assert np.all(np.diff(heard["time_ns"]) >= 0)
+    near.close()
+    far.close()
+
+
+class TestPacer:
+    def test_without_inputs_it_ticks_freely(self):
+        pacer = Pacer(0)
+        assert pacer.next_wake(1) == CYCLE_NS
+
+    def test_it_wakes_just_after_a_sample_is_due(self):
+        pacer = Pacer(1_000_000)
+        pacer.arrived(0, 1_000_000)
+        assert 1_000_000 + CYCLE_NS < pacer.next_wake(1_000_001) < 1_000_000 + CYCLE_NS + 500_000
+
+    def test_corners_that_come_together_are_answered_together(self):
+        pacer = Pacer(1_000_000)
+        pacer.arrived(0, 1_000_000)
+        pacer.arrived(1, 1_100_000)
+        assert pacer.next_wake(1_100_001) >= 1_100_000 + CYCLE_NS
+
+    def test_corners_apart_are_answered_apart(self):
+        pacer = Pacer(1_000_000)
+        pacer.arrived(0, 1_000_000)
+        pacer.arrived(1, 3_000_000)
+        assert pacer.next_wake(3_000_001) < 2_000_000 + CYCLE_NS
+
+    def test_a_lost_sample_does_not_stop_the_ticks(self):
+        pacer = Pacer(0)
+        pacer.arrived(0, 0)
+        pacer.last_tick_ns = 9 * CYCLE_NS
+        assert pacer.next_wake(9 * CYCLE_NS + 1) <= 10 * CYCLE_NS + 500_000
