@@ -1,0 +1,1 @@
+"""Whether a machine can hold the loop, measured on that machine."""
