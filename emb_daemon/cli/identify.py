@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.errors import InputError
     from emb_daemon.identify.campaign import load_campaign
     from emb_daemon.identify.run import identify
-    from emb_daemon.identify.table import Line, table
+    from emb_daemon.identify.table import table
 
     if not arguments.output.parent.is_dir():
         raise InputError(f"{arguments.output}: no such folder: {arguments.output.parent}")
@@ -37,13 +37,20 @@ def run(arguments: argparse.Namespace) -> int:
             build(result).write(arguments.report / "report.html")
     except OSError as error:
         raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
-    lines = table(result)
-    for line in lines:
-        verdict = {True: "met", False: "MISSED", None: ""}[line.met]
-        ours, thesis = Line.spread(line.ours), Line.spread(line.thesis)
-        print(f"{line.judged_on:<72} thesis form {thesis:>15}   ours {ours:>15} {line.unit:<3} {line.target:<28} {verdict}")
+    _print(table(result))
     print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s")
     return 0
+
+
+def _print(lines) -> None:
+    rows = [("RMSE on logs that fitted nothing", "", "thesis reports", "thesis form", "ours", "to reach", "")]
+    for line in lines:
+        verdict = {True: "met", False: "MISSED", None: ""}[line.met]
+        thesis, ours = line.spread(line.thesis), line.spread(line.ours)
+        rows.append((line.judged_on, line.unit, line.thesis_reports, thesis, ours, line.target, verdict))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows if lines else ():
+        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _with_progress(work):

@@ -43,6 +43,8 @@ _ONE_CYCLE_S = 1.5 * _CYCLE_S
 TOUCHING_N = 200.0
 #: Wheel speed from which pads heat: the sensor's noise at standstill does not.
 TURNING_RAD_PER_S = 0.5
+#: Doubt of the pads' temperature, after a start with hot pads, that is reported.
+_DOUBTED_K = 10.0
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
 _HEAT_STEP_S = 0.046
 #: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
@@ -292,7 +294,7 @@ def step(s, p, m, out):
     out.mode = RUNNING
     out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
     reasons = OUT_OF_RANGE if moved_zero else 0
-    if not s.temperature_known or s.temperature_doubt > 2.0 * p.thermal.sigma:
+    if not s.temperature_known or s.temperature_doubt > _DOUBTED_K:
         reasons |= TEMPERATURE_UNCERTAIN
     if out.contact_sigma > 0.5:
         reasons |= CONTACT_UNCERTAIN

@@ -25,12 +25,12 @@ _FINE_S = 0.1
 _OFTEN_S = 0.25
 #: Time over which backing plate readings are averaged: they creep, their noise does not.
 _PLATE_WINDOW_S = 1.0
+#: Grids beyond this, of logs that last for hours, are stepped whole.
+_COARSE_S = 0.5
 #: Time between residuals. The model's errors, of the size of a thermocouple's noise (0.3 K), last for about a minute: each
 #: residual is worth a twelfth of an independent one, which this standard deviation makes it.
 _RESIDUAL_EVERY_S = 5.0
 _RESIDUAL_SIGMA_K = 1.0
-#: Residuals beyond this many standard deviations count less and less.
-_OUTLYING = 1.0
 #: Pads that rise by less tell nothing.
 _LEAST_RISE_K = 30.0
 
@@ -256,7 +256,7 @@ def simulate(parameters: np.ndarray, r: Recording, torque_known: bool = True, ev
         Shape (rows, 13), degC: the nine of `Recording.measured`, both pad surfaces, both pad means.
     """
     out = np.empty((-(-len(r.power) // every), 13))
-    longest = max(LONGEST_S, r.step_s) if r.step_s > 2.0 * LONGEST_S else LONGEST_S
+    longest = LONGEST_S if r.step_s <= _COARSE_S else r.step_s
     inputs = (r.inner, r.outer, r.ambient, r.power, torque_known, r.touching, r.speed, r.force)
     _simulate(parameters, r.step_s, longest, every, *inputs, out)
     return out
@@ -380,6 +380,7 @@ def fit_heat(recordings: list[Recording], nominal: Nominal, progress=lambda shar
 
     def residual(r, every):
         known = np.isfinite(r.measured[:, ::every].T)
+        known[:, :8] &= np.tile(np.array(DEPTHS_M) <= nominal.pad_thickness_m, 2)
 
         def of(x):
             nonlocal calls
@@ -387,9 +388,7 @@ def fit_heat(recordings: list[Recording], nominal: Nominal, progress=lambda shar
             progress(1.0 - np.exp(-calls / (100.0 * len(recordings))))
             for u, value in zip(UNKNOWNS, values(x), strict=True):
                 _write(p, u, value)
-            error = (simulate(p, r, every=every)[:, :9] - r.measured[:, ::every].T)[known] / _RESIDUAL_SIGMA_K
-            bent = _OUTLYING * np.sqrt(2.0 * (np.sqrt(1.0 + (error / _OUTLYING) ** 2) - 1.0))
-            return np.copysign(bent, error)
+            return (simulate(p, r, every=every)[:, :9] - r.measured[:, ::every].T)[known] / _RESIDUAL_SIGMA_K
 
         return of
 
@@ -402,7 +401,7 @@ def fit_heat(recordings: list[Recording], nominal: Nominal, progress=lambda shar
     for u, value in zip(UNKNOWNS, values(x), strict=True):
         _write(p, u, value)
     found = p.copy()
-    deviation, formal = _jackknife(blocks, x, (x <= low) | (x >= high))
+    deviation, formal = _jackknife(blocks, x)
     unit = np.where(linear, scale, values(x))
     return HeatFit(
         parameters=found,
@@ -411,7 +410,7 @@ def fit_heat(recordings: list[Recording], nominal: Nominal, progress=lambda shar
     )
 
 
-def _jackknife(blocks: list[Block], x: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _jackknife(blocks: list[Block], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(standard deviations by leaving out groups of residuals, formal ones); the last block, the prior, always stays in."""
     count = len(x)
     groups, normals, gradients = [], [], []

@@ -40,6 +40,9 @@ _TORQUE = (
     ("load_m_per_rad", "load friction μ", 1e6, "µm/rad"),
     ("presliding_angle_rad", "presliding angle", 1e3, "mrad"),
 )
+#: Many measured points behind a line; and few of them.
+_CLOUD = Style("#aab4c0", mode="markers", size=3.0)
+_POINTS = Style("#1d2430", mode="markers")
 _EFFECTS = {
     (): "one lag alone (thesis)",
     ("second_relaxation",): "+ second relaxation",
@@ -125,7 +128,7 @@ def _curves(page: Page, result: Identification) -> None:
                 continue
             x = log.samples["angle"] - log.samples["angle"][0] - clearance
             thin = slice(None, None, max(len(x) // 700, 1))
-            force.append(Trace("measured", x[thin], 1e-3 * log.force_N[thin], Style("#c9d0d8", mode="markers")))
+            force.append(Trace("measured", x[thin], 1e-3 * log.force_N[thin], _CLOUD))
             known = np.isfinite(log.force_N)
             error = result.fit.residuals[str(log.path)]
             residual.append(Trace(name, x[known][thin], error[thin], Style(colour, 0.9)))
@@ -329,7 +332,7 @@ def _frequency(page: Page, result: Identification) -> None:
                     "Magnitude",
                     "dB",
                     [
-                        Trace("measured", f, 20.0 * np.log10(np.abs(found.measured)), Style("#1d2430", mode="markers")),
+                        Trace("measured", f, 20.0 * np.log10(np.abs(found.measured)), _POINTS),
                         Trace("first order (thesis)", f, 20.0 * np.log10(found.fitted), THESIS),
                         Trace("identified dynamics", f, 20.0 * np.log10(np.abs(found.model)), MODEL),
                     ],
@@ -338,7 +341,7 @@ def _frequency(page: Page, result: Identification) -> None:
                     "Phase",
                     "°",
                     [
-                        Trace("measured", f, np.degrees(np.angle(found.measured)), Style("#1d2430", mode="markers")),
+                        Trace("measured", f, np.degrees(np.angle(found.measured)), _POINTS),
                         Trace("first order (thesis)", f, phase, THESIS),
                         Trace("identified dynamics", f, np.degrees(np.angle(found.model)), MODEL),
                     ],
@@ -442,7 +445,7 @@ def _fusion(page: Page, result: Identification) -> None:
     )
     rows = []
     for judged in result.judged:
-        for form, figures in (("thesis form", judged.thesis), ("ours", judged.ours)):
+        for form, figures in (("thesis", judged.thesis), ("ours", judged.ours)):
             inside = f"{100 * figures.inside_two_sigma:.1f}"
             state = "" if form != "ours" else PASS if 0.9 <= figures.inside_two_sigma <= 0.99 else FAIL
             rows.append(
@@ -474,8 +477,8 @@ def _thermal(page: Page, result: Identification) -> None:
     section = page.section("Pads and disc: heat")
     if result.thermal is None:
         section.text(
-            "No log heats the pads: conductivity, specific heat and disc are the datasheet's nominal values, and the force does "
-            "not follow temperature. Needed: braking with thermocouples in the pads."
+            "No log heats the pads: conductivity, specific heat and disc are the datasheet's nominal values, and the force "
+            "does not follow temperature. Needed: braking with thermocouples in the pads."
         )
         return
     found = result.thermal
@@ -484,7 +487,7 @@ def _thermal(page: Page, result: Identification) -> None:
         "brake torque sensor; without it the heat comes from the estimated force and the friction map, as in a car."
     )
     rows = []
-    for key, value in found.thermal_values().items() if hasattr(found, "thermal_values") else _thermal_values(found):
+    for key, value in _thermal_values(found):
         rows.append([key, _value(value, found.sigmas.get(f"thermal.{key}"))])
     section.table(["parameter", "value"], rows)
     section.items(list(found.notes))
@@ -494,8 +497,7 @@ def _thermal(page: Page, result: Identification) -> None:
     _cooling(section, found.plots.get("disc_cooling"))
     _friction(section, found.plots.get("friction"))
     _softening(section, found.plots.get("softening"), found.plots.get("window"))
-    figures = {**found.figures}
-    section.table(["figure on logs that fitted nothing", "value"], [[k, f"{v:.3g}"] for k, v in figures.items()])
+    section.table(["figure on logs that fitted nothing", "value"], [[k, f"{v:.3g}"] for k, v in found.figures.items()])
     section.table(["residual of what was fitted", "value"], [[k, f"{v:.3g}"] for k, v in found.residuals.items()])
 
 
@@ -513,10 +515,7 @@ def _temperatures(section, name, data) -> None:
     panels = []
     colours = shades(4)[::-1]
     for side, offset in (("Inner pad", 0), ("Outer pad", 4)):
-        traces = []
-        for index, depth in enumerate(_DEPTHS):
-            if offset + index < len(data["measured"]):
-                traces.append(Trace("measured", time, data["measured"][offset + index], Style("#b3bcc7", 2.2)))
+        traces = [Trace("measured", time, row, Style("#b3bcc7", 2.2)) for row in data["measured"][offset : offset + 4]]
         for index, depth in enumerate(_DEPTHS):
             if offset + index < len(data["known"]):
                 traces.append(Trace(depth, time, data["known"][offset + index], Style(colours[index], 1.2)))
@@ -536,8 +535,8 @@ def _temperatures(section, name, data) -> None:
     errors = []
     if "thesis" in data:
         errors.append(Trace("thesis form", time, _rms(data["thesis"] - data["measured"][:8]), THESIS))
-    errors.append(Trace("ours, no torque sensor", time, _rms(data["unknown"][:8] - data["measured"][:8]), PALE))
-    errors.append(Trace("ours, torque known", time, _rms(data["known"][:8] - data["measured"][:8]), MODEL))
+    errors.append(Trace("no torque sensor", time, _rms(data["unknown"][:8] - data["measured"][:8]), PALE))
+    errors.append(Trace("torque known", time, _rms(data["known"][:8] - data["measured"][:8]), MODEL))
     panels.append(Panel("Error, RMS over the eight thermocouples", "K", errors, 180))
     section.heading(f"Temperatures: {name}")
     section.figure(time_figure(panels))
@@ -564,7 +563,7 @@ def _cooling(section, data) -> None:
                             "each log",
                             speed,
                             data["rate_per_s"][order],
-                            Style("#1d2430", mode="markers"),
+                            _POINTS,
                             data["rate_sigma_per_s"][order],
                         ),
                         Trace("line", speed, data["line_per_s"][order], MODEL),
@@ -584,7 +583,7 @@ def _friction(section, data) -> None:
     section.heading("Friction of pad on disc, for service without a brake torque sensor")
     thin = slice(None, None, max(len(data["measured"]) // 1500, 1))
     measured, model = data["measured"][thin], data["model"][thin]
-    dots = Style("rgba(11,92,173,0.35)", mode="markers")
+    dots = Style("rgba(11,92,173,0.35)", mode="markers", size=3.5)
     section.figure(
         xy_figure(
             [
@@ -592,7 +591,7 @@ def _friction(section, data) -> None:
                     "Friction coefficient",
                     "1",
                     [
-                        Trace("measured", data["temperature_C"][thin], measured, Style("#c9d0d8", mode="markers")),
+                        Trace("measured", data["temperature_C"][thin], measured, _CLOUD),
                         Trace("map", data["temperature_C"][thin], model, dots),
                     ],
                     260,
@@ -617,7 +616,7 @@ def _softening(section, data, window) -> None:
                     "Stiffness over that of the cold pads",
                     "1",
                     [
-                        Trace("each burst", hours, data["factor"], Style("#1d2430", mode="markers"), data["factor_sigma"]),
+                        Trace("each burst", hours, data["factor"], _POINTS, data["factor_sigma"]),
                         Trace("moving window (thesis)", hours, data["window"], THESIS),
                         Trace("first-order history", hours, data["exponential"], MODEL),
                     ],
@@ -640,11 +639,17 @@ def _softening(section, data, window) -> None:
     if window is not None:
         section.figure(
             xy_figure(
-                [Panel("Search for the window's width", "residual", [Trace("window", window["width_s"], window["residual"], THESIS)],
-                       200)],
+                [
+                    Panel(
+                        "Search for the window's width",
+                        "residual",
+                        [Trace("window", window["width_s"], window["residual"], THESIS)],
+                        200,
+                    )
+                ],
                 "width / s",
             )
-        )  # fmt: skip
+        )
 
 
 def _logs(page: Page, result: Identification) -> None:

@@ -51,6 +51,7 @@ from emb_daemon.identify.stiffness import (
 )
 from emb_daemon.identify.torque import SIGN, TorqueFit, fit_torque
 from emb_daemon.offline import Log
+from emb_daemon.pipeline import CYCLE_S
 
 #: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
 _WORTH = 1.02
@@ -161,6 +162,7 @@ def identify(campaign: Campaign, progress: Progress = _quiet) -> Identification:
         raise InputError(
             "\n".join([*campaign.faults, f"{campaign.path}: curves, random: no usable log; needed: {_NEED_CURVE}"])
         )
+    _check_thickness(result)
     progress(0.02, "structure of the dynamics")
     _choose_structure(result)
     progress(0.1, "torque path")
@@ -195,6 +197,22 @@ def _pads(campaign: Campaign) -> list[Pads]:
             if log is not None:
                 logs.setdefault(campaign.thickness(entry), []).append(log)
     return [Pads(thickness, tuple(logs[thickness])) for thickness in sorted(logs)]
+
+
+def _check_thickness(result: Identification) -> None:
+    """A calibration for pads too far from every measured thickness could not be loaded."""
+    campaign = result.campaign
+    table = tuple(Curve(pad_thickness_mm=pads.thickness_mm, coefficients=(1.0,)) for pads in result.pads)
+    try:
+        curve_at(table, campaign.file.pad_thickness_mm)
+    except InputError as error:
+        raise InputError(
+            "\n".join([*campaign.faults, f"{campaign.path}: {error}; needed: curves of pads nearer to that thickness"])
+        ) from None
+    if not any(_random_logs(pads) for pads in result.pads):
+        campaign.fault(
+            f"random: no usable log, so that relaxation rests on slow clamps, which hardly show it; needed: {_NEED_RANDOM}"
+        )
 
 
 def _slow_logs(pads: Pads) -> list[Log]:
@@ -244,13 +262,19 @@ def _in_service(values: dict[str, float]) -> dict[str, float]:
     return {**values, "signal_delay.delay_s": 0.0}
 
 
+def _geometry(campaign: Campaign) -> tuple[float, float]:
+    """Gear gain in m/rad and the resolver's smallest step in rad."""
+    sheet = campaign.datasheet
+    return sheet.actuator.gear_gain_m_per_rad, 2.0 * np.pi / sheet.resolver.counts_per_revolution
+
+
 def _torque(result: Identification) -> None:
     logs = [log for pads in result.pads for log in pads.logs if log.samples["has_current"].any()]
     if not logs:
         raise InputError(f"{result.campaign.path}: curves, random: no log holds motor current; needed: EMB_*_Current frames")
-    gear_gain = result.campaign.datasheet.actuator.gear_gain_m_per_rad
-    result.torque = fit_torque(logs, gear_gain)
-    result.thesis_torque = fit_torque(logs, gear_gain, sign_model=True)
+    gear_gain, count = _geometry(result.campaign)
+    result.torque = fit_torque(logs, gear_gain, count)
+    result.thesis_torque = fit_torque(logs, gear_gain, count, sign_model=True)
 
 
 def _thesis_forms(result: Identification) -> None:
@@ -318,7 +342,7 @@ class Fold:
 
 
 def _folds(result: Identification) -> list[Fold]:
-    gear_gain = result.campaign.datasheet.actuator.gear_gain_m_per_rad
+    gear_gain, count = _geometry(result.campaign)
     folds = []
     indices = [i for i, pads in enumerate(result.pads) if _slow_logs(pads) and _random_logs(pads)]
     if len(result.pads) < 2 or not indices:
@@ -354,8 +378,8 @@ def _folds(result: Identification) -> list[Fold]:
                 fit.dynamics.values,
                 own,
                 clearance,
-                fit_torque(logs, gear_gain),
-                fit_torque(logs, gear_gain, sign_model=True),
+                fit_torque(logs, gear_gain, count),
+                fit_torque(logs, gear_gain, count, sign_model=True),
                 judged,
                 errors,
                 thesis_errors,
@@ -433,7 +457,7 @@ def _noise_of(result: Identification, folds: list[Fold], interpolation: float = 
     logs = [log for pads in result.pads for log in pads.logs]
     speed = speed_noise(logs)
     if speed is None:
-        speed = 2.0 * np.pi / result.campaign.datasheet.resolver.counts_per_revolution / 0.004
+        speed = _geometry(result.campaign)[1] / CYCLE_S
         result.notes.append("The motor never stands for 0.2 s: speed noise is one resolver count per sample, not measured.")
     if folds:
         errors = [pair for fold in folds for pair in (fold.thesis_errors if thesis else fold.errors)]
@@ -484,8 +508,8 @@ def _gears(result: Identification) -> None:
     for entry in campaign.file.gear_wear:
         log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
         if log is not None:
-            gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
-            forms = (fit_torque([log], gear_gain), fit_torque([log], gear_gain, sign_model=True))
+            gear_gain, count = _geometry(campaign)
+            forms = (fit_torque([log], gear_gain, count), fit_torque([log], gear_gain, count, sign_model=True))
             result.gears.append((entry.training, *forms))
 
 
@@ -493,7 +517,7 @@ def _contact(result: Identification) -> Contact:
     """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it."""
     found = np.concatenate([curve.clearances_rad for curve in result.fit.curves])
     errors = np.concatenate([curve.clearance_sigmas_rad for curve in result.fit.curves])
-    count = 2.0 * np.pi / result.campaign.datasheet.resolver.counts_per_revolution
+    count = _geometry(result.campaign)[1]
     spread = float(np.std(found, ddof=1)) if len(found) > 1 else 0.0
     return Contact(
         clearance_rad=float(np.mean(found)),
@@ -521,7 +545,7 @@ def _contact_walk(result: Identification) -> float:
                 if weight > 0.0 and np.isfinite(error[part]).all():
                     shifts.append(-float(slope[part] @ error[part]) / weight)
             squares += float(np.sum(np.diff(shifts) ** 2))
-            seconds += rows * 0.004 * max(len(shifts) - 1, 0)
+            seconds += rows * CYCLE_S * max(len(shifts) - 1, 0)
     return float(np.sqrt(squares / seconds)) if seconds else 0.0
 
 
@@ -564,14 +588,16 @@ def _assemble(
 
 
 def _calibration(result: Identification) -> Calibration:
-    return _assemble(
-        result,
-        thickness_mm=result.campaign.file.pad_thickness_mm,
-        curves=tuple(curve.curve() for curve in result.fit.curves),
-        values=result.fit.dynamics.values,
-        effects=result.fit.dynamics.effects(),
-        torque=result.torque,
-        noise=result.noise,
+    return _tidy(
+        _assemble(
+            result,
+            thickness_mm=result.campaign.file.pad_thickness_mm,
+            curves=tuple(curve.curve() for curve in result.fit.curves),
+            values=result.fit.dynamics.values,
+            effects=result.fit.dynamics.effects(),
+            torque=result.torque,
+            noise=result.noise,
+        )
     )
 
 
@@ -661,7 +687,7 @@ def _heat(result: Identification, progress: Progress) -> None:
             campaign.fault(fault)
         result.notes.extend(result.thermal.notes)
     except InputError as error:
-        campaign.fault(f"{error}; thermal values are the datasheet's nominal ones, forces do not follow temperature")
+        campaign.fault(f"{error}; heat keeps the datasheet's nominal values and the force does not follow temperature")
         result.nominal_thermal = _nominal_thermal(nominal)
 
 
@@ -824,5 +850,18 @@ def _provenance(result: Identification) -> Provenance:
     )
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")
+def _rounded(value: float, digits: int = 4) -> float:
+    return float(f"{value:.{digits}g}")
+
+
+def _tidy(calibration: Calibration) -> Calibration:
+    """Seven digits: far more than is known, and a file that people can read."""
+
+    def tidy(value):
+        if isinstance(value, dict):
+            return {key: tidy(entry) for key, entry in value.items()}
+        if isinstance(value, list | tuple):
+            return [tidy(entry) for entry in value]
+        return _rounded(value, 7) if isinstance(value, float) else value
+
+    return msgspec.convert(tidy(msgspec.to_builtins(calibration)), Calibration)

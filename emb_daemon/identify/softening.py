@@ -28,7 +28,7 @@ class SofteningFit:
 
     Attributes:
         softening: for the calibration; fitted on every other burst from the first.
-        sigmas: ``per_K``, ``history_per_K``, ``history_time_s``, bursts left out in turn.
+        sigmas: ``per_K``, ``history_per_K``, ``history_time_s``, bursts left out in turn, and the residual's own part.
         factor, factor_sigma: measured stiffness factor, from the full static form.
         exponential, window: factors modelled with the first-order history and with the thesis's moving window.
         shift_rad: contact shift, were it free.
@@ -212,7 +212,18 @@ def fit_softening(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.
     if not keeps:
         found = np.array([_regress([at_burst[own]], loss[own])[0], 0.0, found[2]])
     count = len(own)
-    sigmas = np.sqrt((count - 1) / count * np.sum((left - left.mean(axis=0)) ** 2, axis=0))
+    variance = (count - 1) / count * np.sum((left - left.mean(axis=0)) ** 2, axis=0)
+
+    # So few bursts leave the jackknife itself unsure: the residual's own share comes on top.
+    def losses(x):
+        return x[0] * at_burst[own] + x[1] * history(x[2])[own]
+
+    steps = 1e-3 * np.maximum(np.abs(found), [1e-4, 1e-4, 1.0])
+    slopes = np.array([(losses(found + step) - losses(found - step)) for step in np.diag(steps)]).T / (2.0 * steps)
+    noise = np.sum((losses(found) - loss[own]) ** 2) / max(count - 3, 1)
+    unit = np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+    inverse = np.linalg.pinv((slopes / unit).T @ (slopes / unit), rcond=1e-10)
+    sigmas = np.sqrt(variance + noise * np.diag(inverse) / unit**2)
 
     widths = np.geomspace(max(0.005 * span, 2.0 * heat.step_s), span, 60)
     thesis_loss = 1.0 - thesis_factor

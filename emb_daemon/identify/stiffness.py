@@ -30,6 +30,9 @@ DYNAMICS = (
 #: Effects that a fit may leave out; the delay of the reference against the resolver is a nuisance that always stays in.
 OPTIONAL = ("second_relaxation", "stiffness_hysteresis")
 _DELAY_UNIT_S = 1e-3
+#: Further starting points of the slip angle, times the first, and iterations that each is given to prove itself.
+_SLIP_STARTS = (0.3, 3.0)
+_TRIAL = 8
 
 
 @njit
@@ -240,9 +243,10 @@ def starting_values(groups: list[Pads]) -> dict[str, float]:
         for log in pads.logs:
             contact = contact_guess(log, rest_noise(log))
             spans.append(float(log.samples["angle"].max() - contact))
-            times.append(regress_free(log, contact)[1])
-    # Slow logs hardly show the lag, so that noise shortens it there: the longest is the best guess.
-    time = float(np.clip(max(times), 2e-3, 0.5))
+            times.append((is_slow(log), regress_free(log, contact)[1]))
+    # Slow logs hardly show the lag: they count only where there are no others.
+    fast = [time for slow, time in times if not slow] or [time for _, time in times]
+    time = float(np.clip(np.median(fast), 2e-3, 0.5))
     return {
         "relaxation_time_s": time,
         "second_relaxation.share": 0.1,
@@ -268,12 +272,13 @@ def fit_dynamics(
 
     Args:
         effects: which of `OPTIONAL` take part.
-        start: dynamics to start from, by name.
+        start: dynamics to start from, by name; without it several starting points are tried.
         curves: curves to start from, one per group.
         fraction: share that is fitted of each log that is not slow, from its beginning.
         fixed: keep the dynamics at ``start`` and fit curves and contact angles alone.
     """
-    start = dict(start or starting_values(groups))
+    given = start is not None
+    start = dict(start) if given else starting_values(groups)
     names = [name for name, effect in DYNAMICS if effect is None or effect == "signal_delay" or effect in effects]
     logs = [(g, log) for g, pads in enumerate(groups) for log in pads.logs]
     noises = [rest_noise(log) for _, log in logs]
@@ -348,7 +353,18 @@ def fit_dynamics(
         return Block(residual, np.concatenate([np.arange(shared), own, [first_contact + index]]))
 
     blocks = [block(index) for index in range(len(logs))]
-    solution = least_squares(blocks, np.array(x), np.array(scale), np.array(low), np.array(high))
+    limits = np.array(scale), np.array(low), np.array(high)
+    starts = [np.array(x)]
+    slip = "stiffness_hysteresis.slip_angle_rad"
+    if not given and slip in names:
+        # A loop's width and its turning length trade off: other turning lengths may lead to another valley.
+        for factor in _SLIP_STARTS:
+            starts.append(starts[0].copy())
+            starts[-1][names.index(slip)] += np.log(factor)
+    if len(starts) > 1:
+        tried = [least_squares(blocks, start, *limits, iterations=_TRIAL) for start in starts]
+        starts = [min(tried, key=lambda found: found.rms).x]
+    solution = least_squares(blocks, starts[0], *limits)
     return _unpack(
         solution, groups, logs, [] if fixed else names, start if fixed else {}, powers, spans, shared, first_contact
     )

@@ -1,6 +1,5 @@
 """The thesis's table filled in for a campaign: what he reports, his form here, ours, and what to reach."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +69,17 @@ def table(result: Identification) -> list[Line]:
     for row in result.thermal.table if result.thermal else ():
         target = f"≤ {row.target:g}" if np.isfinite(row.target) else ""
         met = bool(row.ours <= row.target) if np.isfinite(row.target) else None
-        lines.append(Line(row.name, row.unit, _REPORTED.get(row.unit, "–"), (row.thesis,), (row.ours,), target, met))
+        lines.append(
+            Line(
+                row.name,
+                row.unit,
+                f"{row.reported:g}" if np.isfinite(row.reported) else "–",
+                (row.thesis,),
+                (row.ours,),
+                target,
+                met,
+            )
+        )
     add("integrated, dynamic stiffness", integrated, "stiffness", "1.09")
     add("integrated, maximum likelihood", integrated, "maximum_likelihood", "0.56")
     add("integrated, Kalman filter", integrated, "fused", "0.50", 0.25, True)
@@ -92,12 +101,9 @@ def table(result: Identification) -> list[Line]:
     return lines
 
 
-_REPORTED: dict[str, str] = {}
-
-
 def _kilonewton(group: list[Judged], path: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    pick: Callable[[Figures], float] = lambda figures: 1e-3 * figures.rmse[path]  # noqa: E731
-    return tuple(pick(judged.thesis) for judged in group), tuple(pick(judged.ours) for judged in group)
+    thesis, ours = (judged.thesis for judged in group), (judged.ours for judged in group)
+    return tuple(1e-3 * f.rmse[path] for f in thesis), tuple(1e-3 * f.rmse[path] for f in ours)
 
 
 def _over_inputs(figures: Figures, path: str) -> float:

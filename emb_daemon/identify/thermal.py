@@ -63,6 +63,8 @@ class Row:
     thesis: float
     ours: float
     target: float
+    #: What the thesis reports of its own rig.
+    reported: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -420,7 +422,7 @@ class _Judgement:
         self.figures["pad_cooling: force, bursts left out, thesis form, kN"] = 1e-3 * fit.thesis_N
         self.figures["pad_cooling: force, bursts left out, cold stiffness, kN"] = 1e-3 * fit.uncorrected_N
         name = "curves through the cooling of the pads (bursts that fitted nothing)"
-        self.rows.append(Row(name, "kN", 1e-3 * fit.thesis_N, 1e-3 * fit.ours_N, 1e-3 * _SOFTENING_TARGET_N))
+        self.rows.append(Row(name, "kN", 1e-3 * fit.thesis_N, 1e-3 * fit.ours_N, 1e-3 * _SOFTENING_TARGET_N, 1.0))
 
 
 def _temperature_rows(result: _Judgement) -> None:
@@ -428,7 +430,7 @@ def _temperature_rows(result: _Judgement) -> None:
     thesis, known = figures.get("validate: pads, thesis form, K", none), figures["validate: pads, torque known, K"]
     without = figures.get("validate: pads, no torque, estimated force, K", figures["validate: pads, no torque, K"])
     name = "pad temperatures at 2, 4, 6, 8 mm, both pads, validate, brake torque known"
-    result.rows.append(Row(name, "°C", thesis, known, _PADS_TARGET_K))
+    result.rows.append(Row(name, "°C", thesis, known, _PADS_TARGET_K, 3.7))
     result.rows.append(Row("the same without brake torque (as in a car)", "°C", none, without, _PADS_WITHOUT_TORQUE_TARGET_K))
 
 

@@ -104,11 +104,12 @@ class _Regression:
         return regressors, instruments, variance[self.rows] < _KNOWN
 
 
-def fit_torque(logs: list[Log], gear_gain: float, *, sign_model: bool = False) -> TorqueFit:
+def fit_torque(logs: list[Log], gear_gain: float, resolver_count: float, *, sign_model: bool = False) -> TorqueFit:
     """Instrumental-variable regression with the presliding angle sought in one dimension.
 
     Args:
         gear_gain: clamp travel per motor angle, m/rad.
+        resolver_count: smallest step of the motor angle, rad; no turning over is known better than that.
         sign_model: the thesis's form: sign of the angle difference for friction, acceleration by second difference,
             ordinary least squares.
     """
@@ -162,13 +163,15 @@ def fit_torque(logs: list[Log], gear_gain: float, *, sign_model: bool = False) -
         change[index, 0] = -solution[index] * constant / solution[0]
         change[index, index] = constant
     change[4, 4] = presliding
+    covariance = change @ covariance @ change.T
+    covariance[4, 4] += 0.0 if sign_model else resolver_count**2
     return TorqueFit(
         float(constant),
         float(solution[1] * constant),
         float(solution[2] * constant),
         float(solution[3] * constant),
         presliding,
-        change @ covariance @ change.T,
+        covariance,
         float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))),
         {
             part.path: (part.rows[use], residual)

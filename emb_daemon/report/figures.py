@@ -24,6 +24,8 @@ class Style:
     width: float = 1.4
     dash: str = "solid"
     mode: str = "lines"
+    #: Diameter of markers, pixels.
+    size: float = 7.0
 
 
 REFERENCE = Style(INK, 1.6)
@@ -111,7 +113,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
                     name=trace.name,
                     mode=style.mode,
                     line={"color": style.colour, "width": style.width, "dash": style.dash},
-                    marker={"color": style.colour, "size": 7},
+                    marker={"color": style.colour, "size": style.size},
                     fill="tonexty" if is_band and band_open else None,
                     fillcolor=style.colour if is_band else None,
                     hoverinfo="skip" if is_band else None,
@@ -134,8 +136,8 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis, title_standoff=8)
     figure.update_layout(
-        height=total + 110,
-        margin={"l": 64, "r": 16, "t": 40, "b": 48},
+        height=total + 116,
+        margin={"l": 64, "r": 16, "t": 68, "b": 48},
         paper_bgcolor="white",
         plot_bgcolor="white",
         font={"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12.5, "color": INK},

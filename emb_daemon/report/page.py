@@ -34,8 +34,10 @@ caption { caption-side: bottom; text-align: left; color: var(--muted); font-size
 th { text-align: left; font-weight: 600; color: var(--muted); border-bottom: 1.5px solid var(--ink); padding: 5px 18px 5px 0;
   vertical-align: bottom; }
 td { border-bottom: 1px solid var(--line); padding: 5px 18px 5px 0; vertical-align: top; }
-th.number, td.number { text-align: right; }
-td.pass { color: var(--good); font-weight: 600; } td.fail { color: var(--bad); font-weight: 600; }
+th.number, td.number { text-align: right; } td.number { white-space: nowrap; }
+td.pass { color: var(--good); font-weight: 600; }
+td.fail { color: var(--bad); font-weight: 600; }
+th:last-child, td:last-child { padding-right: 0; }
 figure { margin: 14px 0 22px; }
 figcaption { color: var(--muted); font-size: 13.5px; max-width: 90ch; }
 ul { max-width: 90ch; padding-left: 20px; margin: 8px 0; } li { margin: 3px 0; }
@@ -165,7 +167,7 @@ class Page:
 
     def render(self) -> str:
         """The whole file. The plot library is inside, once, and only if there is a plot."""
-        links = "".join(f'<a href="#{section.anchor}">{html.escape(section.title)}</a>' for section in self._sections)
+        links = " ".join(f'<a href="#{section.anchor}">{html.escape(section.title)}</a>' for section in self._sections)
         data = "".join(
             f'<script type="application/json" id="f{number}">{text}</script>\n'
             for number, text in enumerate(self._figures, start=1)
