@@ -8,6 +8,7 @@ import pytest
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
+from emb_daemon.effects import REGISTRY
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.offline import estimate, log_of
@@ -15,7 +16,7 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios
 from emb_daemon.plant.brake import move_motor, static_curve
 from emb_daemon.plant.car import CYCLE_S, Car, idle
-from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.derive import plant_from_calibration, wear_pads
 from emb_daemon.plant.heat import cell_count
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.records import EFFECTS, FORCE, PARK_APPLIED, PARK_RELEASED, PLANT_STATE, SUBSTEP_S
@@ -258,6 +259,21 @@ def test_the_daemons_estimator_follows_a_unit_it_was_not_calibrated_on(calibrati
     # Started a clearance before contact, it ends where the pads really touch, to 10 um.
     assert np.max(np.abs(estimates["contact_angle"] - truth["contact_angle"])) < 0.25
     assert np.nanmax(np.abs(estimates["mean"] - truth["mean"])) < 5.0
+
+
+def test_the_plant_can_have_every_effect_of_the_catalogue():
+    for effect in REGISTRY:
+        assert [field.name for field in EFFECTS[effect.name]] == [parameter.name for parameter in effect.parameters]
+
+
+def test_worn_pads_are_stiffer_and_touch_later(calibration):
+    plant = plant_from_calibration(calibration, seed=2)
+    angle, stroke = scenarios.angle_at(plant, 8000.0), scenarios.angle_at(plant, 8000.0) - plant["contact_angle"]
+    wear_pads(plant, calibration, 1.5)
+    assert plant["pad_thickness"] == pytest.approx(0.0085)
+    assert scenarios.angle_at(plant, 8000.0) - plant["contact_angle"] < stroke
+    # 1.5 mm less on a gear gain of 39.8 um/rad, less what the stiffer pads save.
+    assert scenarios.angle_at(plant, 8000.0) - angle == pytest.approx(1.5e-3 / plant["gear_gain"], rel=0.05)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
