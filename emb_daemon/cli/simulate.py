@@ -52,5 +52,5 @@ def run(arguments: argparse.Namespace) -> int:
         live.run(stop, arguments.seconds)
     finally:
         bus.close()
-    print(f"{live.ticks} cycles, {live.late} late, {bus.unsent} frames not sent")
+    print(f"{live.ticks} cycles, {live.late} late, {live.lost} lost, {bus.unsent} frames not sent")
     return 0

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.estimator.records import MODES, SOURCES
+from emb_daemon.estimator.records import MODES, REASONS, SOURCES
 from emb_daemon.plant.records import PARK_RELEASED
 from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
 
@@ -60,6 +60,15 @@ def _bar(force_kN: float) -> Text:
     return Text("█" * filled, style="cyan") + Text("·" * (_BAR_WIDTH - filled), style="dim")
 
 
+def _remark(recorder: Recorder, row: int) -> str:
+    progress, reasons = recorder.progress(row), recorder.value(ESTIMATOR_STATUS, row, 3)
+    if not math.isnan(progress):
+        return f"adapting, {progress:.0f} %"
+    if math.isnan(reasons):
+        return ""
+    return ", ".join(text for bit, text in enumerate(REASONS) if int(reasons) >> bit & 1)
+
+
 def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
     """The view for a terminal."""
     if not recorder.cycles:
@@ -80,11 +89,13 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
         "true*",
         "adapting",
     ):
-        table.add_column(heading, justify="left" if heading in ("", "source", "status", "mode") else "right", no_wrap=True)
+        table.add_column(
+            heading, justify="left" if heading in ("", "source", "status", "mode", "remark") else "right", no_wrap=True
+        )
     for row, corner in enumerate(recorder.corners):
         force = recorder.value(CLAMP_FORCE, row, 0)
         source, mode = recorder.value(CLAMP_FORCE, row, 3), recorder.value(ESTIMATOR_STATUS, row, 0)
-        status, progress = recorder.status(row), recorder.progress(row)
+        status = recorder.status(row)
         true = truth[row]
         table.add_row(
             Text(corner, style="bold"),
@@ -98,7 +109,7 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
             f"{recorder.value(PAD_TEMP, row, 0):.0f} °C",
             f"{recorder.value(PAD_TEMP, row, 1):.0f} °C",
             Text(f"{true['mean'][0]:.0f}", style="dim"),
-            "" if math.isnan(progress) else f"{progress:.0f} %",
+            _remark(recorder, row),
         )
     time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
     head = Text(f"{time:5.1f} of {seconds:.0f} s   {phase(truth[0])}   {truth[0]['vehicle_speed']:.1f} m/s", style="bold")

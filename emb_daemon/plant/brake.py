@@ -1,4 +1,4 @@
-"""Motor, gear, friction, pads and caliper of one corner: ordinary differential equations in sub-steps of a quarter millisecond."""
+"""Motor, gear, friction, pads and caliper of one corner: differential equations in steps of a quarter millisecond."""
 
 from math import cos, exp, sin
 
@@ -118,7 +118,11 @@ def _settle(state, before, now, time_constant):
 
 @njit
 def clamp(p, s):
-    """One sub-step of the clamp force: backlash, static curve, slip, relaxations."""
+    """One sub-step of the clamp force: backlash, static curve, slip, relaxations.
+
+    The first relaxation is the thesis's (3.3.2): force lags the motor angle, so a fast stroke returns more work to the motor
+    than it took. It describes what force sensors show, not a passive material.
+    """
     e = p.effects
     angle = s.angle
     if e.spindle_lead_error.amplitude_um != 0.0:

@@ -19,7 +19,7 @@ _STEP_S = 1e-9 * CYCLE_NS
 @njit
 def cell_count(p):
     """Cells in use through one pad: near 0.4 mm each."""
-    return min(max(int(ceil(p.pad_thickness / _CELL_M)), 5), CELLS)
+    return min(max(ceil(p.pad_thickness / _CELL_M), 5), CELLS)
 
 
 @njit

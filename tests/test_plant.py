@@ -1,0 +1,451 @@
+"""The simulated brake and car: physics that must hold whatever the parameters, and promises to those who test with it."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.cli.main import main
+from emb_daemon.effects import REGISTRY
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.logs.columns import Decoder
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.plant import scenarios
+from emb_daemon.plant.brake import move_motor, static_curve
+from emb_daemon.plant.car import CYCLE_S, Car, idle
+from emb_daemon.plant.derive import plant_from_calibration, wear_pads
+from emb_daemon.plant.heat import cell_count
+from emb_daemon.plant.live import LiveCar
+from emb_daemon.plant.records import EFFECTS, FORCE, PARK_APPLIED, PARK_RELEASED, PLANT_STATE, SUBSTEP_S
+from emb_daemon.resources import resource
+from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.wire.e2e import COUNTER_MODULO, protect
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import ADAPT_REQUEST, CORNERS, default_layout, pack
+from emb_daemon.wire.receive import ACCEPTED
+
+#: Parameters at which each effect must show.
+VISIBLE = {
+    "disc_thickness_variation": {"order_1_cosine_um": 15.0},
+    "disc_thermal_expansion": {"growth_um_per_K": 0.3},
+    "pad_wear": {"wear_um_per_MJ": 50.0},
+    "torque_constant_fade": {"fade_per_K": 0.01, "disc_share": 1.0},
+    "current_offset": {"offset_A": 0.5},
+    "viscous_friction": {"viscous_Nms_per_rad": 3e-4},
+    "stribeck_friction": {"rise": 0.5, "speed_rad_per_s": 5.0},
+    "friction_asymmetry": {"asymmetry": 0.2},
+    "gear_mesh_ripple": {"cosine": 0.05, "order_per_turn": 3.0},
+    "cogging_torque": {"sine_Nm": 0.01, "order_per_turn": 6.0},
+    "stiffness_hysteresis": {"share": 0.06, "slip_angle_rad": 1.0},
+    "second_relaxation": {"share": 0.2, "time_constant_s": 1.0},
+    "signal_delay": {"delay_s": 0.003},
+    "backlash": {"play_rad": 0.2},
+    "friction_coefficient_fade": {"fade_per_K": 0.003, "onset_C": 30.0},
+    "disc_radiation": {"area_m2": 0.3},
+    "thermocouple_lag": {"lag_s": 10.0},
+    "clamp_creep": {"share": 0.05, "time_constant_s": 30.0},
+    "brake_torque_coupling": {"per_Nm": 5e-5},
+    "caliper_softening": {"per_K": 0.01},
+    "spindle_lead_error": {"amplitude_um": 10.0, "order_per_turn": 0.3},
+    "cold_grease": {"per_K": 0.05},
+}
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+@pytest.fixture(scope="module")
+def bare(calibration):
+    """A plant that is the calibration's own unit, without any effect."""
+    return plant_from_calibration(calibration, effects={name: {} for name in calibration.effects})
+
+
+@pytest.fixture(scope="module")
+def driven(calibration):
+    """A city drive of one corner: plant, frames, truth."""
+    plant = plant_from_calibration(calibration, seed=5)
+    return plant, *scenarios.simulate_log(plant, scenarios.city_drive(), seed=7)
+
+
+def same(a, b):
+    """Equal in every field; the padding between fields means nothing."""
+    return len(a) == len(b) and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a.dtype.names)
+
+
+def settled(car, mode, target, seconds, drive=None):
+    commands, standing = idle(1)
+    commands["mode"], commands["target"] = mode, target
+    for _ in range(round(seconds / CYCLE_S)):
+        car.tick(commands, standing[0] if drive is None else drive)
+    return car
+
+
+def test_one_seed_gives_one_log(calibration, driven):
+    plant, frames, truth = driven
+    again, truth_again = scenarios.simulate_log(plant, scenarios.city_drive(), seed=7)
+    assert same(again, frames)
+    assert same(truth_again, truth)
+    other, _ = scenarios.simulate_log(plant, scenarios.city_drive(), seed=8)
+    assert not same(other, frames)
+    assert plant_from_calibration(calibration, seed=5).tobytes() == plant.tobytes()
+    assert plant_from_calibration(calibration, seed=6).tobytes() != plant.tobytes()
+
+
+@pytest.mark.parametrize("force", [500.0, 4000.0, 20000.0])
+def test_held_angle_settles_on_the_characteristic_curve(bare, force):
+    car = Car(np.atleast_1d(bare))
+    settled(car, 1, scenarios.angle_at(bare, force), 3.0)
+    state = car.states[0]
+    x = state["angle"] - bare["contact_angle"]
+    static = np.polyval([*bare["curve"][::-1], 0.0], x)
+    assert state["force"] == pytest.approx(static, rel=1e-3)
+    assert static == pytest.approx(force, rel=0.02)
+
+
+@pytest.mark.parametrize("force", [300.0, 3000.0, 25000.0])
+def test_force_controller_brings_the_true_force(bare, force):
+    car = settled(Car(np.atleast_1d(bare)), FORCE, force, 3.0)
+    # The controller leaves 20 N and half a percent alone, lest it hunt.
+    assert abs(car.states[0]["force"] - force) < 22.0 + 0.006 * force
+    assert abs(car.states[0]["speed"]) < 0.05
+
+
+def test_motor_work_becomes_motion_friction_and_clamping(bare):
+    car = Car(np.atleast_1d(bare))
+    schedule = scenarios.random_angle(bare, 5.0, np.random.default_rng(0))
+    car.run(schedule.commands[:, None], schedule.drives)
+    state = car.states[0]
+    kinetic = 0.5 * bare["inertia"] * state["speed"] ** 2
+    spent = kinetic + state["friction_loss"] + state["clamp_work"]
+    assert state["motor_work"] > 1.0
+    assert spent == pytest.approx(state["motor_work"], rel=1e-6)
+    assert state["friction_loss"] > 0.1 * state["motor_work"]
+
+
+def test_hysteresis_takes_energy_in_a_slow_stroke(calibration):
+    """Per stroke 2 h times the work of clamping once; slowly, because the thesis's lag gives energy back when fast."""
+    share = 0.05
+    off = {name: {} for name in calibration.effects}
+    plant = plant_from_calibration(
+        calibration, effects=off | {"stiffness_hysteresis": {"share": share, "slip_angle_rad": 0.05}}
+    )
+    car = Car(np.atleast_1d(plant))
+    schedule = scenarios.curve(plant, 15000.0, 60.0) + scenarios.rest(1.0)
+    _, truth = car.run(schedule.commands[:, None], schedule.drives)
+    closing = slice(0, len(truth) // 2)
+    once = np.trapezoid(truth["static_force"][closing, 0], truth["angle"][closing, 0]) * plant["gear_gain"]
+    assert car.states[0]["clamp_work"] == pytest.approx(2.0 * share * once, rel=0.15)
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+@pytest.mark.parametrize("share, slides", [(0.85, False), (1.15, True)])
+def test_standing_friction_holds_up_to_its_level_and_no_further(bare, direction, share, slides):
+    state = np.zeros(1, PLANT_STATE)[0]
+    state["force"], state["caliper"] = 8000.0, 22.0
+    level = bare["offset_friction"] + bare["load_friction"] * state["force"]
+    balance = bare["gear_gain"] * state["force"] / bare["torque_constant"]
+    margin = direction * share * level / bare["torque_constant"]
+    state["current"] = balance
+    steps = round(1.0 / SUBSTEP_S)
+    for step in range(steps):
+        move_motor(bare, state, balance + margin * min(1.0, 2.0 * step / steps))
+    moved = direction * state["angle"]
+    if slides:
+        assert moved > 20.0 * bare["presliding_angle"]
+    else:
+        assert 0.0 < moved < 5.0 * bare["presliding_angle"]
+
+
+def stored_heat(p, s):
+    """Enthalpy over 0 degC of everything that stores heat, J."""
+    cells = cell_count(p)
+    pads = s["pads"][:, :cells]
+    enthalpy = p["specific_heat"] * (pads + 0.5 * p["specific_heat_rise"] * (pads - 20.0) ** 2)
+    total = p["density"] * p["pad_area"] * p["pad_thickness"] / cells * enthalpy.sum()
+    total += p["pad_area"] * p["plate_heat_capacity"] * s["plate"].sum()
+    return total + p["caliper_heat_capacity"] * s["caliper"] + p["disc_heat_capacity"] * s["disc"]
+
+
+@pytest.mark.parametrize("thickness", [0.5, 10.0])
+def test_friction_heat_is_stored_or_lost(calibration, thickness):
+    plant = plant_from_calibration(calibration, pad_thickness_mm=thickness)
+    car = Car(np.atleast_1d(plant))
+    before = stored_heat(plant, car.states[0])
+    schedule = scenarios.rig_drag(5000.0, 40.0, 60.0) + scenarios.rig_cooling(20.0, 60.0)
+    car.run(schedule.commands[:, None], schedule.drives)
+    state = car.states[0]
+    gained = stored_heat(plant, state) - before
+    assert state["disc"] > 150.0
+    assert gained + state["heat_lost"] == pytest.approx(state["friction_heat"], rel=2e-3)
+
+
+def test_braking_turns_motion_into_heat(calibration):
+    plants = np.array([plant_from_calibration(calibration, seed) for seed in range(4)])
+    car = Car(plants, CORNERS)
+    motion = car.motion[0]
+    motion["speed"] = 25.0
+    motion["wheel_speed"] = 25.0 / motion["wheel_radius"]
+    motion["drag"] = motion["rolling"] = 0.0
+    kinetic = 0.5 * motion["mass"] * 25.0**2
+    schedule = scenarios.stop(9000.0, 8.0)
+    car.run(scenarios.commands_of(schedule, CORNERS), schedule.drives)
+    assert motion["speed"] == 0.0
+    assert car.states["friction_heat"].sum() == pytest.approx(kinetic, rel=0.01)
+
+
+def test_the_wire_contract_is_kept(calibration):
+    """Every frame passes the daemon's receiver; each message comes at its cycle; both frames of a sample share a counter."""
+    plants = np.array([plant_from_calibration(calibration, seed) for seed in range(4)])
+    seconds = 20.0
+    frames, truth = scenarios.simulate_log(plants, scenarios.city_drive(), seconds, 3, CORNERS, reference=True)
+    assert np.all(np.diff(frames["time_ns"]) >= 0)
+    parameters = np.zeros(4, PARAMETERS)
+    parameters[:] = to_parameters(calibration)
+    pipeline = Pipeline(parameters, capacity=1 << 12)
+    pipeline.begin(int(frames["time_ns"][0]))
+    start = answered = 0
+    while start < len(frames):
+        start, count = pipeline.consume(frames, start)
+        answered += int(np.count_nonzero(pipeline.estimates[:count]["age_cycles"] == 0))
+    counts = pipeline.receptions["count"]
+    assert counts[:, ACCEPTED].sum() == counts.sum()
+    # The last sample may still wait for company.
+    assert answered >= truth.size - len(CORNERS)
+    cycles = {0x100: 4, 0x110: 4, 0x120: 10, 0x700: 4, 0x710: 100, 0x720: 100}
+    for corner in range(4):
+        for base, cycle in cycles.items():
+            expected = 1000.0 * seconds / cycle
+            assert np.count_nonzero(frames["can_id"] == base + corner) == pytest.approx(expected, abs=1)
+    for can_id, cycle in ((0x180, 10), (0x181, 10), (0x182, 100)):
+        assert np.count_nonzero(frames["can_id"] == can_id) == pytest.approx(1000.0 * seconds / cycle, abs=1)
+    resolver = frames[frames["can_id"] == 0x102]["data"] >> np.uint64(8) & np.uint64(0xF)
+    current = frames[frames["can_id"] == 0x112]["data"] >> np.uint64(8) & np.uint64(0xF)
+    assert np.array_equal(resolver, current)
+    assert np.array_equal(resolver, truth["counter"][:, 2])
+
+
+def test_sensors_say_what_is_true(driven):
+    plant, frames, truth = driven
+    truth = truth[:, 0]
+    resolver = Decoder().columns(frames, "EMB_FL_Resolver")
+    assert np.max(np.abs(resolver["MotorAngle"] - truth["angle"])) < 2.0 * plant["angle_count"]
+    noise = resolver["MotorSpeed"] - truth["speed"]
+    assert np.std(noise) == pytest.approx(plant["speed_noise"], rel=0.05)
+    error = Decoder().columns(frames, "EMB_FL_Current")["CurrentQ"] - truth["current"]
+    assert np.std(error) == pytest.approx(plant["current_noise"], rel=0.15)
+    neighbours = np.corrcoef(error[1:], error[:-1])[0, 1]
+    # Averaging over the cycle correlates neighbours a little more than the exponential alone.
+    assert np.exp(-CYCLE_S / plant["current_noise_time"]) - 0.03 < neighbours < 0.8
+    reference = Decoder("dbc/rig.dbc").columns(frames, "RIG_FL_Force")["ClampForceRef"] - truth["force"]
+    assert np.std(reference) == pytest.approx(plant["force_noise"], rel=0.05)
+    turned = np.ptp(truth["wheel_angle"])
+    pulses = np.unwrap(Decoder().columns(frames, "VEH_WheelPulse")["WheelPulseFL"], period=4096)
+    assert np.ptp(pulses) == pytest.approx(turned / (2.0 * np.pi) * 96, abs=3)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_daemons_estimator_follows_a_unit_it_was_not_calibrated_on(calibration, seed):
+    plant = plant_from_calibration(calibration, seed)
+    frames, truth = scenarios.simulate_log(plant, scenarios.city_drive(), seed=seed)
+    estimates, truth = estimate(log_of(frames).samples, to_parameters(calibration)), truth[:, 0]
+    error = estimates["force"] - truth["force"]
+    assert np.sqrt(np.mean(error**2)) < 80.0
+    assert np.mean(np.abs(error) <= 2.0 * estimates["sigma"]) > 0.9
+    # Started a clearance before contact, it ends where the pads really touch, to 10 um.
+    assert np.max(np.abs(estimates["contact_angle"] - truth["contact_angle"])) < 0.25
+    assert np.nanmax(np.abs(estimates["mean"] - truth["mean"])) < 5.0
+
+
+def test_the_plant_can_have_every_effect_of_the_catalogue():
+    for effect in REGISTRY:
+        assert [field.name for field in EFFECTS[effect.name]] == [parameter.name for parameter in effect.parameters]
+
+
+def test_worn_pads_are_stiffer_and_touch_later(calibration):
+    plant = plant_from_calibration(calibration, seed=2)
+    angle, stroke = scenarios.angle_at(plant, 8000.0), scenarios.angle_at(plant, 8000.0) - plant["contact_angle"]
+    wear_pads(plant, calibration, 1.5)
+    assert plant["pad_thickness"] == pytest.approx(0.0085)
+    assert scenarios.angle_at(plant, 8000.0) - plant["contact_angle"] < stroke
+    # 1.5 mm less on a gear gain of 39.8 um/rad, less what the stiffer pads save.
+    assert scenarios.angle_at(plant, 8000.0) - angle == pytest.approx(1.5e-3 / plant["gear_gain"], rel=0.05)
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_an_effect_is_neutral_at_zero_and_shows_otherwise(calibration, name):
+    assert set(VISIBLE) == set(EFFECTS)
+    schedule = (
+        scenarios.random_angle(plant_from_calibration(calibration), 1.0, np.random.default_rng(0))
+        + scenarios.rig_stop(8000.0, 50.0, 3.0, 6.0)
+        + scenarios.rig_drag(6000.0, 50.0, 8.0)
+    )
+
+    def signals(effects):
+        base = {known: {} for known in calibration.effects}
+        plant = plant_from_calibration(calibration, effects=base | effects)
+        frames, _ = scenarios.simulate_log(plant, schedule, seed=1)
+        return frames
+
+    without = signals({})
+    assert same(signals({name: dict.fromkeys((field.name for field in EFFECTS[name]), 0.0)}), without)
+    assert not same(signals({name: VISIBLE[name]}), without)
+
+
+def test_thickness_variation_shows_at_the_wheels_orders_and_only_when_it_turns(bare, calibration):
+    off = {name: {} for name in calibration.effects}
+    plant = plant_from_calibration(calibration, effects=off | {"disc_thickness_variation": {"order_2_sine_um": 12.0}})
+    car = Car(np.atleast_1d(plant))
+    hold = scenarios.rest(12.0, wheel_speed=20.0)
+    hold.commands["mode"], hold.commands["target"] = 1, scenarios.angle_at(plant, 6000.0)
+    _, truth = car.run(hold.commands[:, None], hold.drives)
+    held = truth[1000:, 0]
+    force = held["force"] - np.mean(held["force"])
+    second = [np.mean(force * np.exp(-1j * order * held["wheel_angle"])) for order in (1, 2, 3)]
+    slope = (static_curve(plant, 11.5) - static_curve(plant, 10.5)) / plant["gear_gain"]
+    # Amplitude: local stiffness times thickness, less what the relaxation lets through; phase: a sine, a little late.
+    assert 2.0 * abs(second[1]) == pytest.approx(12e-6 * slope, rel=0.4)
+    assert abs(second[1]) > 5.0 * max(abs(second[0]), abs(second[2]))
+    hold.drives["wheel_speed"] = 0.0
+    _, truth = car.run(hold.commands[:, None], hold.drives)
+    assert np.ptp(truth["force"][1500:, 0]) < 20.0
+
+
+def test_a_late_resolver_reads_the_past(calibration):
+    plant = plant_from_calibration(calibration, effects={"signal_delay": {"delay_s": 0.003}})
+    frames, truth = scenarios.simulate_log(plant, scenarios.sinusoid(plant, 2.0, 4.0))
+    behind = truth["angle"][:, 0] - Decoder().columns(frames, "EMB_FL_Resolver")["MotorAngle"]
+    speed = truth["speed"][:, 0]
+    assert np.dot(behind, speed) / np.dot(speed, speed) == pytest.approx(0.003, rel=0.1)
+
+
+class Parked:
+    """A parked car, and a daemon that asks it for training motion."""
+
+    def __init__(self, plant):
+        self.car = Car(np.atleast_1d(plant))
+        self.commands, drive = idle(1)
+        self.drive = drive[0]
+        self.commands["mode"], self.commands["target"] = FORCE, 9000.0
+        self.drive["park_brake"] = PARK_APPLIED
+        self.counter = 0
+        self.asks = None
+
+    def run(self, cycles):
+        """Truth of the coming cycles; a request, while there is one, is repeated every 20 ms."""
+        rows = []
+        for _ in range(cycles):
+            if self.asks is not None and self.car.motion[0]["tick"] % 5 == 0:
+                self.say(self.asks)
+            self.car.tick(self.commands, self.drive)
+            rows.append(self.car.truth[0].copy())
+        return np.array(rows)
+
+    def say(self, request, low=0.0, high=12.0, amplitude=0.8, frequency=6.0):
+        layout, frames = default_layout()[0], np.zeros(1, FRAME)
+        can_id = layout["sent_id"][ADAPT_REQUEST, 0]
+        payload = np.uint64(0)
+        for column, value in enumerate((request, 0.0, 0.0, low, high, amplitude, frequency)):
+            payload |= pack(float(value), layout["sent"][ADAPT_REQUEST, column])
+        frames[0] = (0, protect(can_id, payload, self.counter, 0), can_id, 8, 0)
+        self.counter = (self.counter + 1) % COUNTER_MODULO
+        self.car.hear(frames)
+
+
+@pytest.fixture
+def parked(bare):
+    parked = Parked(bare)
+    assert not np.any(parked.run(500)["training"])
+    return parked
+
+
+def test_training_motion_comes_on_request(parked):
+    parked.asks = 1
+    truth = parked.run(6000)
+    assert np.all(truth["training"][1:])
+    stroke = truth[1000:]
+    assert stroke["force"].min() < 50.0
+    assert stroke["force"].max() == pytest.approx(12000.0, rel=0.15)
+    angle = stroke["angle"] - np.convolve(stroke["angle"], np.ones(250) / 250, "same")
+    inner = angle[500:-500] * np.hanning(len(angle) - 1000)
+    frequencies = np.fft.rfftfreq(len(inner), CYCLE_S)
+    dither = np.abs(np.fft.rfft(inner)) * (frequencies > 1.5)
+    assert frequencies[np.argmax(dither)] == pytest.approx(6.0, abs=0.1)
+
+
+@pytest.mark.parametrize("how", ["abort", "none", "brake request", "park brake released"])
+def test_training_ends_within_one_cycle(parked, how):
+    parked.asks = 1
+    assert parked.run(2000)["training"][-1]
+    parked.asks = None
+    if how == "abort":
+        parked.say(2)
+    elif how == "none":
+        parked.say(0)
+    elif how == "brake request":
+        parked.drive["brake_request"] = 1
+    else:
+        parked.drive["park_brake"] = PARK_RELEASED
+    after = parked.run(1000)
+    assert not np.any(after["training"])
+    assert after["force"][-1] == pytest.approx(9000.0, rel=0.01)
+
+
+def test_training_ends_when_the_daemon_falls_silent(parked):
+    parked.asks = 1
+    assert parked.run(500)["training"][-1]
+    parked.asks = None
+    assert not parked.run(30)["training"][-1]
+
+
+def test_a_moving_car_does_not_train(parked):
+    parked.asks = 1
+    parked.drive["wheel_speed"] = 5.0
+    assert not np.any(parked.run(100)["training"])
+
+
+def test_live_car_puts_the_same_frames_on_a_bus(calibration):
+    plants = np.array([plant_from_calibration(calibration, 1), plant_from_calibration(calibration, 2)])
+    near, far = socket_pair()
+    corners = ("FL", "FR")
+    live = LiveCar(Car(plants, corners, seed=4), near, scenarios.city_drive())
+    live.warm_up()
+    live.run(threading.Event(), seconds=0.2)
+    received = far.drain()
+    near.close()
+    far.close()
+    frames, _ = scenarios.simulate_log(plants, scenarios.city_drive(), 0.2, 4, corners, reference=False)
+    assert live.ticks == 50
+    # A held-up machine loses cycles, but it invents none.
+    sent = frames["data"].tolist()
+    assert len(received) > 0
+    assert set(received["data"].tolist()) <= set(sent)
+    if live.lost == 0:
+        assert received["data"].tolist() == sent
+
+
+def test_demo_compares_broadcasts_with_the_truth_and_leaves_a_picture(tmp_path, capsys):
+    picture = tmp_path / "demo.png"
+    assert main(["demo", "--corners", "1", "--seconds", "2", "--picture", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "simulated truth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (["demo", "--seconds", "0"], "--seconds"),
+        (["demo", "--picture", "/nonexistent/x.png"], "no such folder"),
+        (["simulate", "-i", "virtual", "--scenario", "moon"], "expected one of drive"),
+        (["simulate", "-i", "nosuch", "-c", "x", "--seconds", "1"], "bus"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_status_2(arguments, expected, capsys):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
