@@ -39,8 +39,9 @@ def _stiffness_force(p, angle, dt=0.004):
 
 @pytest.fixture
 def plain(parameters):
-    """Parameters of FL without effects, and without torque: the stiffness path alone."""
+    """Parameters of FL without effects, softening and torque: the stiffness path alone."""
     p = parameters[0]
+    p["thermal"]["softening"] = p["thermal"]["softening_history"] = 0.0
     p["effects"] = np.zeros((), p["effects"].dtype)
     p["torque_relative_sigma"] = p["clearance_sigma"] = p["contact_walk"] = 1e-12
     return p
