@@ -77,8 +77,8 @@ def _with_attributes(value):
 
 def _plain(function):
     @functools.wraps(function)
-    def call(*arguments):
-        return function(*map(_with_attributes, arguments))
+    def call(*arguments, **options):
+        return function(*map(_with_attributes, arguments), **options)
 
     return call
 

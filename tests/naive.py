@@ -44,7 +44,7 @@ def update_errors(x, P, innovation, h, variance):
 
 
 def heat_matrices(p, pads, disc, ambient, braking, wheel_speed):
-    """Heat capacities (J/K), conductances between nodes (W/K, symmetric) and to the surroundings.
+    """Heat capacities (J/K), conductances between nodes (W/K, symmetric), to the surroundings, and to backing plates.
 
     Nodes 0..n-1 are the inner pad from its friction surface, n..2n-1 the outer one, 2n the disc.
     """
@@ -61,8 +61,10 @@ def heat_matrices(p, pads, disc, ambient, braking, wheel_speed):
             between[first + node, first + node + 1] = k * area / (positions[node + 1] - positions[node])
         between[first, 2 * nodes] = area * p["contact_conductance" if braking else "gap_conductance"]
     capacity[2 * nodes] = p["disc_heat_capacity"]
-    outside = np.zeros(2 * nodes + 1)
-    outside[[nodes - 1, 2 * nodes - 1]] = p["backplate_conductance"] * area
+    plates, outside = np.zeros(2 * nodes + 1), np.zeros(2 * nodes + 1)
+    plates[[nodes - 1, 2 * nodes - 1]] = p["backplate_conductance"] * area
+    if not braking:
+        outside[[0, nodes]] = p["surface_cooling_per_speed"] * wheel_speed * area
     hot, cold = disc + 273.15, ambient + 273.15
     radiation = (
         5.670374419e-8 * p["disc_radiating_area"] * (hot**4 - cold**4) / (hot - cold)
@@ -70,21 +72,21 @@ def heat_matrices(p, pads, disc, ambient, braking, wheel_speed):
         else (4.0 * 5.670374419e-8 * p["disc_radiating_area"] * hot**3)
     )
     outside[2 * nodes] = p["disc_cooling"] + p["disc_cooling_per_speed"] * wheel_speed + radiation
-    return capacity, between + between.T, outside
+    return capacity, between + between.T, outside, plates
 
 
 def heat_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt):
     """One implicit Euler step as a dense system; returns (pads, disc)."""
     nodes = len(p["node_position"])
-    capacity, between, outside = heat_matrices(p, pads, disc, ambient, braking, wheel_speed)
+    capacity, between, outside, plates = heat_matrices(p, pads, disc, ambient, braking, wheel_speed)
     before = np.concatenate([pads[0], pads[1], [disc]])
     source = np.zeros(2 * nodes + 1)
     source[0], source[nodes] = p["heat_share"] * power
     source[2 * nodes] = (1.0 - p["heat_share"].sum()) * power
-    source[nodes - 1] += outside[nodes - 1] * inner_backplate
-    source[2 * nodes - 1] += outside[2 * nodes - 1] * outer_backplate
-    source[2 * nodes] += outside[2 * nodes] * ambient
-    matrix = np.diag(capacity / dt + between.sum(axis=1) + outside) - between
+    source[:nodes] += plates[:nodes] * inner_backplate
+    source[nodes:] += plates[nodes:] * outer_backplate
+    source += outside * ambient
+    matrix = np.diag(capacity / dt + between.sum(axis=1) + outside + plates) - between
     after = np.linalg.solve(matrix, capacity / dt * before + source)
     return np.array([after[:nodes], after[nodes : 2 * nodes]]), after[2 * nodes]
 

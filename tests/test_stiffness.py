@@ -39,8 +39,9 @@ def _stiffness_force(p, angle, dt=0.004):
 
 @pytest.fixture
 def plain(parameters):
-    """Parameters of FL without effects, and without torque: the stiffness path alone."""
+    """Parameters of FL without effects, softening and torque: the stiffness path alone."""
     p = parameters[0]
+    p["thermal"]["softening"] = p["thermal"]["softening_history"] = 0.0
     p["effects"] = np.zeros((), p["effects"].dtype)
     p["torque_relative_sigma"] = p["clearance_sigma"] = p["contact_walk"] = 1e-12
     return p
@@ -82,28 +83,31 @@ def test_estimates_never_see_the_future(parameters):
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
 def test_an_effect_at_zero_is_bit_for_bit_neutral(parameters, effect):
-    """The parameter that scales the effect at zero, its others anywhere: the same bits as without the effect."""
+    """Amplitudes at zero, whatever its shape parameters: the same bits as without the effect; at its prior it does something."""
     p = parameters[0]
     angle = p["clearance"] + 12.0 + 10.0 * np.sin(np.arange(600) * 0.02 - 2.0)
     angle = np.concatenate([np.linspace(0.0, angle[0], 100), angle])
     p["effects"] = np.zeros((), p["effects"].dtype)
     rows, _ = brake.samples(p, angle)
     rows["wheel_speed"], rows["wheel_pulse"] = 30.0, np.arange(len(rows)) % 4096
+    rows["inner_backplate"] = rows["outer_backplate"] = 20.0 + 0.2 * np.arange(len(rows))
     without = estimate(rows, p)
-    for number, parameter in enumerate(effect.parameters):
-        p["effects"][effect.name][parameter.name] = 0.0 if number == 0 else 0.5 * (parameter.low + parameter.high)
+    for parameter in effect.shapes:
+        p["effects"][effect.name][parameter.name] = parameter.prior
     with_zero = estimate(rows, p)
     for name in without.dtype.names:
         np.testing.assert_array_equal(with_zero[name], without[name], err_msg=name)
-    p["effects"][effect.name][effect.parameters[0].name] = effect.parameters[0].prior
     p["effects"][effect.name] = tuple(parameter.prior for parameter in effect.parameters)
-    assert not np.array_equal(estimate(rows, p)["force"], without["force"]), "the effect does nothing at its prior"
+    at_prior = estimate(rows, p)
+    quantities = ("force", "sigma", "torque_force", "surface", "disc")
+    assert any(not np.array_equal(at_prior[name], without[name], equal_nan=True) for name in quantities)
 
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
 def test_an_effect_is_described(effect):
     assert effect.path in ("stiffness", "torque", "thermal")
     assert effect.equation and effect.source
+    assert effect.amplitudes, "nothing switches it off"
     for parameter in effect.parameters:
         assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
         assert parameter.unit and parameter.meaning

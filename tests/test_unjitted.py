@@ -32,14 +32,14 @@ def test_estimates_are_equal_without_compilation(parameters, tmp_path):
     from emb_daemon.offline import estimate
     from emb_daemon.pipeline import Pipeline
 
-    pipeline = Pipeline(parameters, ("FL",), collect=True)
+    pipeline = Pipeline(parameters, ("FL",))
     pipeline.begin(0)
     frames = np.concatenate(
         wirekit.drive(
             150,
-            angle=lambda t: 30.0 * min(t / 0.3, 1.0),
-            speed=lambda t: 100.0 * (t < 0.3),
-            current=lambda t: 0.5 + 30.0 * t,
+            angle=30.0 * np.clip(np.arange(150) / 75.0, 0.0, 1.0),
+            speed=100.0 * (np.arange(150) < 75),
+            current=0.5 + 0.12 * np.arange(150),
             wheel_speed=30.0,
         )
     )

@@ -47,7 +47,8 @@ _CONTRACT = (
     ("EMB_{}_EstimatorStatus", 0x220, 100, "Mode 16|4 u 1 0 -; StiffnessFactor 20|12 u 0.0005 0 -; "
      "ContactAngle 32|16 s 0.1 0 rad; DegradedReasons 48|16 u 1 0 -"),
     ("EMB_{}_AdaptRequest", 0x230, 20, "Request 16|2 u 1 0 -; Progress 18|7 u 1 0 %; Result 25|4 u 1 0 -; "
-     "LowForce 32|8 u 0.25 0 kN; HighForce 40|8 u 0.25 0 kN; DitherAmplitude 48|8 u 0.02 0 rad; DitherFrequency 56|8 u 0.1 0 Hz"),
+     "LowForce 32|8 u 0.25 0 kN; HighForce 40|8 u 0.25 0 kN; "
+     "DitherAmplitude 48|8 u 0.02 0 rad; DitherFrequency 56|8 u 0.1 0 Hz"),
 )  # fmt: skip
 _MESSAGES = [
     (template.format(corner), can_id + index, cycle, signals)

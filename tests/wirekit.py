@@ -43,22 +43,31 @@ def decode(frame_record) -> tuple[str, dict]:
     return found.name, found.decode(data, decode_choices=False)
 
 
+def same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays of records hold the same bits, but for those between fields."""
+    return all(a[name].tobytes() == b[name].tobytes() for name in a.dtype.names)
+
+
 def drive(
     cycles: int,
     corner: str = "FL",
     start_ns: int = 0,
-    angle=lambda t: 0.0,
-    speed=lambda t: 0.0,
-    current=lambda t: 0.0,
+    angle=(0.0,),
+    speed=(0.0,),
+    current=(0.0,),
     wheel_speed: float = 0.0,
     backplate: float = 25.0,
     ambient: float = 20.0,
     first: int = 0,
 ) -> list[np.ndarray]:
-    """Frames of one corner and its car for ``cycles`` resolver cycles from cycle ``first`` on; functions of time in s."""
+    """Frames of one corner and its car for ``cycles`` resolver cycles from cycle ``first`` on.
+
+    ``angle`` (rad), ``speed`` (rad/s) and ``current`` (A) by cycle, over and over.
+    """
     frames = []
     for cycle in range(first, first + cycles):
-        now, t, counter = start_ns + cycle * 4 * MS, 0.004 * cycle, cycle % 15
+        now, counter = start_ns + cycle * 4 * MS, cycle % 15
+        at = [signal[cycle % len(signal)] for signal in (angle, speed, current)]
         if cycle % 25 == 0:
             frames.append(frame("VEH_Status", now - 3000, cycle // 25 % 15, AmbientTemp=ambient))
         if cycle % 5 in (0, 2):
@@ -75,6 +84,6 @@ def drive(
             )
             frames.append(frame("VEH_WheelSpeed", now - 1000, slow, **{f"WheelSpeed{corner}": wheel_speed}))
             frames.append(frame("VEH_WheelPulse", now - 500, slow))
-        frames.append(frame(f"EMB_{corner}_Resolver", now, counter, MotorAngle=angle(t), MotorSpeed=speed(t)))
-        frames.append(frame(f"EMB_{corner}_Current", now + 100_000, counter, CurrentQ=current(t)))
+        frames.append(frame(f"EMB_{corner}_Resolver", now, counter, MotorAngle=at[0], MotorSpeed=at[1]))
+        frames.append(frame(f"EMB_{corner}_Current", now + 100_000, counter, CurrentQ=at[2]))
     return frames

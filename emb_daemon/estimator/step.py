@@ -181,12 +181,23 @@ def stiffness_path(s, p, m, factor):
     e, state = p.effects, s.effects
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
     x = m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
+    dt = m.dt
+    if dt > _ONE_CYCLE_S:
+        # Over a gap the way is unknown but for its end, which the speed tells and the lag remembers best.
+        dt = min(0.5 * m.dt, 2.0 * p.relaxation_time)
+        _deform(s, p, x - dt * m.speed, m.dt - dt, factor)
+    _deform(s, p, x, dt, factor)
+
+
+@njit
+def _deform(s, p, x, dt, factor):
+    """The motor turns steadily to ``x`` rad past contact within ``dt`` s."""
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x
-    drive = effects.static_force(e, state, factor * static, travel, m.dt)
-    s.force = first_order_lag(s.force, s.drive, drive, m.dt, p.relaxation_time)
-    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, m.dt, p.relaxation_time)
+    drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
+    s.force = first_order_lag(s.force, s.drive, drive, dt, p.relaxation_time)
+    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, p.relaxation_time)
     s.drive = drive
     s.drive_slope = factor * slope
 
@@ -224,6 +235,9 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = p.contact_walk * p.contact_walk * m.dt
+    if m.dt > _ONE_CYCLE_S:
+        lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
+        P[0, 0] += (lag_error / spread) ** 2
     predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque)
     h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
     out.stiffness_sigma = sqrt(variance_along(P, h))
@@ -276,6 +290,8 @@ def step(s, p, m, out):
     force_before = s.force
     stiffness_path(s, p, m, s.factor)
     torque, leverage, friction_variance = _torque(s, p, m)
+    if moved_zero:
+        torque = np.nan
     _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.

@@ -1,0 +1,59 @@
+"""Files that matter are whole at every moment."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_daemon.atomic import write_atomically
+
+_WRITER = """
+import sys
+from pathlib import Path
+from emb_daemon.atomic import write_atomically
+path, number = Path(sys.argv[1]), 0
+print("ready", flush=True)
+while True:
+    number += 1
+    write_atomically(path, str(number % 10).encode() * 200_000)
+"""
+
+
+def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new(tmp_path):
+    """Fifty writers, each killed at a random moment of its writing."""
+    path = tmp_path / "state.json"
+    rng = np.random.default_rng(11)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    seen = set()
+    for _ in range(50):
+        writer = subprocess.Popen([sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE, env=environment)
+        writer.stdout.readline()
+        try:
+            writer.wait(rng.uniform(0.0, 0.02))
+        except subprocess.TimeoutExpired:
+            writer.kill()
+        writer.communicate()
+        if path.exists():
+            content = path.read_bytes()
+            assert len(content) == 200_000 and content == content[:1] * 200_000
+            seen.add(content[:1])
+    assert len(seen) > 1, "no writer lived long enough to show anything"
+
+
+def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = tmp_path / "state.json"
+    write_atomically(path, b"old")
+    monkeypatch.setattr(os, "fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_mode_and_missing_folder(tmp_path):
+    write_atomically(tmp_path / "a", b"x", 0o640)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+    with pytest.raises(OSError):
+        write_atomically(tmp_path / "none" / "a", b"x")

@@ -1,0 +1,315 @@
+"""Calibration and configuration files: every fault found at once, with its line; what is saved is what is loaded."""
+
+import math
+import re
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import calibration_hash, dump_calibration, load_calibration, save_calibration
+from emb_daemon.calibration.strict_yaml import load_yaml
+from emb_daemon.calibration.types import Calibration, Struct, curve_at, to_parameters
+from emb_daemon.errors import InputErrors
+from emb_daemon.resources import resource
+
+_TEXT = resource("config/calibration.yaml").read_text()
+_CALIBRATION = load_calibration(resource("config/calibration.yaml"))
+
+
+def _line(text: str, key: str) -> int:
+    return next(number for number, line in enumerate(text.splitlines(), 1) if re.match(rf"[ -]*{key}:", line))
+
+
+def _replaced(key: str, value: str) -> str:
+    """The shipped calibration with the first ``key: ...`` line's value replaced."""
+    return re.sub(rf"(?m)^([ -]*{key}:).*$", rf"\g<1> {value}", _TEXT, count=1)
+
+
+def _faults(tmp_path, text: str) -> list[str]:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(text)
+    with pytest.raises(InputErrors) as caught:
+        load_calibration(path)
+    for fault in caught.value.faults:
+        assert fault.startswith(str(path)) and "\n" not in fault
+    return [fault.removeprefix(str(path)) for fault in caught.value.faults]
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("hello", "Expected `float`, got `str`"),
+        ("'0.05'", "Expected `float`, got `str`"),
+        ("[1.0]", "Expected `float`, got `array`"),
+        ("true", "Expected `float`, got `bool`"),
+        ("on", "got `str`"),
+        ("null", "got `null`"),
+        ("", "got `null`"),
+        (".nan", "not a finite number"),
+        ("nan", "not a finite number"),
+        (".inf", "not a finite number"),
+        ("-.inf", "not a finite number"),
+        ("1e999", "finite"),
+        ("010", "leading zeros"),
+        ("-1.0", "> 0"),
+        ("0.0", "> 0"),
+        ("0x10", "got `str`"),
+        ("1_000", "got `str`"),
+        ("1:30", "got `str`"),
+    ],
+)
+def test_a_wrong_number_is_named_with_its_line(tmp_path, value, expected):
+    text = _replaced("torque_constant_Nm_per_A", value)
+    (fault,) = _faults(tmp_path, text)
+    assert fault.startswith(f":{_line(text, 'torque_constant_Nm_per_A')}: motor.torque_constant_Nm_per_A: ")
+    assert expected in fault
+
+
+@pytest.mark.parametrize("value", ["5e-2", "5.0e-2", ".05", "+0.05", "1", "5E-2"])
+def test_numbers_of_all_spellings(tmp_path, value):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(_replaced("torque_constant_Nm_per_A", value))
+    assert load_calibration(path).motor.torque_constant_Nm_per_A == float(value)
+
+
+def test_unknown_key_with_a_suggestion(tmp_path):
+    text = _TEXT.replace("  inertia_kg_m2:", "  inertia_kgm2:")
+    unknown, missing = _faults(tmp_path, text)
+    assert unknown == f":{_line(text, 'inertia_kgm2')}: motor.inertia_kgm2: unknown key; did you mean inertia_kg_m2?"
+    assert missing.endswith("motor.inertia_kg_m2: missing")
+
+
+def test_duplicate_key(tmp_path):
+    text = _TEXT.replace("friction:\n  load", "friction:\n  load_m_per_rad: 1.0e-06\n  load", 1)
+    (fault,) = _faults(tmp_path, text)
+    assert fault == f":{_line(text, 'friction') + 2}: friction.load_m_per_rad: stands here twice"
+
+
+@pytest.mark.parametrize("section", ["motor", "noise", "thermal", "contact"])
+def test_missing_section(tmp_path, section):
+    (fault,) = _faults(
+        tmp_path, re.sub(rf"(?m)^{section}:", f"x_{section}_x:", _TEXT).replace(f"x_{section}_x:", "effects_:", 1)
+    )[1:]
+    assert fault.endswith(f"{section}: missing")
+
+
+@pytest.mark.parametrize(
+    ("effects", "expected"),
+    [
+        ("{warp_drive: {share: 1.0}}", "effects.warp_drive: unknown effect; known are"),
+        ("{stiffness_hysteresis: {share: 0.9, slip_angle_rad: 1.0}}", "effects.stiffness_hysteresis.share: 0.9 outside [0.0, 0.2]"),
+        ("{stiffness_hysteresis: {share: 0.1, slip: 1.0, slip_angle_rad: 1.0}}", "effects.stiffness_hysteresis.slip: unknown parameter"),
+        ("{stiffness_hysteresis: {share: 0.1}}", "effects.stiffness_hysteresis: missing slip_angle_rad"),
+        ("{stiffness_hysteresis: {share: wide, slip_angle_rad: 1.0}}", "effects.stiffness_hysteresis.share: Expected `float`, got `str`"),
+        ("{stiffness_hysteresis: 3.0}", "expected keys and values"),
+        ("[1.0]", "expected keys and values"),
+    ],
+)  # fmt: skip
+def test_effects(tmp_path, effects, expected):
+    head = _TEXT[: _TEXT.index("\neffects:")] if "\neffects:" in _TEXT else _TEXT[: _TEXT.find("\nprovenance:")]
+    text = f"{head}\neffects: {effects}\n"
+    (fault,) = _faults(tmp_path, text)
+    assert expected in fault and fault.startswith(f":{len(text.splitlines())}:")
+
+
+def test_every_fault_at_once(tmp_path):
+    text = _replaced("inertia_kg_m2", "-1").replace("offset_Nm:", "ofset_Nm:", 1)
+    text = re.sub(r"(?m)^(  clearance_rad:).*", r"\1 wide", text)
+    text = re.sub(r"(?m)^(  density|    density_kg_per_m3:).*", r"    density_kg_per_m3: .inf", text, count=1)
+    faults = _faults(tmp_path, text)
+    for key in (
+        "motor.inertia_kg_m2",
+        "friction.ofset_Nm",
+        "friction.offset_Nm: missing",
+        "contact.clearance_rad",
+        "density_kg_per_m3",
+    ):
+        assert sum(key in fault for fault in faults) == 1, (key, faults)
+    assert len(faults) == 5
+    lines = [int(fault.split(":")[1]) for fault in faults if "missing" not in fault]
+    assert lines == sorted(lines)
+
+
+def test_several_faults_of_effects_each_with_its_line(tmp_path):
+    head = _TEXT[: _TEXT.index("\neffects:")] if "\neffects:" in _TEXT else _TEXT[: _TEXT.find("\nprovenance:")]
+    text = f"{head}\neffects:\n  warp: {{a: 1.0}}\n  signal_delay:\n    delay_s: 9.0\n"
+    first, second = _faults(tmp_path, text)
+    last = len(text.splitlines())
+    assert first.startswith(f":{last - 2}: effects.warp") and second.startswith(
+        f":{last}: effects.signal_delay.delay_s: 9.0 outside"
+    )
+
+
+@pytest.mark.parametrize(
+    ("pattern", "value", "expected"),
+    [
+        (r"(?m)^    force_N:.*$", "    force_N: [0.0, 1.0]", "length >= 6"),
+        (r"(?m)^    force_N:.*$", "    force_N: [0.0, 1.0, 2.0, 3.0, 3.0, 5.0]", "force_N: expected ascending values"),
+        (
+            r"(?ms)^    coefficient:\n.*?^  softening",
+            "    coefficient: [[[0.4]]]\n  softening",
+            "coefficient: expected 6 x 6 x 8",
+        ),
+        (r"(?m)^    coefficients:.*$", "    coefficients: [-300.0]", "must be positive"),
+        (r"(?m)^  - pad_thickness_mm:.*$", "  - pad_thickness_mm: 99.0", "ascending"),
+        (r"(?m)^format:.*$", "format: 2", "<= 1"),
+        (r"(?m)^actuator:.*$", "actuator: ''", "length >= 1"),
+        (r"(?m)^actuator:.*$", "actuator: 5", "Expected `str`"),
+        (r"(?m)^    inner_heat_share:.*$", "    inner_heat_share: 0.99", "sum exceeds 1"),
+    ],
+)
+def test_shapes_and_relations(tmp_path, pattern, value, expected):
+    text, count = re.subn(pattern, value, _TEXT, count=1)
+    assert count == 1
+    (fault,) = _faults(tmp_path, text)
+    assert expected in fault and re.match(r":\d+: ", fault)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "empty"),
+        (b"- a\n- b\n", "expected keys"),
+        (b"format: [1\nmotor: {", "not YAML"),
+        (b"a: 1\n---\nb: 2\n", "not YAML"),
+        (b"\xff\xfe\x00", "not a readable text file"),
+        (b"a: &x [*x]\n", "unknown key"),
+        (b"\t- a", "not YAML"),
+    ],
+)
+def test_what_is_no_calibration_at_all(tmp_path, content, expected):
+    path = tmp_path / "calibration.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputErrors) as caught:
+        load_calibration(path)
+    assert any(expected in fault for fault in caught.value.faults)
+
+
+@given(st.text(max_size=200))
+def test_no_text_makes_the_reader_fall(text):
+    with pytest.raises(InputErrors):
+        load_yaml(resource("config/calibration.yaml"), Calibration, text)
+
+
+class _Everything(Struct, kw_only=True):
+    text: str
+    number: float
+    whole: int
+    flag: bool
+    numbers: tuple[float, ...] = ()
+    table: dict[str, dict[str, float]] = {}
+    nothing: str | None = None
+
+
+_words = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=12)
+_number = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(st.builds(_Everything, text=_words, number=_number, whole=st.integers(), flag=st.booleans(),
+                 numbers=st.lists(_number, max_size=4).map(tuple),
+                 table=st.dictionaries(_words, st.dictionaries(_words, _number, max_size=2), max_size=2)))  # fmt: skip
+def test_what_is_written_is_read(value):
+    """Through the calibration's own dumper: any text, also one that looks like a number, any finite number."""
+    text = dump_calibration(value)
+    assert load_yaml(resource("config/calibration.yaml"), _Everything, text) == value
+
+
+@given(st.floats(1e-6, 10.0), st.floats(1e-9, 1e-3), st.dictionaries(_words, _number, max_size=3))
+def test_calibration_round_trip(tmp_path_factory, constant, gain, figures):
+    provenance = msgspec.convert({"date": "2026-01-01", "tool": "0.1", "figures": figures, "logs": [{"log": "010", "sha256": "1e5"}]},
+                                 msgspec.structs.fields(Calibration)[-1].type)  # fmt: skip
+    motor = msgspec.structs.replace(_CALIBRATION.motor, torque_constant_Nm_per_A=constant, gear_gain_m_per_rad=gain)
+    changed = msgspec.structs.replace(_CALIBRATION, motor=motor, actuator="0815", provenance=provenance)
+    path = tmp_path_factory.mktemp("c") / "calibration.yaml"
+    save_calibration(changed, path)
+    assert load_calibration(path) == changed
+    assert yaml.safe_load(path.read_text())["motor"]["torque_constant_Nm_per_A"] == constant, "other readers read it otherwise"
+
+
+def test_hash_is_of_the_values_not_of_the_file(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text("# another formatting\n" + yaml.safe_dump(yaml.safe_load(_TEXT), default_flow_style=True, width=70))
+    same = load_calibration(path)
+    assert calibration_hash(same) == calibration_hash(_CALIBRATION)
+    assert calibration_hash(msgspec.structs.replace(same, provenance=None)) == calibration_hash(same)
+    assert calibration_hash(msgspec.structs.replace(same, pad_thickness_mm=9.0)) != calibration_hash(same)
+    assert re.fullmatch(r"[0-9a-f]{12}", calibration_hash(same))
+
+
+def test_parameters_are_the_calibration(parameters):
+    p = to_parameters(_CALIBRATION)
+    assert p["torque_constant"] == _CALIBRATION.motor.torque_constant_Nm_per_A
+    assert p["thermal"]["thickness"] == pytest.approx(1e-3 * _CALIBRATION.pad_thickness_mm)
+    assert p["thermal"]["node_position"][-1] == pytest.approx(p["thermal"]["thickness"])
+    for name, values in _CALIBRATION.effects.items():
+        assert all(p["effects"][name][key] == value for key, value in values.items())
+    assert all(parameters[k].tobytes() == p.tobytes() for k in range(4))
+
+
+def test_curves_between_measured_thicknesses():
+    """Compliance adds up: at a measured thickness the measured curve, between two the mean of their reciprocals."""
+    curves = _CALIBRATION.stiffness.curves
+    for curve in curves:
+        np.testing.assert_allclose(curve_at(curves, curve.pad_thickness_mm)[: len(curve.coefficients)], curve.coefficients)
+    low, high = curves[1], curves[2]
+    middle = curve_at(curves, 0.5 * (low.pad_thickness_mm + high.pad_thickness_mm))
+    expected = 2.0 / (1.0 / low.coefficients[0] + 1.0 / high.coefficients[0])
+    assert middle[0] == pytest.approx(expected)
+    stiffness = [
+        curve_at(curves, thickness)[0]
+        for thickness in np.linspace(curves[0].pad_thickness_mm, curves[-1].pad_thickness_mm, 40)
+    ]
+    assert np.all(np.diff(stiffness) < 0.0), "thicker pads are softer"
+    with pytest.raises(Exception, match="pad_thickness_mm: 40.0 is too far from the measured"):
+        curve_at(curves, 40.0)
+
+
+def test_shipped_configuration_is_valid():
+    setup = Setup(resource("config/emb.yaml"))
+    assert set(setup.calibrations) == {"FL", "FR", "RL", "RR"} and np.all(setup.parameters["gear_gain"] > 0.0)
+
+
+def test_setup_lists_the_faults_of_all_files(tmp_path):
+    (tmp_path / "emb.yaml").write_text(
+        "format: 1\ndbc: missing.dbc\ncorners:\n  FL: {calibration: a.yaml}\n  FR: {calibration: b.yaml}\n  RL: {calibration: c.yaml}\n"
+    )
+    (tmp_path / "a.yaml").write_text(_replaced("inertia_kg_m2", "x"))
+    (tmp_path / "c.yaml").write_text(_replaced("pad_thickness_mm", "77.0"))
+    with pytest.raises(InputErrors) as caught:
+        Setup(tmp_path / "emb.yaml")
+    faults = "\n".join(caught.value.faults)
+    for expected in (
+        "missing.dbc: no such file",
+        "a.yaml:",
+        "b.yaml: no such file",
+        "c.yaml: pad_thickness_mm: 77.0 is too far",
+    ):
+        assert expected in faults
+    assert len(caught.value.faults) == 4
+
+
+def test_configuration_faults(tmp_path):
+    path = tmp_path / "emb.yaml"
+    path.write_text(
+        "format: 1\ncorners: {XX: {calibration: c}, FL: {calibraton: c}}\nrealtime: {fifo_priority: 100, cpu: on}\nlog_level: loud\n"
+    )
+    with pytest.raises(InputErrors) as caught:
+        Setup(path)
+    faults = "\n".join(caught.value.faults)
+    for expected in (
+        ":2: corners.FL.calibraton: unknown key",
+        ":3: realtime.fifo_priority",
+        ":3: realtime.cpu",
+        ":4: log_level",
+    ):
+        assert expected in faults
+    path.write_text("format: 1\ncorners: {XX: {calibration: c}, YY: {calibration: c}}\n")
+    with pytest.raises(InputErrors) as caught:
+        Setup(path)
+    assert [fault.split(": ", 2)[1] for fault in caught.value.faults] == ["corners.XX", "corners.YY"]
+    assert math.prod(fault.count(":2: ") for fault in caught.value.faults) == 1

@@ -1,0 +1,313 @@
+"""Frames cut, late, corrupted, repeated, out of range and foreign: which flag rises after how many ticks, what sigma does, and
+that the first good frames bring everything back."""
+
+import numpy as np
+import pytest
+import wirekit
+from test_pipeline import _run, _sliding, car  # noqa: F401
+from wirekit import MS
+
+from emb_daemon.estimator import records as r
+from emb_daemon.pipeline import CYCLE_NS
+
+#: Cycles before the fault, in it, and after it; the last E2E error is shown for a second.
+_BEFORE, _DURING, _AFTER = 150, 100, 300
+
+
+def _fault(parameters, change, cycles=_BEFORE + _DURING + _AFTER, **options):
+    """Estimates of a drive whose frames of the middle part went through ``change(frame, cycle)``, which gives a list."""
+    frames = []
+    for cycle in range(cycles):
+        for frame in _sliding(1, first=cycle, **options):
+            frames += change(frame, cycle) if _BEFORE <= cycle < _BEFORE + _DURING else [frame]
+    frames = np.concatenate(frames)
+    return _run(parameters, frames[np.argsort(frames["time_ns"], kind="stable")])
+
+
+_ARGUMENTS = {"Counter": "counter", "Status": "status"}
+
+
+def _again(frame, **changes):
+    """The frame with some signals changed, protected anew."""
+    name, signals = wirekit.decode(frame[0])
+    del signals["CRC"]
+    signals = {_ARGUMENTS.get(key, key): value for key, value in (signals | changes).items()}
+    return wirekit.frame(name, int(frame["time_ns"][0]), **signals)
+
+
+def _drop(*can_ids):
+    return lambda frame, cycle: [] if frame["can_id"][0] in can_ids else [frame]
+
+
+def _at(estimates, cycle, sample=None):
+    found = estimates[estimates["cycle"] == cycle]
+    if sample is not None:
+        found = found[found["is_sample"] == sample]
+    assert len(found), f"nothing was said in cycle {cycle}"
+    return found[-1]
+
+
+def _raised(estimates, reason):
+    """Cycles in which a reason was raised."""
+    return estimates["cycle"][(estimates["reasons"] & reason) != 0]
+
+
+@pytest.fixture(scope="module")
+def good(car):  # noqa: F811
+    return _fault(car, lambda frame, cycle: [frame])[0]
+
+
+def test_an_undisturbed_drive_raises_nothing(good):
+    assert not good["reasons"].any() and np.all(good["mode"] == r.RUNNING)
+
+
+def test_resolver_cut(car, good):  # noqa: F811
+    """Predicted from the third cycle of silence, Degraded; sigma grows with every cycle; the first sample back is Fused."""
+    estimates, sent = _fault(car, _drop(0x100))
+    silent = np.arange(_BEFORE + 2, _BEFORE + _DURING)
+    gone = np.array([_at(estimates, cycle) for cycle in silent])
+    assert np.all(gone["source"] == r.PREDICTED) and np.all(gone["mode"] == r.DEGRADED)
+    assert np.array_equal(_raised(estimates, r.RESOLVER_LOST)[: len(silent)], silent)
+    assert np.all(np.diff(gone["sigma"]) >= 0.0) and np.all(np.diff(gone["sigma"][:10]) > 0.0)
+    assert gone["sigma"][0] > 3.0 * _at(estimates, _BEFORE - 1)["sigma"] and gone["sigma"][-1] > 10_000.0
+    assert np.array_equal(gone["age_cycles"], silent - (_BEFORE - 1))
+    back = _at(estimates, _BEFORE + _DURING, sample=True)
+    assert back["source"] == r.FUSED or back["source"] == r.STIFFNESS_ONLY
+    assert not back["reasons"] & r.RESOLVER_LOST
+    assert abs(back["force"] - _at(good, _BEFORE + _DURING)["force"]) < 3.0 * back["sigma"]
+    settled = _at(estimates, _BEFORE + _DURING + 20)
+    assert settled["source"] == r.FUSED and settled["reasons"] == 0
+    for frame in sent:
+        name, signals = wirekit.decode(frame)
+        cycle = int(frame["time_ns"]) // CYCLE_NS
+        if name == "EMB_FL_ClampForce" and cycle in silent:
+            assert signals["Status"] == 1 and signals["ForceSource"] == 3
+            assert signals["InputAge"] == min(4 * (cycle - _BEFORE + 1), 255)
+
+
+def test_everything_cut_in_the_clearance_grows_uncertain_too(car):  # noqa: F811
+    """Without force the local stiffness is zero, but the motor may be clamping unseen."""
+    estimates, _ = _run(car, np.concatenate(wirekit.drive(50)), end_ns=150 * CYCLE_NS)
+    last = estimates[-1]
+    assert last["source"] == r.PREDICTED and last["force"] == 0.0 and last["sigma"] > 5_000.0
+
+
+def test_current_cut(car, good):  # noqa: F811
+    """Each sample is answered 2 ms after it came, without its current: flag after 3 cycles, StiffnessOnly after 13."""
+    estimates, _ = _fault(car, _drop(0x110))
+    samples = estimates[estimates["is_sample"]]
+    assert len(samples) == len(good), "a sample was not answered"
+    raised = _raised(samples, r.CURRENT_LOST)
+    assert np.array_equal(raised, np.arange(_BEFORE + 3, _BEFORE + _DURING))
+    sources = samples["source"]
+    assert np.all(sources[_BEFORE : _BEFORE + 11] == r.FUSED)
+    assert np.all(sources[_BEFORE + 13 : _BEFORE + _DURING] == r.STIFFNESS_ONLY)
+    during = slice(_BEFORE + 13, _BEFORE + _DURING)
+    assert np.all(samples["sigma"][during] > good["sigma"][during])
+    assert samples["source"][_BEFORE + _DURING] == r.FUSED and not samples["reasons"][_BEFORE + _DURING]
+
+
+def test_current_is_waited_for_two_milliseconds(car):  # noqa: F811
+    """Time, not the next frame, ends the wait."""
+    from emb_daemon.pipeline import Pipeline
+
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    frames = np.concatenate(_sliding(3))
+    _, count = pipeline.collect(frames[:-1])
+    assert count == 2
+    assert pipeline.overdue(8 * MS + 2 * MS) == 0
+    assert pipeline.overdue(8 * MS + 2 * MS + 1) == 1
+    assert not pipeline.samples[0]["has_current"]
+
+
+@pytest.mark.parametrize(
+    ("can_id", "reason", "cycles"),
+    [
+        (0x120, r.THERMOCOUPLE_LOST, 63),
+        (0x180, r.WHEEL_SPEED_LOST, 63),
+        (0x181, r.WHEEL_PULSE_LOST, 63),
+        (0x182, r.VEHICLE_STATUS_LOST, 625),
+    ],
+)
+def test_slow_messages_cut(car, can_id, reason, cycles):  # noqa: F811
+    """Reported after 25 of their periods; gone with their first frame. The force goes on being fused."""
+    frames = [f for f in _sliding(1100) if f["can_id"][0] != can_id or not 100 <= round(f["time_ns"][0] / CYCLE_NS) < 1000]
+    estimates, _ = _run(car, np.concatenate(frames))
+    raised = _raised(estimates, reason)
+    assert abs(raised[0] - (100 + cycles)) <= 25 and raised[-1] in range(995, 1001)
+    assert np.all(np.diff(raised) == 1)
+    assert np.all(estimates["source"][1:] == r.FUSED)
+    assert estimates["reasons"][-1] == 0
+    assert np.abs(np.diff(estimates["stiffness_factor"])).max() < 1e-3, "the stiffness jumped when an input was lost"
+
+
+def test_corrupted(car, good):  # noqa: F811
+    """A resolver frame with a flipped bit is as good as lost, and E2E error is raised in the next answer, for a second."""
+
+    def flip(frame, cycle):
+        if frame["can_id"][0] == 0x100:
+            frame["data"] ^= np.uint64(1 << (cycle % 64))
+        return [frame]
+
+    estimates, _ = _fault(car, flip)
+    assert np.all(estimates["source"][(estimates["cycle"] >= _BEFORE + 2) & ~estimates["is_sample"]] == r.PREDICTED)
+    raised = _raised(estimates, r.E2E_ERROR)
+    assert raised[0] == _BEFORE + 2
+    assert raised[-1] == _BEFORE + _DURING - 1 + 249
+    assert not estimates["reasons"][-1]
+    assert np.array_equal(estimates["force"][:_BEFORE], good["force"][:_BEFORE])
+
+
+def test_one_corrupted_frame_costs_one_sample(car, good):  # noqa: F811
+    def flip(frame, cycle):
+        if frame["can_id"][0] == 0x100 and cycle == _BEFORE:
+            frame["data"] ^= np.uint64(1 << 40)
+        return [frame]
+
+    estimates, _ = _fault(car, flip)
+    assert np.all(estimates["is_sample"]) and _BEFORE not in estimates["cycle"] and len(estimates) == len(good) - 1
+    after = _at(estimates, _BEFORE + 1)
+    assert after["reasons"] == r.E2E_ERROR and after["source"] == r.FUSED and after["mode"] == r.DEGRADED
+    assert after["force"] == pytest.approx(_at(good, _BEFORE + 1)["force"], abs=after["sigma"])
+
+
+def test_repeated(car, good):  # noqa: F811
+    """Every frame twice: the second changes nothing but the flag."""
+    estimates, _ = _fault(car, lambda frame, cycle: [frame, frame])
+    assert np.array_equal(estimates["force"], good["force"]) and np.array_equal(estimates["sigma"], good["sigma"])
+    assert _raised(estimates, r.E2E_ERROR)[0] in (_BEFORE, _BEFORE + 1)
+
+
+def test_frozen_sender(car):  # noqa: F811
+    """The same resolver frame again and again is silence: Predicted after three cycles, for as long as it lasts."""
+    stuck = wirekit.frame("EMB_FL_Resolver", 0, (_BEFORE - 1) % 15, MotorAngle=19.0)
+
+    def freeze(frame, cycle):
+        if frame["can_id"][0] == 0x100:
+            same = stuck.copy()
+            same["time_ns"] = frame["time_ns"]
+            return [same]
+        return [frame]
+
+    estimates, _ = _fault(car, freeze)
+    cycles = np.arange(_BEFORE + 2, _BEFORE + _DURING)
+    assert np.array_equal(_raised(estimates, r.RESOLVER_LOST)[: len(cycles)], cycles)
+    assert all(_at(estimates, cycle)["source"] == r.PREDICTED for cycle in cycles)
+
+
+@pytest.mark.parametrize("late_ms", [1, 3, 6, 20])
+def test_late(car, good, late_ms):  # noqa: F811
+    """All frames late by as much: answered as late, with the same forces; silence is told of meanwhile."""
+
+    def delay(frame, cycle):
+        frame["time_ns"] += late_ms * MS
+        return [frame]
+
+    estimates, _ = _fault(car, delay)
+    samples = estimates[estimates["is_sample"]]
+    assert bool(len(_raised(estimates, r.RESOLVER_LOST))) == (late_ms > 8)
+    if late_ms < 4:
+        np.testing.assert_allclose(samples["force"], good["force"], atol=1.0)
+    last = samples[-1]
+    assert last["reasons"] == 0 and last["force"] == pytest.approx(good["force"][-1], abs=2.0 * last["sigma"])
+    assert last["cycle"] == good["cycle"][-1]
+
+
+def test_thermocouple_out_of_range(car, good):  # noqa: F811
+    """Refused whole: Out of range at the next answer, for a second; the last good temperatures stand."""
+
+    def broken(frame, cycle):
+        if frame["can_id"][0] != 0x120:
+            return [frame]
+        counter = int(frame["data"][0]) >> 8 & 15
+        return [wirekit.frame("EMB_FL_Thermocouple", int(frame["time_ns"][0]), counter, InnerBackplateTemp=3000.0)]
+
+    estimates, _ = _fault(car, broken)
+    raised = _raised(estimates, r.OUT_OF_RANGE)
+    assert raised[0] in range(_BEFORE, _BEFORE + 3) and raised[-1] in range(_BEFORE + _DURING + 240, _BEFORE + _DURING + 255)
+    assert not len(_raised(estimates, r.E2E_ERROR)) and not estimates["reasons"][-1]
+    assert np.abs(estimates["mean"] - good["mean"]).max() < 1.0
+
+
+def test_angle_that_no_motor_reaches(car, good):  # noqa: F811
+    """One sample 200 rad off: Out of range in that tick, contact uncertain, sigma up at once and down with sliding."""
+
+    def jump(frame, cycle):
+        if frame["can_id"][0] == 0x100 and cycle == _BEFORE + 50:
+            counter = cycle % 15
+            return [wirekit.frame("EMB_FL_Resolver", int(frame["time_ns"][0]), counter, MotorAngle=219.5, MotorSpeed=0.0)]
+        return [frame]
+
+    estimates, _ = _fault(car, jump)
+    cycle = _BEFORE + 50
+    assert list(_raised(estimates, r.OUT_OF_RANGE)) == [cycle, cycle + 1]
+    assert np.all(np.abs(estimates["force"] - good["force"])[cycle:] < 2.5 * estimates["sigma"][cycle:])
+    assert estimates["sigma"][cycle + 1] > 3.0 * good["sigma"][cycle + 1] and estimates["reasons"][cycle] & r.CONTACT_UNCERTAIN
+    assert estimates["sigma"][-1] < 0.5 * estimates["sigma"][cycle + 1]
+
+
+def test_resolver_that_lost_its_zero(car, good):  # noqa: F811
+    """Multi-turn angle counted anew from zero: the contact angle follows, the force does not jump to release."""
+    frames = _sliding(150) + [
+        _again(f, MotorAngle=wirekit.decode(f[0])[1]["MotorAngle"] - 19.0) if f["can_id"][0] == 0x100 else f
+        for f in _sliding(150, first=150)
+    ]
+    estimates, _ = _run(car, np.concatenate(frames))
+    assert list(_raised(estimates, r.OUT_OF_RANGE)) == [150]
+    assert np.all(np.abs(estimates["force"] - good["force"][:300])[150:] < 2.0 * estimates["sigma"][150:])
+    assert estimates["contact_angle"][-1] == pytest.approx(estimates["contact_angle"][149] - 19.0, abs=2.0)
+
+
+def test_speed_beyond_the_motor(car, good):  # noqa: F811
+    def wild(frame, cycle):
+        if frame["can_id"][0] == 0x100 and cycle == _BEFORE:
+            angle = wirekit.decode(frame[0])[1]["MotorAngle"]
+            return [wirekit.frame("EMB_FL_Resolver", int(frame["time_ns"][0]), cycle % 15, MotorAngle=angle, MotorSpeed=600.0)]
+        return [frame]
+
+    estimates, _ = _fault(car, wild)
+    assert list(_raised(estimates, r.OUTSIDE_RANGE)) == [_BEFORE]
+
+
+def test_foreign_frames_change_nothing(car, good):  # noqa: F811
+    """Other ids, extended, remote, error and FD frames, other corners, our own ids from others: not a bit differs."""
+    rng = np.random.default_rng(9)
+
+    def among(frame, cycle):
+        others = [
+            wirekit.record(int(frame["time_ns"][0]), int(can_id), rng.bytes(8))
+            for can_id in (0x0, 0x7FF, 0x184, 0x700, 0x101, 0x112, 0x200, 0x230)
+        ]
+        for flags in (1, 2, 4, 8):
+            other = frame.copy()
+            other["flags"] = flags
+            others.append(other)
+        return [*others, frame]
+
+    estimates, _ = _fault(car, among)
+    assert wirekit.same(estimates, good)
+
+
+def test_sender_that_says_it_is_faulty_is_not_used(car):  # noqa: F811
+    def faulty(frame, cycle):
+        if frame["can_id"][0] != 0x100:
+            return [frame]
+        return [wirekit.frame("EMB_FL_Resolver", int(frame["time_ns"][0]), cycle % 15, 2, MotorAngle=19.0)]
+
+    estimates, _ = _fault(car, faulty)
+    assert _raised(estimates, r.RESOLVER_LOST)[0] == _BEFORE + 2
+    assert _at(estimates, _BEFORE + _DURING, sample=True)["source"] in (r.FUSED, r.STIFFNESS_ONLY)
+
+
+def test_restarted_controller(car):  # noqa: F811
+    """Counters that begin anew cost one sample."""
+    frames = _sliding(100) + [
+        _again(f, Counter=(wirekit.decode(f[0])[1]["Counter"] + 7) % 15)
+        for f in _sliding(60, first=100)
+        if f["can_id"][0] in (0x100, 0x110)
+    ]
+    estimates, _ = _run(car, np.concatenate(frames))
+    samples = estimates[estimates["is_sample"]]
+    assert len(samples) == 159 and 100 not in samples["cycle"] and samples["cycle"][-1] == 159
+    assert samples["source"][-1] == r.FUSED

@@ -1,0 +1,200 @@
+"""Log files: our bulk reader beside python-can's, and what is said of files that are damaged."""
+
+import gzip
+
+import can
+import numpy as np
+import pytest
+import wirekit
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.errors import InputError
+from emb_daemon.logs.candump import format_candump, parse_candump
+from emb_daemon.logs.columns import Decoder, References
+from emb_daemon.logs.read import read_frames
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
+
+_messages = st.builds(
+    lambda stamp, extended, can_id, data, remote, error, rx: can.Message(
+        timestamp=stamp / 1e6,
+        is_extended_id=extended,
+        arbitration_id=can_id if extended else can_id & 0x7FF,
+        data=None if remote else data,
+        dlc=0 if remote else None,
+        is_remote_frame=remote and not error,
+        is_error_frame=error and not extended,
+        is_rx=rx,
+        channel="can0",
+    ),
+    st.integers(0, 1_900_000_000_000_000),
+    st.booleans(),
+    st.integers(0, 0x1FFF_FFFF),
+    st.binary(max_size=8),
+    st.booleans(),
+    st.just(False),
+    st.booleans(),
+)
+
+
+def _matches(frames, messages, tolerance_ns=2000):
+    assert len(frames) == len(messages)
+    for frame, message in zip(frames, messages, strict=True):
+        assert abs(int(frame["time_ns"]) - message.timestamp * 1e9) <= tolerance_ns
+        assert frame["can_id"] == message.arbitration_id
+        assert bool(frame["flags"] & EXTENDED) == message.is_extended_id
+        assert bool(frame["flags"] & REMOTE) == message.is_remote_frame
+        if not message.is_remote_frame:
+            assert int(frame["data"]).to_bytes(8, "little")[: frame["length"]] == bytes(message.data[:8])
+
+
+@given(st.lists(_messages, min_size=1, max_size=20))
+def test_candump_is_read_as_python_can_reads_it(tmp_path_factory, messages):
+    path = tmp_path_factory.mktemp("logs") / "x.log"
+    with can.CanutilsLogWriter(path) as writer:
+        for message in messages:
+            writer(message)
+    _matches(read_frames(path), list(can.CanutilsLogReader(path)))
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 2**60), st.integers(0, 2**64 - 1), st.integers(0, 2047), st.integers(0, 8)), max_size=20)
+)
+def test_what_we_write_we_read(rows):
+    frames = np.zeros(len(rows), FRAME)
+    for frame, (stamp, data, can_id, length) in zip(frames, rows, strict=True):
+        frame["time_ns"], frame["can_id"], frame["length"] = stamp // 1000 * 1000, can_id, length
+        frame["data"] = data & ((1 << (8 * length)) - 1)
+    parsed, bad_line, _ = parse_candump(format_candump(frames).encode())
+    assert bad_line == 0 and wirekit.same(parsed, frames)
+
+
+@pytest.mark.parametrize(
+    ("line", "can_id", "flags", "data"),
+    [
+        ("(1.5) vcan0 123#0011", 0x123, 0, b"\x00\x11"),
+        ("(1.500000) can0 123#", 0x123, 0, b""),
+        ("(1.500000000) can0 00000123#AA", 0x123, EXTENDED, b"\xaa"),
+        ("(1.5) can0 20000040#0000000000000000", 0x40, ERROR, bytes(8)),
+        ("(1.5) can0 123#R", 0x123, REMOTE, b""),
+        ("(1.5) can0 123#R8", 0x123, REMOTE, b""),
+        ("(1.5) can0 123##1" + "AB" * 12, 0x123, FD, b"\xab" * 8),
+        ("(1.5) can0 123#aabb R", 0x123, 0, b"\xaa\xbb"),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", ""])
+def test_lines_of_can_utils(line, can_id, flags, data, end):
+    frames, bad_line, _ = parse_candump((line + end).encode())
+    assert bad_line == 0 and len(frames) == 1
+    frame = frames[0]
+    assert (int(frame["time_ns"]), int(frame["can_id"]), int(frame["flags"]) & ~16) == (1_500_000_000, can_id, flags)
+    assert int(frame["data"]).to_bytes(8, "little")[: len(data)] == data
+
+
+_GOOD = "(1.000000) can0 100#00\n"
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["hello", "(1) can0 123#00", "(1.0 can0 123#00", "(1.0) can0 12#00", "(1.0) can0 123#0", "(1.0) can0 123#0G",
+     "(1.0) can0 123#001122334455667788", "(1.0) 123#00", "(1.0) can0 1234567#00", "1.0 can0 123#00", "(1.0)  123#00"],
+)  # fmt: skip
+def test_a_malformed_line_is_named(tmp_path, line):
+    path = tmp_path / "x.log"
+    path.write_text(_GOOD + line + "\n" + _GOOD)
+    with pytest.raises(InputError, match=rf"{path}:2: not a candump line"):
+        read_frames(path)
+
+
+@given(st.binary(max_size=60))
+def test_no_bytes_make_the_parser_fall(tail):
+    frames, bad_line, _ = parse_candump(_GOOD.encode() + tail)
+    assert len(frames) >= 1 and bad_line >= 0
+
+
+def test_a_line_cut_off_at_the_end_is_left_out_with_a_word(tmp_path, capsys):
+    path = tmp_path / "x.log"
+    path.write_text(_GOOD * 3 + "(2.000000) can0 10")
+    assert len(read_frames(path)) == 3
+    assert f"{path}: line 4 is cut off" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["random_6.5mm.log", "a.b.c.log.gz", "plain.log", "UPPER.LOG", "dots...log"])
+def test_names_with_dots(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(_GOOD.encode()) if name.endswith("gz") else _GOOD.encode())
+    assert len(read_frames(path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("none.log", None, "no such file"),
+        ("empty.log", b"", "holds no frames"),
+        ("blank.log", b"\n\n", "holds no frames"),
+        ("empty.log.gz", gzip.compress(b""), "holds no frames"),
+        ("damaged.log.gz", gzip.compress(_GOOD.encode() * 1000)[:-20], "damaged gzip"),
+        ("flipped.log.gz", gzip.compress(_GOOD.encode())[:12] + b"\xff\xff\xff", "damaged gzip"),
+        ("notes.txt", b"hello", "unknown log format"),
+        ("nothing", b"hello", "unknown log format"),
+        ("x.blf", b"not a blf file at all", "BLFReader"),
+        ("x.mf4", b"not an mf4 file at all", "MF4Reader"),
+        ("random.log", bytes(range(256)), "not a candump line"),
+    ],
+)
+def test_unusable_files_are_named_in_one_line(tmp_path, name, content, expected):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_frames(path)
+    assert str(path) in str(caught.value) and expected in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_folder_is_no_log(tmp_path):
+    (tmp_path / "x.log").mkdir()
+    with pytest.raises(InputError, match="directory"):
+        read_frames(tmp_path / "x.log")
+
+
+@pytest.mark.parametrize("ending", [".log", ".asc", ".blf", ".trc", ".mf4", ".log.gz", ".asc.gz"])
+def test_formats_of_python_can(tmp_path, ending):
+    """The same frames through every writer; text formats count time from the log's start."""
+    if ending == ".mf4":
+        pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    drive = [f[0] for f in wirekit.drive(30, start_ns=1_790_000_000_000_000_000, angle=np.arange(30.0))]
+    path = tmp_path / f"a.b{ending}"
+    with can.Logger(str(tmp_path / ("ab" + ending))) as writer:
+        for frame in drive:
+            data = int(frame["data"]).to_bytes(8, "little")
+            can_id = int(frame["can_id"])
+            writer(can.Message(1e-9 * float(frame["time_ns"]), can_id, False, data=data, channel=1))
+    (tmp_path / ("ab" + ending)).rename(path)
+    frames = read_frames(path)
+    assert np.array_equal(frames["can_id"], [f["can_id"] for f in drive])
+    assert np.array_equal(frames["data"], [f["data"] for f in drive])
+    assert np.all(frames["length"] == 8) and not np.any(frames["flags"] & (EXTENDED | REMOTE | ERROR | FD))
+    stamps = frames["time_ns"] - frames["time_ns"][0]
+    expected = np.array([int(f["time_ns"]) - int(drive[0]["time_ns"]) for f in drive])
+    assert np.abs(stamps - expected).max() <= 1_000_000
+
+
+def test_columns_are_the_signals_of_a_message():
+    frames = np.concatenate(wirekit.drive(25, angle=np.linspace(-3.0, 40.0, 25)))
+    columns = Decoder().columns(frames, "EMB_FL_Resolver")
+    np.testing.assert_allclose(columns["MotorAngle"], np.linspace(-3.0, 40.0, 25), atol=1.1e-4)
+    assert np.array_equal(columns["Counter"], np.arange(25) % 15)
+    assert len(Decoder().columns(frames, "EMB_RR_Resolver")["MotorAngle"]) == 0
+
+
+def test_reference_is_the_nearest_in_time_or_nothing():
+    """An instrument's frame of 1000 N every 4 ms; one cut short by the writer's end is no measurement."""
+    payload = bytes.fromhex("6400000000000000")
+    frames = np.concatenate([wirekit.record(4_000_000 * n, 0x700, payload) for n in range(10)])
+    frames[-1]["length"] = 3
+    reference = References(frames, "FL")
+    assert len(reference.time_ns) == 9
+    at = reference.at(np.array([0, 5_000_000, 6_100_000, 90_000_000, -1_000_000]), np.arange(9.0))
+    assert np.array_equal(at, [0.0, 1.0, 2.0, np.nan, 0.0], equal_nan=True)
+    nothing = References(np.zeros(0, FRAME), "FL")
+    assert np.all(np.isnan(nothing.at(np.array([0, 1]), nothing.clamp_force_N)))
