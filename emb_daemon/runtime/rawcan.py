@@ -139,6 +139,9 @@ class RawCanSocket:
         self.dropped = 0
         self.unsent = 0
         self.down = False
+        # Compiled now, not when the first frame is waiting.
+        self._take(0, self._last_drain_ns)
+        _to_kernel(self._frames[:0], 0, self._sent.raw)
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until a frame is there or the time is over."""
@@ -156,15 +159,17 @@ class RawCanSocket:
                 raise OSError(code, os.strerror(code))
             return self._frames[:0]
         self.down = False
-        offset = time.time_ns() - now
-        batch = self._received
-        drops = _from_kernel(
-            batch.raw, batch.headers, batch.control, count, self._stamped, offset, self._last_drain_ns, now, self._frames
-        )
+        drops = self._take(count, now)
         self._last_drain_ns = now
         if drops >= 0:
             self.dropped = drops
         return self._frames[:count]
+
+    def _take(self, count: int, now: int) -> int:
+        batch, offset = self._received, time.time_ns() - now
+        return _from_kernel(
+            batch.raw, batch.headers, batch.control, count, self._stamped, offset, self._last_drain_ns, now, self._frames
+        )
 
     def send(self, frames: np.ndarray) -> None:
         """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
