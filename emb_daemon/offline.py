@@ -1,7 +1,7 @@
 """Logs through the estimator without a bus: what replay, identify and diagnose stand on.
 
-`load_log` turns a log into samples once, by the daemon's own pipeline; `estimate` runs the daemon's own estimator over them, with
-any parameters, as often as one likes.
+`load_log` turns a log into samples once, by the daemon's own pipeline; `estimate` runs the daemon's own estimator over
+them, with any parameters, as often as one likes.
 """
 
 from dataclasses import dataclass

@@ -83,7 +83,7 @@ def test_estimates_never_see_the_future(parameters):
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
 def test_an_effect_at_zero_is_bit_for_bit_neutral(parameters, effect):
-    """Amplitudes at zero, whatever its shape parameters: the same bits as without the effect; at its prior it does something."""
+    """Amplitudes at zero, whatever its shape: the same bits as without the effect; at its prior it does something."""
     p = parameters[0]
     angle = p["clearance"] + 12.0 + 10.0 * np.sin(np.arange(600) * 0.02 - 2.0)
     angle = np.concatenate([np.linspace(0.0, angle[0], 100), angle])
