@@ -130,7 +130,8 @@ def clamp(p, s):
         angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error
     half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
-    x = s.driven_angle + grown(p, s) - p.contact_angle
+    # The clearance is what the motor turns until contact when closing.
+    x = s.driven_angle + half + grown(p, s) - p.contact_angle
     s.static_force = static_curve(p, x)
     hysteresis = e.stiffness_hysteresis
     if hysteresis.share != 0.0:
