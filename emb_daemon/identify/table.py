@@ -90,7 +90,7 @@ def table(result: Identification) -> list[Line]:
         lines.append(
             Line(
                 f"share of errors inside two sigma, {len(ours)} judged logs",
-                "1",
+                "",
                 "–",
                 thesis,
                 ours,

@@ -136,12 +136,12 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis, title_standoff=8)
     figure.update_layout(
-        height=total + 116,
-        margin={"l": 64, "r": 16, "t": 68, "b": 48},
+        height=total + 128,
+        margin={"l": 64, "r": 16, "t": 80, "b": 48},
         paper_bgcolor="white",
         plot_bgcolor="white",
         font={"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12.5, "color": INK},
-        legend={"orientation": "h", "yanchor": "bottom", "y": 1.0 + 24.0 / total, "xanchor": "right", "x": 1.0},
+        legend={"orientation": "h", "yanchor": "bottom", "y": 1.0 + 22.0 / total, "xanchor": "right", "x": 1.0},
         hovermode="x unified" if shared else "closest",
         hoverlabel={"font": {"size": 12}},
     )

@@ -1,0 +1,121 @@
+"""emb-daemon identify on logs of the simulated rig: targets, faults, provenance, report."""
+
+import contextlib
+import hashlib
+import io
+import re
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError
+from emb_daemon.identify.campaign import load_campaign
+
+
+def _campaign(folder, rig, text):
+    path = folder / "campaign.yaml"
+    head = f"rig: A\ncorner: FL\ndatasheet: {rig}/datasheet.yaml\npad_thickness_mm: 6.5\n"
+    path.write_text(head + text.replace("RIG", str(rig)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def identified(rig, tmp_path_factory):
+    """A campaign on three pad thicknesses with a missing, an empty and a wrong log, run once by the command."""
+    folder = tmp_path_factory.mktemp("identify")
+    (folder / "empty.log").write_text("")
+    campaign = _campaign(
+        folder,
+        rig,
+        """curves:
+  - {log: RIG/static/curve_0p5mm.log.gz, pad_thickness_mm: 0.5}
+  - {log: RIG/static/curve_6p5mm.log.gz}
+  - {log: RIG/static/curve_11p5mm.log.gz, pad_thickness_mm: 11.5}
+random:
+  - {log: RIG/static/random_0p5mm.log.gz, pad_thickness_mm: 0.5}
+  - {log: RIG/static/random_6p5mm.log.gz}
+  - {log: RIG/static/random_11p5mm.log.gz, pad_thickness_mm: 11.5}
+  - {log: gone.log.gz, pad_thickness_mm: 3.5}
+  - {log: empty.log, pad_thickness_mm: 3.5}
+  - {log: RIG/static/curve_3p5mm.log.gz, pad_thickness_mm: 3.5}
+frequency_response:
+  - {log: RIG/static/sine_0p6Hz.log.gz, frequency_Hz: 0.6, pad_thickness_mm: 10.0}
+  - {log: RIG/static/sine_1p7Hz.log.gz, frequency_Hz: 1.7, pad_thickness_mm: 10.0}
+  - {log: RIG/static/sine_5Hz.log.gz, frequency_Hz: 5.0, pad_thickness_mm: 10.0}
+""",
+    )
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "report")])
+    outputs = {"out": out.getvalue(), "err": err.getvalue()}
+    assert status == 0, outputs["err"]
+    return folder, outputs
+
+
+def test_calibration_loads_and_reaches_the_targets_on_logs_that_fitted_nothing(identified):
+    folder, outputs = identified
+    calibration = load_calibration(folder / "c.yaml")
+    assert np.isfinite(to_parameters(calibration)["curve"]).all()
+    figures = calibration.provenance.figures
+    for thickness in ("0.5", "6.5", "11.5"):
+        of = {path: figures[f"random, {thickness} mm: {path} rmse_N"] for path in ("stiffness", "torque", "fused")}
+        assert of["stiffness"] <= 120.0 and of["torque"] <= 550.0
+        assert of["fused"] <= 1.05 * min(of["stiffness"], of["torque"])
+        assert 0.90 <= figures[f"random, {thickness} mm: inside_two_sigma"] <= 0.99
+    assert "MISSED" not in outputs["out"]
+
+
+def test_every_log_that_cannot_serve_is_named_with_what_was_needed(identified):
+    _, outputs = identified
+    lines = outputs["err"].splitlines()
+    for name in ("gone.log.gz", "empty.log", "curve_3p5mm"):
+        (line,) = [line for line in lines if name in line]
+        assert "needed" in line
+    assert any("nominal" in line for line in lines), "heat without logs must be said to be nominal"
+
+
+def test_provenance_names_each_log_with_its_hash_and_each_value_with_its_sigma(identified, rig):
+    folder, _ = identified
+    provenance = load_calibration(folder / "c.yaml").provenance
+    hashes = {source.log: source.sha256 for source in provenance.logs}
+    name = f"{rig}/static/random_6p5mm.log.gz"
+    assert hashes[name] == hashlib.sha256((rig / "static/random_6p5mm.log.gz").read_bytes()).hexdigest()
+    for key in ("stiffness.relaxation_time_s", "effects.second_relaxation.share", "motor.torque_constant_Nm_per_A"):
+        assert provenance.sigmas[key] > 0.0
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", provenance.date)
+
+
+def test_report_is_one_file_that_fetches_nothing(identified):
+    folder, _ = identified
+    assert [path.name for path in (folder / "report").iterdir()] == ["report.html"]
+    page = (folder / "report/report.html").read_text()
+    assert page.count("Plotly.newPlot(place") == 1
+    assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="http', page)
+    assert "All" in page and "Frequency response" in page and "gone.log.gz" in page
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("curvs: []\n", r"campaign.yaml:5: curvs: unknown key; did you mean curves\?"),
+        ("corner: FL\n", "corner: stands here twice"),
+        ("curves:\n  - {pad_thickness_mm: 3}\n", "curves.*log: missing"),
+        ("random:\n  - {log: a.log, pad_thickness_mm: -1}\n", "pad_thickness_mm: Expected"),
+        ("dbc: nowhere.dbc\n", "nowhere.dbc: no such file"),
+        ("curves: []\n", "curves, random: no usable log; needed: slow clamp"),
+    ],
+)
+def test_unusable_campaigns_end_with_one_clear_line(rig, tmp_path, capsys, text, expected):
+    campaign = _campaign(tmp_path, rig, text)
+    assert main(["identify", str(campaign), "--output", str(tmp_path / "c.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert re.search(expected, error), error
+    assert not (tmp_path / "c.yaml").exists()
+
+
+def test_missing_campaign_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load_campaign(tmp_path / "none.yaml")
