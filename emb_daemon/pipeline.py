@@ -238,7 +238,7 @@ def _complete(b, index, with_current, count):
 
 @njit
 def _head(b, row, index, age):
-    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and what is amiss around the estimator."""
+    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and what is amiss around it."""
     corner = b.corners[index]
     now = corner.sample_ns + age * CYCLE_NS
     row.corner = index
