@@ -17,7 +17,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import pack
-from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
+from emb_daemon.wire.receive import ACCEPTED, SECOND_SENDER, new_reception, receive
 
 CYCLE_NS = 4_000_000
 CYCLE_S = 0.004
@@ -34,7 +34,8 @@ _REFUSED_NS = 1_000_000_000
 _OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
 
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
-#: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then.
+#: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
+#: ``stranger_ns`` when somebody else last sent one of our messages.
 CORNER = np.dtype(
     [
         ("active", "?"),
@@ -48,12 +49,16 @@ CORNER = np.dtype(
         ("cycle", "i8"),
         ("announced", "i8"),
         ("predicted", "i8"),
+        ("stranger_ns", "i8"),
     ],
     align=True,
 )
 
 #: E2E counters of what is sent, by message and corner.
 TRANSMISSION = np.dtype([("counter", "i8", (4, 4))], align=True)
+
+#: Which predictions `_overdue` makes.
+_NONE, _ALL, _NEWEST = range(3)
 
 #: Rows that one frame can give besides predictions: each corner's overdue sample, and the sample that the frame completes.
 _ROWS_A_FRAME = 8
@@ -90,6 +95,7 @@ class Pipeline:
         self.corners = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
+        self.corners["stranger_ns"] = -2 * _REFUSED_NS
         self.samples = np.zeros(capacity, SAMPLE)
         self.estimates = np.zeros(capacity, ESTIMATE)
         self.frames = np.zeros(4 * capacity, FRAME)
@@ -107,11 +113,13 @@ class Pipeline:
         """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the buffer of samples is nearly full.
 
         Returns (index of the next frame, number of rows in ``self.samples``)."""
-        return _collect(self._buffers, frames, start, predictions)
+        return _collect(self._buffers, frames, start, _ALL if predictions else _NONE)
 
     def overdue(self, time_ns: int, count: int = 0) -> int:
-        """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then."""
-        return _overdue(self._buffers, time_ns, True, count)
+        """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then.
+
+        A corner that owes several predictions gives the newest alone: the others would be news of the past."""
+        return _overdue(self._buffers, time_ns, _NEWEST, count)
 
     def answer(self, count: int) -> None:
         """Estimate the first ``count`` rows of ``self.samples`` into ``self.estimates``."""
@@ -138,6 +146,8 @@ def _collect(b, frames, start, predictions):
             break
         start += 1
         slot, verdict = receive(frame, b.receptions, b.layout[0])
+        if verdict == SECOND_SENDER:
+            _note_stranger(b, frame)
         if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES == wire.THERMOCOUPLE:
             continue
         index = slot // wire.CORNER_MESSAGES
@@ -160,6 +170,14 @@ def _collect(b, frames, start, predictions):
 
 
 @njit
+def _note_stranger(b, frame):
+    for kind in range(len(b.layout[0].sent_cycle_ns)):
+        for index in range(4):
+            if b.layout[0].sent_id[kind, index] == frame.can_id:
+                b.corners[index].stranger_ns = frame.time_ns
+
+
+@njit
 def _overdue(b, time_ns, predictions, count):
     for index in range(4):
         corner = b.corners[index]
@@ -167,8 +185,10 @@ def _overdue(b, time_ns, predictions, count):
             continue
         if corner.pending >= 0 and time_ns - corner.pending_ns > _PAIRING_NS:
             count = _complete(b, index, False, count)
+        if predictions == _NEWEST:
+            corner.predicted = max(corner.predicted, (time_ns - corner.sample_ns) // CYCLE_NS - LATE_CYCLES)
         while (
-            predictions
+            predictions != _NONE
             and time_ns - corner.sample_ns >= (LATE_CYCLES + corner.predicted) * CYCLE_NS
             and count + _ROWS_A_FRAME < len(b.samples)
         ):
@@ -269,6 +289,8 @@ def _head(b, row, index, age):
             reasons |= r.E2E_ERROR
         if now - b.receptions[slot].range_ns < _REFUSED_NS:
             reasons |= r.OUT_OF_RANGE
+    if now - corner.stranger_ns < _REFUSED_NS:
+        reasons |= r.SECOND_SENDER
     row.reasons = reasons
 
 

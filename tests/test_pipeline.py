@@ -59,8 +59,9 @@ def _run(parameters, frames, corners=("FL",), begin_ns=0, end_ns=None, cuts=(), 
             start, count = pipeline.consume(batch, start)
             estimates.append(pipeline.estimates[:count].copy())
             sent.append(pipeline.broadcast(count).copy())
-    if end_ns is not None:
-        count = pipeline.overdue(end_ns)
+    last_ns = int(frames["time_ns"][-1]) if len(frames) else begin_ns
+    for now in range(last_ns + CYCLE_NS, (end_ns or 0) + 1, CYCLE_NS):
+        count = pipeline.overdue(now)
         pipeline.answer(count)
         estimates.append(pipeline.estimates[:count].copy())
         sent.append(pipeline.broadcast(count).copy())
@@ -163,6 +164,43 @@ def test_before_the_first_sample_nothing_may_be_used(car):
         assert signals["Status"] == 15, name
         if name == "EMB_FL_ClampForce":
             assert signals["ForceSource"] == 15 and signals["ClampForceSigma"] == pytest.approx(65.535)
+
+
+def test_after_a_stall_of_the_loop_the_newest_prediction_goes_out_and_no_flood(car):
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    assert pipeline.overdue(2500 * CYCLE_NS) == 1
+    assert pipeline.samples["age_cycles"][0] == 2500
+    assert pipeline.overdue(2501 * CYCLE_NS) == 1
+
+
+def test_after_a_tenth_of_a_second_of_silence_the_force_is_a_fault_until_the_next_sample(car):
+    log = _log()
+    end = int(log["time_ns"][-1]) + 60 * CYCLE_NS
+    estimates, sent = _run(car, log, end_ns=end)
+    silent = estimates[~estimates["is_sample"]]
+    predicted = silent["age_cycles"] * 0.004 <= 0.1
+    assert predicted.any() and not predicted.all()
+    assert np.all(silent["source"] == np.where(predicted, r.PREDICTED, r.INVALID))
+    assert np.all(silent["mode"] == np.where(predicted, r.DEGRADED, r.FAULT))
+    assert np.all(silent["reasons"] & r.RESOLVER_LOST)
+    _, signals = wirekit.decode(sent[sent["can_id"] == 0x200][-1])
+    assert signals["Status"] == 2
+    again = _sliding(5, first=int(estimates["cycle"][-1]) + 5)
+    resumed, _ = _run(car, np.concatenate([log, *again]))
+    assert resumed[-1]["source"] in (r.FUSED, r.STIFFNESS_ONLY) and not resumed[-1]["reasons"] & r.RESOLVER_LOST
+
+
+def test_somebody_else_who_sends_our_messages_is_reported(car):
+    log = _log()
+    stranger = np.zeros(1, FRAME)
+    stranger["can_id"], stranger["length"], stranger["time_ns"] = 0x200, 8, log["time_ns"][len(log) // 2]
+    estimates, _ = _run(car, np.insert(log, len(log) // 2, stranger))
+    shown = (estimates["reasons"] & r.SECOND_SENDER) != 0
+    at = np.searchsorted(estimates["time_ns"], stranger["time_ns"][0], side="right")
+    assert shown[at] and not shown[: at - 1].any(), "from the next sample on"
+    plain, _ = _run(car, log)
+    assert np.array_equal(plain["force"], estimates["force"]), "and changes no force"
 
 
 def test_sample_route_equals_frame_route(car, rig):

@@ -39,6 +39,8 @@ from emb_daemon.models.torque import friction_state, torque_balance, unexplained
 #: The current is averaged over this time before its sample (wire contract), s.
 _CYCLE_S = 0.004
 _ONE_CYCLE_S = 1.5 * _CYCLE_S
+#: Without a resolver sample for this long the last force is no estimate any more: the brake may have opened and closed, s.
+SILENCE_S = 0.1
 #: Clamp force from which pads and disc exchange heat by contact, N.
 TOUCHING_N = 200.0
 #: Wheel speed from which pads heat: the sensor's noise at standstill does not.
@@ -334,9 +336,12 @@ def _temperatures(s, out):
 
 @njit
 def predict(s, p, age, out):
-    """What can be said ``age`` seconds after the last sample: the last force, and how far it may have moved since."""
+    """What can be said ``age`` seconds after the last sample: the last force, and how far it may have moved since.
+
+    After `SILENCE_S` nothing can: then the source is Invalid.
+    """
     out.mode = RUNNING if s.started else INIT
-    out.source = PREDICTED if s.started else INVALID
+    out.source = PREDICTED if s.started and age <= SILENCE_S else INVALID
     out.reasons = 0
     # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
     reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * age, p.curve)

@@ -72,7 +72,7 @@ def _scan(estimates, count, receptions, arrivals, reported):
         if estimate.is_sample:
             base = CORNER_MESSAGES * corner
             arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
-        if estimate.source == records.INVALID and estimate.mode != records.INIT:
+        if estimate.is_sample and estimate.source == records.INVALID:
             invalid += 1
         # What disturbs the loop is logged once, not for each corner.
         state = estimate.mode << 16 | estimate.reasons & ~_OF_THE_LOOP
@@ -165,7 +165,7 @@ class Daemon:
         """Everything that has arrived, answered."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
         while True:
-            start, count = pipeline.collect(frames, start)
+            start, count = pipeline.collect(frames, start, predictions=False)
             if start >= len(frames):
                 count = pipeline.overdue(now_ns, count)
             pipeline.answer(count)
