@@ -107,5 +107,5 @@ def _shade(axes, time: np.ndarray, where: np.ndarray, label: str) -> None:
         left, right = time[start], time[min(end, len(time) - 1)]
         axes.axvspan(left, right, color="#f0ead6", zorder=0)
         axes.text(
-            0.5 * (left + right), 0.02, label, transform=axes.get_xaxis_transform(), ha="center", color="#8a7f5c", fontsize=9
+            0.5 * (left + right), 0.93, label, transform=axes.get_xaxis_transform(), ha="center", color="#8a7f5c", fontsize=9
         )

@@ -22,6 +22,7 @@ from emb_daemon.runtime.daemon import Daemon
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.rawcan import socket_pair
 from emb_daemon.runtime.realtime import settle_memory, use_fifo
+from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS
 
 _VIEW_S, _LINE_S = 0.25, 3.0
@@ -75,6 +76,9 @@ class Session:
         self.daemon.warm_up()
         self.live.warm_up()
         self.recorder.compare(0)
+        for sender, receiver in (self._buses, self._buses[::-1]):
+            sender.send(np.zeros(1, FRAME))
+            receiver.drain()
         settle_memory()
 
     def run(self, show, period_s: float) -> None:
