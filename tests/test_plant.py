@@ -261,6 +261,15 @@ def test_the_daemons_estimator_follows_a_unit_it_was_not_calibrated_on(calibrati
     assert np.max(np.abs(estimates["mean"] - truth["mean"])[10:]) < 5.0
 
 
+def test_a_flickering_resolver_does_not_wear_friction_away(calibration):
+    """A converter without hysteresis flickers between two counts; held forces must not drift for it."""
+    plant = plant_from_calibration(calibration, seed=1)
+    plant["angle_hysteresis"], plant["angle_noise"] = 0.0, 0.2 * plant["angle_count"]
+    frames, truth = scenarios.simulate_log(plant, scenarios.city_drive(), seed=1)
+    error = estimate(log_of(frames).samples, to_parameters(calibration))["force"] - truth["force"][:, 0]
+    assert np.sqrt(np.mean(error**2)) < 40.0
+
+
 def test_the_plant_can_have_every_effect_of_the_catalogue():
     for effect in REGISTRY:
         assert [field.name for field in EFFECTS[effect.name]] == [parameter.name for parameter in effect.parameters]

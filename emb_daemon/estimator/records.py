@@ -157,6 +157,7 @@ STATE = np.dtype(
         ("slope", "f8"),
         # Torque path.
         ("friction_state", "f8"),
+        ("slid_angle", "f8"),
         ("friction_variance", "f8"),
         ("torque_age", "f8"),
         ("balance", "f8"),

@@ -53,6 +53,9 @@ _HEAT_STEP_S = 0.046
 _DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
 _SELF_LOCKING = 0.2
+#: Half a count of a 4096-count resolver: a reading that flickers between two counts at standstill would otherwise turn the
+#: friction state over and over, until it forgets which way the motor came.
+_FLICKER_RAD = 0.0008
 #: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
 _SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
@@ -63,7 +66,7 @@ _TORQUE_GAIN_WALK = 1e-9
 @njit
 def _start(s, p, m):
     s.started = True
-    s.angle = m.angle
+    s.angle = s.slid_angle = m.angle
     s.speed = m.speed
     s.contact_angle = m.angle + p.clearance
     s.past_contact = -p.clearance
@@ -88,6 +91,7 @@ def _follow_zero(s, p, m):
     if abs(jump) <= _SPEED_MARGIN * reach + _ANGLE_MARGIN:
         return False
     s.angle += jump
+    s.slid_angle += jump
     s.contact_angle += jump
     s.covariance[1, 1] += reach * reach
     return True
@@ -212,8 +216,10 @@ def _torque(s, p, m):
     the torque is NaN where it says nothing.
     """
     travel = m.angle - s.angle
+    slid = min(max(s.slid_angle, m.angle - _FLICKER_RAD), m.angle + _FLICKER_RAD) - s.slid_angle
+    s.slid_angle += slid
     s.friction_state, mean, s.friction_variance = friction_state(
-        s.friction_state, s.friction_variance, travel, p.presliding_angle, _DISSOLVING_PER_S, m.dt
+        s.friction_state, s.friction_variance, slid, p.presliding_angle, _DISSOLVING_PER_S, m.dt
     )
     e, mean_speed = p.effects, 0.5 * (m.speed + s.speed)
     gear, friction = effects.gear(e, m.angle, travel, mean_speed, mean)
