@@ -260,6 +260,7 @@ def _softening_log(bursts_s, mean_C, law, parameters, rng, duration_s):
 
 def _stiffness_parameters():
     p = np.zeros(1, PARAMETERS)
+    p["gear_gain"] = 4e-5
     p["curve"][0, :3] = 230.0, 27.0, 0.45
     p["relaxation_time"] = 0.028
     p["clearance"] = 5.0

@@ -173,9 +173,9 @@ def identify(campaign: Campaign, progress: Progress = _quiet) -> Identification:
     progress(0.2, "each thickness from the others")
     folds = _folds(result)
     progress(0.35, "noise levels, frequency response, gears")
+    _gears(result)
     _noise(result, folds)
     _frequency(result)
-    _gears(result)
     _heat(result, lambda share, text: progress(0.4 + 0.5 * share, text))
     progress(0.9, "judging")
     result.calibration = _calibration(result)
@@ -465,7 +465,13 @@ def _noise_of(result: Identification, folds: list[Fold], interpolation: float = 
     else:
         errors = _second_halves(result)
         torque = [(log, result.thesis_torque if thesis else result.torque) for log in logs]
-    return noise_levels(errors, torque, actuator.gear_gain_m_per_rad, speed, interpolation)
+    levels = noise_levels(errors, torque, actuator.gear_gain_m_per_rad, speed, interpolation)
+    worn = np.array([(his if thesis else ours).load_friction for _, ours, his in result.gears])
+    if len(worn) < 2:
+        return levels
+    # The daemon is not told how worn its gear is.
+    wear = float(np.std(worn, ddof=1)) / actuator.gear_gain_m_per_rad
+    return msgspec.structs.replace(levels, torque_relative=float(np.hypot(levels.torque_relative, wear)))
 
 
 def _second_halves(result: Identification) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -133,9 +133,17 @@ class DynamicsFit:
     residuals: dict[str, np.ndarray] = field(repr=False)
 
 
+def _blank() -> np.ndarray:
+    """PARAMETERS, shape (1,), of a brake without curve, lag or effects."""
+    parameters = np.zeros(1, PARAMETERS)
+    # What effects add to the pads' way is divided by it, even when it is nothing.
+    parameters["gear_gain"] = 1.0
+    return parameters
+
+
 def with_dynamics(values: dict[str, float]) -> np.ndarray:
     """PARAMETERS, shape (1,), in which only the shared dynamics are set."""
-    parameters = np.zeros(1, PARAMETERS)
+    parameters = _blank()
     for name, effect in DYNAMICS:
         value = values.get(name, 0.0)
         if effect is None:
@@ -319,7 +327,7 @@ def fit_dynamics(
     first_contact = len(x)
     for (g, _), guess in zip(logs, guesses, strict=True):
         add(guess - 0.02 * spans[g], 0.005 * spans[g])
-    scratch = np.zeros(1, PARAMETERS)
+    scratch = _blank()
 
     def set_dynamics(values):
         for index, name in enumerate(names):
