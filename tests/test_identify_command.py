@@ -116,6 +116,25 @@ def test_unusable_campaigns_end_with_one_clear_line(rig, tmp_path, capsys, text,
     assert not (tmp_path / "c.yaml").exists()
 
 
+def test_a_rig_with_another_bus_layout_is_refused(rig, tmp_path):
+    text = (rig / "rig.dbc").read_text()
+    (tmp_path / "other.dbc").write_text(
+        text.replace("SG_ MotorAngle : 16|24@1- (0.0002,0)", "SG_ MotorAngle : 16|24@1- (0.0004,0)")
+    )
+    load_campaign(_campaign(tmp_path, rig, "dbc: RIG/rig.dbc\n"))
+    with pytest.raises(InputError, match="EMB_FL_Resolver: expected id, signals and factors"):
+        load_campaign(_campaign(tmp_path, rig, "dbc: other.dbc\n"))
+
+
+def test_same_campaign_gives_the_same_calibration_but_for_its_date(identified, monkeypatch):
+    folder, _ = identified
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert main(["identify", str(folder / "campaign.yaml"), "--output", str(folder / "again.yaml")]) == 0
+    first, again = ((folder / name).read_text() for name in ("c.yaml", "again.yaml"))
+    assert "1970-01-02" in again
+    assert re.sub(r"\d{4}-\d\d-\d\d", "", first) == re.sub(r"\d{4}-\d\d-\d\d", "", again)
+
+
 def test_missing_campaign_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_campaign(tmp_path / "none.yaml")

@@ -13,9 +13,11 @@ from msgspec import Meta
 
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Positive, Struct
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log, corner_index, load_log
+from emb_daemon.resources import resource
+from emb_daemon.wire.layout import load_database
 
 
 class Trial(Struct, kw_only=True):
@@ -248,6 +250,27 @@ class Campaign:
         return log
 
 
+def _check_dbc(path: Path, corner: str) -> None:
+    """Refuse a rig whose bus is laid out otherwise than the daemon's: its logs would be misread in silence."""
+    theirs, ours = load_database(path), load_database(resource("dbc/emb.dbc"))
+    names = [f"EMB_{corner}_Resolver", f"EMB_{corner}_Current", f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"]
+    faults = []
+    for name in names:
+        try:
+            found, expected = theirs.get_message_by_name(name), ours.get_message_by_name(name)
+        except KeyError:
+            faults.append(f"{path}: {name}: missing")
+            continue
+        layouts = [
+            (message.frame_id, [(s.name, s.start, s.length, s.is_signed, s.scale, s.offset) for s in message.signals])
+            for message in (found, expected)
+        ]
+        if layouts[0] != layouts[1]:
+            faults.append(f"{path}: {name}: expected id, signals and factors as in the daemon's own DBC")
+    if faults:
+        raise InputErrors(faults)
+
+
 def load_campaign(path: str | Path) -> Campaign:
     """Read a campaign and its datasheet; no log is read yet.
 
@@ -259,6 +282,6 @@ def load_campaign(path: str | Path) -> Campaign:
     file = load_yaml(path, CampaignFile)
     corner_index(file.corner)
     datasheet = load_yaml(path.parent / file.datasheet, Datasheet)
-    if file.dbc is not None and not (path.parent / file.dbc).is_file():
-        raise InputError(f"{path}: dbc: {path.parent / file.dbc}: no such file")
+    if file.dbc is not None:
+        _check_dbc(path.parent / file.dbc, file.corner)
     return Campaign(path, file, datasheet)

@@ -46,7 +46,8 @@ footer { margin-top: 56px; border-top: 1px solid var(--line); padding-top: 12px;
 @page { size: A4; margin: 14mm; }
 @media print {
   body { font-size: 10.5pt; } main { max-width: none; padding: 0; } nav { display: none; }
-  h2 { break-after: avoid; } figure, tr, .verdict { break-inside: avoid; } .scroll { overflow: visible; }
+  h2, h3 { break-after: avoid; } .modebar-container { display: none; }
+  figure, tr, .verdict { break-inside: avoid; } .scroll { overflow: visible; }
   .verdict { -webkit-print-color-adjust: exact; print-color-adjust: exact; }
 }
 """
