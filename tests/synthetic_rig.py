@@ -94,7 +94,7 @@ def _log(truth: Truth, thickness: float, path: np.ndarray, name: str, rng: np.ra
     parameters["curve"][0, :3] = truth.curves[thickness]
     force = simulate(samples, truth.clearance, parameters)
     t = truth.torque
-    mean, _ = friction_means(path, t["presliding_angle_rad"])
+    mean, _ = friction_means(path, t["presliding_angle_rad"], flicker=0.0)
     half = np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     # What the estimator sees of force: without the delay of the reference's clock, a detail of half a millisecond.
     torque = GEAR_GAIN * half + t["inertia_kg_m2"] * np.r_[0.0, np.diff(speed)] / CYCLE_S

@@ -34,7 +34,7 @@ from emb_daemon.models.thermal import (
     mean_temperature,
     stiffness_factor,
 )
-from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
+from emb_daemon.models.torque import friction_state, slid_angle, torque_balance, unexplained_torque
 
 #: The current is averaged over this time before its sample (wire contract), s.
 _CYCLE_S = 0.004
@@ -53,9 +53,8 @@ _HEAT_STEP_S = 0.046
 _DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
 _SELF_LOCKING = 0.2
-#: Half a count of a 4096-count resolver: a reading that flickers between two counts at standstill would otherwise turn the
-#: friction state over and over, until it forgets which way the motor came.
-_FLICKER_RAD = 0.0008
+#: Half a count of a 4096-count resolver.
+FLICKER_RAD = 0.0008
 #: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
 _SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
@@ -216,7 +215,7 @@ def _torque(s, p, m):
     the torque is NaN where it says nothing.
     """
     travel = m.angle - s.angle
-    slid = min(max(s.slid_angle, m.angle - _FLICKER_RAD), m.angle + _FLICKER_RAD) - s.slid_angle
+    slid = slid_angle(s.slid_angle, m.angle, FLICKER_RAD) - s.slid_angle
     s.slid_angle += slid
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, _DISSOLVING_PER_S, m.dt

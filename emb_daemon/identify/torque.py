@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from emb_daemon.estimator.step import FLICKER_RAD
 from emb_daemon.identify.fitting import CLUSTER, clustered_covariance
 from emb_daemon.jit import njit
-from emb_daemon.models.torque import friction_state
+from emb_daemon.models.torque import friction_state, slid_angle
 from emb_daemon.offline import Log
 from emb_daemon.pipeline import CYCLE_S
 
@@ -25,17 +26,18 @@ _KNOWN = 0.01
 
 
 @njit
-def _friction_means(angle, presliding_angle, mean, variance):
-    state, spread = 0.0, 1.0
+def _friction_means(angle, presliding_angle, flicker, mean, variance):
+    state, spread, slid = 0.0, 1.0, angle[0]
     for row in range(1, len(angle)):
-        state, mean[row], spread = friction_state(state, spread, angle[row] - angle[row - 1], presliding_angle, 0.0, CYCLE_S)
+        before, slid = slid, slid_angle(slid, angle[row], flicker)
+        state, mean[row], spread = friction_state(state, spread, slid - before, presliding_angle, 0.0, CYCLE_S)
         variance[row] = spread
 
 
-def friction_means(angle: np.ndarray, presliding_angle: float) -> tuple[np.ndarray, np.ndarray]:
+def friction_means(angle: np.ndarray, presliding_angle: float, flicker: float = FLICKER_RAD) -> tuple[np.ndarray, np.ndarray]:
     """Mean friction state over each cycle and its variance, by the estimator's own model."""
     mean, variance = np.zeros(len(angle)), np.ones(len(angle))
-    _friction_means(angle, presliding_angle, mean, variance)
+    _friction_means(angle, presliding_angle, flicker, mean, variance)
     return mean, variance
 
 
@@ -85,6 +87,8 @@ class _Regression:
         self.rows = rows[full_rate & known]
         self.angle = angle
         self.path = str(log.path)
+        # The thesis takes the sign of every angle difference.
+        self.flicker = 0.0 if sign_model else FLICKER_RAD
         r = self.rows
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
         self.current = samples["current_q"][r]
@@ -96,7 +100,7 @@ class _Regression:
 
     def matrices(self, presliding_angle: float):
         """Regressors (n, 4), instruments (n, 4), rows where the friction state is known."""
-        mean, variance = friction_means(self.angle, presliding_angle)
+        mean, variance = friction_means(self.angle, presliding_angle, self.flicker)
         s = mean[self.rows]
         regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
         instruments = regressors.copy()
@@ -164,7 +168,8 @@ def fit_torque(logs: list[Log], gear_gain: float, resolver_count: float, *, sign
         change[index, index] = constant
     change[4, 4] = presliding
     covariance = change @ covariance @ change.T
-    covariance[4, 4] += 0.0 if sign_model else resolver_count**2
+    # The play against flicker and the reading's own step shift each reversal by about a count.
+    covariance[4, 4] += 0.0 if sign_model else (2.0 * resolver_count) ** 2
     return TorqueFit(
         float(constant),
         float(solution[1] * constant),

@@ -11,6 +11,16 @@ from emb_daemon.jit import njit
 
 
 @njit
+def slid_angle(before, angle, flicker):
+    """Angle that the gear has slid to: it follows ``angle`` once that leaves ``before`` by more than ``flicker`` rad.
+
+    A reading that flickers between two counts at standstill would otherwise turn the friction state over and over, until it
+    forgets which way the motor came.
+    """
+    return min(max(before, angle - flicker), angle + flicker)
+
+
+@njit
 def friction_state(state, variance, travel, presliding_angle, dissolving_rate, dt):
     """Friction state s in [-1, 1] after ``travel`` rad of sliding, its mean over the travel, and its variance.
 
