@@ -27,6 +27,8 @@ _PAIRING_NS = CYCLE_NS // 2
 LATE_CYCLES = 3
 #: Deviation of arrival from the counter's clock up to which the counter is believed.
 _JITTER_NS = 2 * CYCLE_NS
+#: Samples on which counter and clock must have agreed before the counter is believed against the clock.
+_AGREED = 3
 #: Age up to which a slow input still feeds the models, and ages from which its absence is reported.
 _USABLE_NS = 2_500_000_000
 _REPORTED_CYCLES = 25
@@ -35,7 +37,8 @@ _OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
 
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
-#: ``stranger_ns`` when somebody else last sent one of our messages.
+#: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
+#: ``agreed`` how many samples in a row counter and clock agreed on; ``stranger_ns`` when somebody else last sent one of our messages.
 CORNER = np.dtype(
     [
         ("active", "?"),
@@ -49,6 +52,9 @@ CORNER = np.dtype(
         ("cycle", "i8"),
         ("announced", "i8"),
         ("predicted", "i8"),
+        ("clock_ns", "i8"),
+        ("late_ns", "i8"),
+        ("agreed", "i8"),
         ("stranger_ns", "i8"),
     ],
     align=True,
@@ -201,16 +207,37 @@ def _overdue(b, time_ns, predictions, count):
 
 
 @njit
-def _cycles(counter, time_ns, corner):
-    """Cycles from the corner's last sample to this one, at least 1."""
-    elapsed = time_ns - corner.sample_ns
+def _cycles(corner, counter, time_ns):
+    """Cycles from the corner's last sample to this one, at least 1; moves the corner's clock.
+
+    The Counter says how many cycles passed, modulo 15, whatever delays the frame had. It is believed as long as frames
+    that come late are made up for by later ones. A log at a reduced rate counts frames instead of cycles, and a sender can
+    pause: there lateness stays or grows, and the time of arrival is believed, until both agree again.
+    """
     step = (counter - corner.counter) % COUNTER_MODULO
     if step == 0:
         step = COUNTER_MODULO
-    step += COUNTER_MODULO * max(0, round((elapsed / CYCLE_NS - step) / COUNTER_MODULO))
-    if abs(elapsed - step * CYCLE_NS) <= _JITTER_NS:
+    late = time_ns - corner.clock_ns - step * CYCLE_NS
+    wraps = COUNTER_MODULO * max(0, round(late / (COUNTER_MODULO * CYCLE_NS)))
+    late -= wraps * CYCLE_NS
+    step += wraps
+    counted = abs(late) <= _JITTER_NS
+    if counted:
+        corner.agreed = min(corner.agreed + 1, _AGREED)
+        corner.late_ns = 0
+        # The senders' clocks are not ours: follow them slowly.
+        corner.clock_ns += step * CYCLE_NS + late // 16
         return step
-    return max(1, round(elapsed / CYCLE_NS))
+    recovering = corner.late_ns == 0 or late < corner.late_ns - CYCLE_NS // 2
+    if corner.agreed == _AGREED and wraps == 0 and late > 0 and recovering:
+        corner.late_ns = late
+        corner.clock_ns += step * CYCLE_NS
+        return step
+    passed = max(1, round((time_ns - corner.clock_ns) / CYCLE_NS))
+    corner.agreed = 0
+    corner.late_ns = 0
+    corner.clock_ns = time_ns
+    return passed
 
 
 @njit
@@ -220,7 +247,7 @@ def _complete(b, index, with_current, count):
     row = b.samples[count]
     base = wire.CORNER_MESSAGES * index
     now = corner.pending_ns
-    cycles = _cycles(corner.pending, now, corner) if corner.started else 0
+    cycles = _cycles(corner, corner.pending, now) if corner.started else 0
     row.is_prediction = False
     row.dt = cycles * CYCLE_S
     row.angle = corner.pending_angle
@@ -247,6 +274,8 @@ def _complete(b, index, with_current, count):
     row.brake_torque = np.nan
 
     corner.cycle += cycles
+    if not corner.started:
+        corner.clock_ns = now
     corner.started = True
     corner.counter = corner.pending
     corner.sample_ns = now

@@ -233,6 +233,31 @@ def test_after_a_gap_time_is_what_passed(car, gap):
     assert rows["cycle"][-1] == 34 + gap
 
 
+def test_a_frame_held_up_on_its_way_changes_nothing(car):
+    """A burst after a hold-up of 20 ms: the counter says what passed, the clock does not."""
+    frames = _log()
+    late = frames.copy()
+    at = int(late["time_ns"][len(late) // 2])
+    held = (late["time_ns"] > at) & (late["time_ns"] < at + 20_000_000)
+    late["time_ns"][held] = at + 20_000_000 + np.arange(held.sum()) * 1000
+    plain, _ = _run(car, frames)
+    held_up, _ = _run(car, late)
+    answered = held_up[held_up["is_sample"]]
+    assert np.array_equal(plain["counter"], answered["counter"])
+    assert np.array_equal(plain["cycle"], answered["cycle"]) and np.array_equal(plain["force"], answered["force"])
+
+
+def test_a_sender_that_paused_is_believed_to_have_paused(car):
+    """20 ms without a frame and a counter that goes on as if nothing were: the time is made up for one sample later."""
+    frames = np.concatenate(_sliding(60))
+    paused = frames["time_ns"] >= frames["time_ns"][len(frames) // 2]
+    frames["time_ns"][paused] += 20_000_000
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    _, count = pipeline.collect(frames, predictions=False)
+    assert pipeline.samples["cycle"][count - 1] == 59 + 5
+
+
 @pytest.mark.parametrize("every", [5, 25, 250])
 def test_logs_at_a_reduced_rate(car, every):
     """Frames every 20 ms, 100 ms and 1 s: all taken, each with the time since the last."""
