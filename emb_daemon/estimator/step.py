@@ -242,10 +242,10 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = p.contact_walk * p.contact_walk * m.dt
+    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque)
     if m.dt > _ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         P[0, 0] += (lag_error / spread) ** 2
-    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque)
     h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
     out.stiffness_sigma = sqrt(variance_along(P, h))
     out.innovation = out.innovation_sigma = np.nan
