@@ -240,8 +240,9 @@ class Search:
             normal = table.T @ table + np.diag(self.penalty(knobs, channel) + 1e-12)
             residual = residual - table @ np.linalg.lstsq(normal, table.T @ residual, rcond=1e-12)[0]
         score = np.zeros(len(orders))
+        binned = 0.0
         for index, order in enumerate(orders):
-            if index == 0 or order > 1.3 * binned:
+            if order > 1.3 * binned:
                 # Samples that pass more than a fifth of a period smear it; bins are a sixteenth wide.
                 binned = order
                 slow = (travel * order < 1.0) & (residual != 0.0)
@@ -555,7 +556,7 @@ class Search:
             finding.accepted = True
             finding.share_explained = self._share(finding.channel, knobs)
             finding.reason = finding.reason or (
-                f"q = {finding.q_value:.1g} over episodes, {finding.gain:.3g} {UNITS[finding.channel]} RMS on left-out episodes"
+                f"q = {finding.q_value:.1g} over episodes, gains {finding.gain:.3g} {UNITS[finding.channel]} on left-out ones"
                 + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
             )
             for knob in knobs:

@@ -161,6 +161,7 @@ def calibrated(calibration: Calibration, values: dict[Knob, float]) -> Calibrati
     table = data["thermal"]["friction"]
     effects = {effect.name: effect for effect in REGISTRY}
     for knob, value in values.items():
+        value = float(value)
         group, _, rest = knob.name.partition(".")
         if group in effects:
             parameter = next(p for p in effects[group].parameters if p.name == rest)
