@@ -239,26 +239,31 @@ class Search:
             table = np.column_stack(columns)
             normal = table.T @ table + np.diag(self.penalty(knobs, channel) + 1e-12)
             residual = residual - table @ np.linalg.lstsq(normal, table.T @ residual, rcond=1e-12)[0]
-        score = np.zeros(len(orders))
-        binned = 0.0
-        for index, order in enumerate(orders):
-            if order > 1.3 * binned:
-                # Samples that pass more than a fifth of a period smear it; bins are a sixteenth wide.
-                binned = order
-                slow = (travel * order < 1.0) & (residual != 0.0)
-                width = 2.0 * np.pi / (16.0 * 1.3 * order)
-                bins = np.floor((angle[slow] - angle.min()) / width).astype(np.int64)
-                sums = np.bincount(bins, weight[slow] * residual[slow])
-                squares = np.bincount(bins, weight[slow] ** 2)
-                centre = angle.min() + (np.arange(len(sums)) + 0.5) * width
-                # One stop's long hold at one angle must not outvote the strokes.
-                typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
-                cap = np.minimum(1.0, typical / np.maximum(squares, typical))
-            phase = np.exp(1j * order * centre)
-            score[index] = abs((cap * sums) @ phase) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
-        if not score.any():
-            return None, len(orders)
-        return float(orders[np.argmax(score)]), len(orders)
+        best, found = 0.0, None
+        low = orders[0]
+        while low < orders[-1]:
+            # One octave at a time: samples that pass more than a sixth of a period smear it, bins are an eighth of one wide.
+            high = 2.0 * low
+            slow = (travel * high < 1.0) & (residual != 0.0)
+            width = 2.0 * np.pi / (8.0 * high)
+            bins = ((angle[slow] - angle.min()) / width).astype(np.int64)
+            if not len(bins):
+                break
+            sums, squares = np.bincount(bins, weight[slow] * residual[slow]), np.bincount(bins, weight[slow] ** 2)
+            # One stop's long hold at one angle must not outvote the strokes.
+            typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
+            cap = np.minimum(1.0, typical / np.maximum(squares, typical))
+            padded = 1 << int(np.ceil(np.log2(4 * len(sums))))
+            power = np.abs(np.fft.rfft(cap * sums, padded)) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
+            scanned = 2.0 * np.pi * np.arange(len(power)) / (padded * width)
+            chosen = orders[(orders >= low) & (orders < high)]
+            if whole and len(chosen):
+                power, scanned = np.interp(chosen, scanned, power), chosen
+            inside = (scanned >= max(low, orders[0])) & (scanned < min(high, orders[-1] + 1e-9))
+            if inside.any() and power[inside].max() > best:
+                best, found = float(power[inside].max()), float(scanned[inside][np.argmax(power[inside])])
+            low = high
+        return found, len(orders)
 
     def round(self, candidates: list[Effect]) -> dict[str, tuple[Finding, tuple]]:
         """Test all candidates against the present residual."""
@@ -408,17 +413,14 @@ class Search:
             for name, (finding, plan) in tested.items():
                 finding.reason = self.why_not(finding, plan)
                 earlier = history.get(name)
-                if earlier is None or not earlier.confounded_with:
+                if earlier is None or not earlier.confounded_with or not finding.reason:
                     history[name] = finding
             chosen: set[str] = set()
             for channel in self.bench.channels:
                 passed = [t for t in tested.values() if t[0].channel == channel and not t[0].reason]
                 if not passed:
                     continue
-                passed.sort(key=lambda t: -t[1][3].gain)
-                winner = passed[0]
-                self._mark_confounded(winner, passed[1:], history)
-                self._accept(winner)
+                self._accept(self._settle(passed, history))
                 chosen.add(channel)
             if not chosen:
                 break
@@ -438,27 +440,37 @@ class Search:
             self.values[knob] = start
         self.residual = self.bench.residuals(self.values)
 
-    def _mark_confounded(self, winner: tuple, others: list[tuple], history: dict[str, Finding]) -> None:
-        finding, (_, _, own, verdict) = winner
-        for rival, (_, _, columns, judged) in others:
-            if judged.gain < _CONFOUNDED * verdict.gain:
+    def _settle(self, passed: list[tuple], history: dict[str, Finding]) -> tuple:
+        """The candidate to accept out of those that passed in one channel, and why the others of equal gain are not.
+
+        Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
+        that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so."""
+        best = max(passed, key=lambda t: t[1][3].gain)
+        rivals = []
+        for other in passed:
+            if other is best or other[1][3].gain < _CONFOUNDED * best[1][3].gain:
                 continue
-            with_winner = self.verdict_given(finding.channel, own, columns)
-            if with_winner.p_value < Q_VALUE and with_winner.gain > 0.0:
+            beside_best = self.verdict_given(best[0].channel, best[1][2], other[1][2])
+            if beside_best.p_value < Q_VALUE and beside_best.gain > 0.0:
                 continue
-            without = self.verdict_given(finding.channel, columns, own)
-            separated = without.p_value < Q_VALUE and without.gain > 0.0
-            rival.reason = (
-                f"explained by {finding.effect.name}, which explains more than it"
-                if separated
-                else f"confounded with {finding.effect.name} on these logs; to separate them: {rival.effect.manoeuvre}"
+            beside_other = self.verdict_given(best[0].channel, other[1][2], best[1][2])
+            if beside_other.p_value < Q_VALUE and beside_other.gain > 0.0:
+                other[0].reason = f"explained by {best[0].effect.name}, beside which it says nothing"
+                history[other[0].effect.name] = other[0]
+            else:
+                rivals.append(other)
+        equal = sorted([best, *rivals], key=lambda t: REGISTRY.index(t[0].effect))
+        winner = equal[0]
+        for loser in equal[1:]:
+            for one, other in ((winner, loser), (loser, winner)):
+                one[0].confounded_with = other[0].effect.name
+                one[0].manoeuvre = other[0].effect.manoeuvre if one is winner else one[0].effect.manoeuvre
+            loser[0].reason = (
+                f"confounded with {winner[0].effect.name} on these logs, which is simpler; to separate them: "
+                f"{loser[0].effect.manoeuvre}"
             )
-            if not separated:
-                rival.confounded_with = finding.effect.name
-                rival.manoeuvre = rival.effect.manoeuvre
-                finding.confounded_with = rival.effect.name
-                finding.manoeuvre = finding.effect.manoeuvre
-            history[rival.effect.name] = rival
+            history[loser[0].effect.name] = loser[0]
+        return winner
 
     def verdict_given(self, channel: str, given: list[np.ndarray], own: list[np.ndarray]) -> Verdict:
         knobs = self.channel_knobs(channel)

@@ -64,6 +64,20 @@ class Diagnosis:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
 
+    def judged_residual(self) -> dict:
+        """RMS of each path's residual on the judging logs, before and after: of the torque path without the limit at zero
+        force that its estimate has. Empty where the fit logs judge themselves."""
+        if self.judged_on != "validate":
+            return {}
+        before = self.judged_bench.residuals({})
+        after = Bench(
+            [trial.log for trial in self.judged_bench.trials], to_parameters(self.calibration)
+        ).residuals({})  # fmt: skip
+        return {
+            channel: {"unit": UNITS[channel], "rms_before": _rms(before[channel]), "rms_after": _rms(after[channel])}
+            for channel in self.judged_bench.channels
+        }
+
     def report(self) -> dict:
         """Contents of report.json."""
         figures = self.figures()
@@ -107,6 +121,7 @@ class Diagnosis:
                 }
                 for channel in self.bench.channels
             },
+            "judged_residual": self.judged_residual(),
             "episodes": self.bench.episodes,
             "seconds": self.seconds,
         }
