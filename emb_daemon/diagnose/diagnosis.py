@@ -236,7 +236,11 @@ def diagnose(
         calibration, augmented, bench, attribution, "validate" if validate else "left_out_episodes",
         judges, before, after, after_rests, before_rests, time.monotonic() - begin,
     )  # fmt: skip
-    sources = tuple(Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest()) for log in fit_logs)
+    sources = tuple(
+        Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())
+        for log in fit_logs
+        if log.path.is_file()
+    )
     result.calibration = _with_provenance(result, sources)
     progress("done", 1.0)
     return result
