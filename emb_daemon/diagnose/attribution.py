@@ -172,7 +172,8 @@ class Search:
                 step = np.linalg.solve(normal / np.outer(size, size) + 1e-9 * np.eye(len(own)), right / size) / size
                 low, high = np.array([k.low for k in own]), np.array([k.high for k in own])
                 limit = np.array([_trust(knob, self.values[knob]) for knob in own])
-                step = np.clip(step, -limit, limit)
+                # Shortened as a whole: knobs that act against each other must move together.
+                step /= max(1.0, float(np.max(np.abs(step) / limit)))
                 steps.update(zip(own, np.clip(now + step, low, high) - now, strict=True))
             before = {channel: self.objective(self.residual, self.values, channel) for channel in channels}
             channels -= self._advance(steps, before, channels)
@@ -182,18 +183,19 @@ class Search:
     def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> set[str]:
         """Take the steps, shortened where they do not help; returns the channels that have converged."""
         share = dict.fromkeys(channels, 1.0)
-        for _ in range(5):
+        for _ in range(8):
             tried = dict(self.values)
             for knob, step in steps.items():
                 tried[knob] += share[knob.channel] * step
             residual = self.bench.residuals(tried)
             after = {channel: self.objective(residual, tried, channel) for channel in channels}
-            worse = {channel for channel in channels if after[channel] > before[channel] * (1.0 + 1e-9)}
+            # A channel that stands still gets worse only through another one, which is then to be followed.
+            worse = {c for c in channels if share[c] > 0.0 and after[c] > before[c] * (1.0 + 1e-9)}
             if not worse:
                 self.values, self.residual = tried, residual
-                return {c for c in channels if before[c] - after[c] < 2e-3 * before[c]}
+                return {c for c in channels if abs(before[c] - after[c]) < 2e-3 * before[c]}
             for channel in worse:
-                share[channel] = 0.0 if share[channel] < 0.1 else 0.3 * share[channel]
+                share[channel] = 0.0 if share[channel] < 0.02 else 0.25 * share[channel]
         return set(channels)
 
     # -- testing ------------------------------------------------------------------------------------------------------
@@ -205,9 +207,12 @@ class Search:
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         return max(_RESIDUAL_SHARE * np.sqrt(self.noise(channel)), share * self.scale[channel])
 
+    def counted(self, channel: str) -> int:
+        """Residuals of a channel that say something."""
+        return max(int(np.count_nonzero(self.residual[channel])), 1)
+
     def rms(self, gain: float, channel: str) -> float:
-        counted = max(int(np.count_nonzero(self.residual[channel])), 1)
-        return float(np.sqrt(max(gain, 0.0) / counted))
+        return float(np.sqrt(max(gain, 0.0) / self.counted(channel)))
 
     def variants(self, effect: Effect, channel: str) -> tuple[list[tuple[tuple[Knob, float], ...]], int]:
         """Shapes in which to test an effect, and how many were looked at to choose them."""
@@ -344,14 +349,15 @@ class Search:
         """Largest gain on left-out episodes of a smooth function of one signal, and that signal."""
         if channel not in self._free:
             best = (0.0, "")
-            for name, gain in self.dependence(channel).items():
-                if gain.sum() > best[0]:
-                    best = (float(gain.sum()), name)
+            for name, (without, with_) in self.dependence(channel).items():
+                gain = float((without - with_).sum())
+                if gain > best[0]:
+                    best = (gain, name)
             self._free[channel] = best
         return self._free[channel]
 
-    def dependence(self, channel: str) -> dict[str, np.ndarray]:
-        """Gain on left-out episodes of a smooth function of each signal, episode by episode."""
+    def dependence(self, channel: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Squared error of each left-out episode, without and with a smooth function of each signal."""
         if channel not in FORCE_CHANNELS:
             return {}
         knobs = self.channel_knobs(channel)
@@ -368,7 +374,7 @@ class Search:
             penalty = np.concatenate([self.penalty(knobs, channel), 1e-3 * np.maximum(own, 1e-300) + 1e-12])
             both = fit(moments, penalty)
             plain = fit(moments.select(list(range(len(knobs)))), penalty[: len(knobs)])
-            result[name] = plain.left_out - both.left_out
+            result[name] = (plain.left_out, both.left_out)
         return result
 
     def placebo(self, effect: Effect, channel: str) -> float | None:

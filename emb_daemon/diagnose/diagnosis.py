@@ -214,13 +214,11 @@ def diagnose(
     search, attribution = attribute_with(bench, progress)
     progress("what is left", 0.85)
     after_rests = {
-        channel: rests(channel, search.dependence(channel), attribution.residual[channel], search.floor(channel))
+        channel: rests(channel, search.dependence(channel), search.counted(channel), search.floor(channel))
         for channel in bench.channels
         if channel in FORCE_CHANNELS
     }
-    before_rests = {
-        channel: rests(channel, gains, attribution.initial[channel], 0.0) for channel, gains in search.first.items()
-    }
+    before_rests = {channel: rests(channel, gains, search.counted(channel), 0.0) for channel, gains in search.first.items()}
     used = {knob: value for knob, value in attribution.values.items() if value != 0.0}
     augmented = calibrated(calibration, used) if used else calibration
     progress("judging", 0.9)

@@ -98,7 +98,7 @@ def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     for index, value in enumerate(parameters["curve"]):
         if value != 0.0:
             name = f"stiffness.curves.coefficients[{index}]"
-            knobs.append(Knob(name, "stiffness", 0.01, 0.3, "1", _coefficient(index)))
+            knobs.append(Knob(name, "stiffness", 0.01, 0.1, "1", _coefficient(index)))
     thermal = parameters["thermal"]
     knobs += [
         Knob("stiffness.relaxation_time_s", "stiffness", 0.02, 0.5, "1", _scale("relaxation_time")),
