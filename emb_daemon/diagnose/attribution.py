@@ -18,6 +18,7 @@ effects only work together (a slow branch without slip gains nothing), so effect
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -39,8 +40,8 @@ _TORQUE_SHARE = 0.08
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
 _OF_MODEL_FREE = 0.6
 _OF_PLACEBO = 0.5
-#: Autocorrelation makes this many samples worth one; weighs priors against data.
-_INFLATION = 30.0
+#: Least number of samples that are worth one, when priors are weighed against data.
+_INFLATION = 5.0
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
 _CONFOUNDED = 0.8
 _GAUSS_NEWTON = 4
@@ -139,9 +140,16 @@ class Search:
         counted = residual != 0.0
         return float(np.mean(residual[counted] ** 2)) if counted.any() else 0.0
 
+    def inflation(self, channel: str) -> float:
+        """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""
+        residual, episode = self.residual[channel], self.bench.episode[channel]
+        sums = np.bincount(episode, residual, minlength=self.bench.episodes)
+        squares = np.bincount(episode, residual**2, minlength=self.bench.episodes)
+        return max(_INFLATION, float((sums**2).sum() / max(squares.sum(), 1e-300)))
+
     def penalty(self, knobs: list[Knob], channel: str) -> np.ndarray:
         prior = np.array([knob.prior for knob in knobs])
-        return _INFLATION * max(self.noise(channel), 1e-12) / prior**2
+        return self.inflation(channel) * max(self.noise(channel), 1e-12) / prior**2
 
     def moments(self, channel: str, columns: list[np.ndarray], residual: np.ndarray | None = None) -> Moments:
         residual = self.residual[channel] if residual is None else residual
@@ -283,14 +291,16 @@ class Search:
         columns = self.bench.regressors(self.values, probes, self.residual)
         tested = {}
         for finding, knobs, shapes, tried in plans:
-            best: tuple[Verdict, tuple, list[np.ndarray]] = (NOT_EXCITED, (), [])
+            best: tuple[Verdict, tuple, list[np.ndarray], list[Knob]] = (NOT_EXCITED, (), [], knobs)
+            parts = _parts(knobs)
             for shape in shapes:
-                own = [columns[Probe(knob, shape)] for knob in knobs]
-                verdict = self.verdict(finding.channel, own)
-                if not best[2] or (verdict.p_value, -verdict.gain) < (best[0].p_value, -best[0].gain):
-                    best = (verdict, shape, own)
-            verdict, shape, own = best
-            finding.p_value = min(1.0, verdict.p_value * tried)
+                for part in parts:
+                    own = [columns[Probe(knob, shape)] for knob in part]
+                    verdict = self.verdict(finding.channel, own)
+                    if not best[2] or (verdict.p_value, -verdict.gain) < (best[0].p_value, -best[0].gain):
+                        best = (verdict, shape, own, part)
+            verdict, shape, own, knobs = best
+            finding.p_value = min(1.0, verdict.p_value * tried * len(parts))
             if finding.channel:
                 finding.gain = self.rms(verdict.gain, finding.channel)
                 initial = float(self.initial[finding.channel] @ self.initial[finding.channel])
@@ -437,8 +447,11 @@ class Search:
     def _accept(self, winner: tuple[Finding, tuple]) -> None:
         finding, (knobs, shape, _, verdict) = winner
         shapes = [knob for knob, _ in shape]
-        self.accepted[finding.effect.name] = [*knobs, *shapes]
-        self.knobs += [*knobs, *shapes]
+        # An effect enters with all its orders; those that prove nothing go at the end.
+        every = [effect_knob(finding.effect, p.name, finding.channel) for p in finding.effect.amplitudes]
+        self.values.update(dict.fromkeys(every, 0.0))
+        self.accepted[finding.effect.name] = [*every, *shapes]
+        self.knobs += [*every, *shapes]
         for knob, value in zip(knobs, verdict.values, strict=True):
             self.values[knob] = float(np.clip(value, knob.low, knob.high))
         for knob, start in shape:
@@ -486,54 +499,36 @@ class Search:
         return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
     def _revise(self, history: dict[str, Finding]) -> None:
-        """Test each accepted effect once more with all others in place; drop what no longer holds."""
+        """Test each accepted effect once more with all others in place; drop what, or which order, no longer holds."""
         for name in list(self.accepted):
-            knobs = self.accepted[name]
-            finding = history[name]
+            finding, knobs = history[name], self.accepted[name]
             channel = finding.channel
             own = self.channel_knobs(channel)
             values = np.array([self.values[k] for k in own])
             restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
             moments = self.moments(channel, [self.columns[k] for k in own], restored)
-            amplitudes = [i for i, k in enumerate(own) if k in knobs and not _is_shape(finding.effect, k)]
-            rest = [i for i, k in enumerate(own) if k not in knobs]
-            verdict = judge(moments, rest, amplitudes, self.penalty(own, channel))
-            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+            amplitudes = [knob for knob in knobs if not _is_shape(finding.effect, knob)]
+            groups = _orders(amplitudes)
+            dropped: list[Knob] = []
+            for group in groups:
+                tested = [own.index(knob) for knob in group]
+                rest = [i for i in range(len(own)) if i not in tested]
+                verdict = judge(moments, rest, tested, self.penalty(own, channel))
+                if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+                    dropped += group
+            if not dropped:
+                continue
+            if len(dropped) == len(amplitudes):
                 finding.reason = "no longer holds beside the other effects"
                 del self.accepted[name]
-                self.knobs = [k for k in self.knobs if k not in knobs]
-                for knob in knobs:
-                    del self.values[knob]
-                self.residual = self.bench.residuals(self.values)
-                self.refine({channel})
+                dropped = knobs
             else:
-                self._prune(finding, knobs)
-
-    def _prune(self, finding: Finding, knobs: list[Knob]) -> None:
-        """Set those orders of a periodic effect to zero that the episodes do not prove."""
-        orders = sorted({knob.name.partition(".order_")[2][0] for knob in knobs if ".order_" in knob.name and not
-                         knob.name.endswith("per_turn")})  # fmt: skip
-        if len(orders) < 2:
-            return
-        channel = finding.channel
-        own = self.channel_knobs(channel)
-        values = np.array([self.values[k] for k in own])
-        restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
-        moments = self.moments(channel, [self.columns[k] for k in own], restored)
-        dropped = []
-        for order in orders:
-            pair = [i for i, k in enumerate(own) if k.name.startswith(f"{finding.effect.name}.order_{order}_")]
-            rest = [i for i in range(len(own)) if i not in pair]
-            verdict = judge(moments, rest, pair, self.penalty(own, channel))
-            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
-                dropped += [own[i] for i in pair]
-        if dropped and len(dropped) < len(knobs):
+                self.accepted[name] = [knob for knob in knobs if knob not in dropped]
             for knob in dropped:
                 del self.values[knob]
-                knobs.remove(knob)
                 finding.values[knob.name.partition(".")[2]] = 0.0
                 finding.sigmas[knob.name.partition(".")[2]] = 0.0
-            self.knobs = [knob for knob in self.knobs if knob not in dropped]
+            self.knobs = [k for k in self.knobs if k not in dropped]
             self.residual = self.bench.residuals(self.values)
             self.refine({channel})
 
@@ -547,7 +542,8 @@ class Search:
             table = np.column_stack([self.columns[knob] for knob in knobs])
             moments = self.moments(channel, [table], self.initial[channel])
             gain = float((moments.products[:, -1, -1] - fit(moments, self.penalty(knobs, channel)).left_out).sum())
-            if self.rms(gain, channel) >= self.floor(channel):
+            # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
+            if channel != "innovation" and self.rms(gain, channel) >= self.floor(channel):
                 result[channel] = self.rms(gain, channel)
         return result
 
@@ -576,6 +572,7 @@ class Search:
             finding.reason = finding.reason or (
                 f"q = {finding.q_value:.1g} over episodes, gains {finding.gain:.3g} {UNITS[finding.channel]} on left-out ones"
                 + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
+                + (", from the difference of both paths: no reference was recorded" if finding.channel == "innovation" else "")
             )
             for knob in knobs:
                 key = knob.name.partition(".")[2]
@@ -597,6 +594,21 @@ class Search:
             [history[effect.name] for effect in REGISTRY],
             self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, penalties,
         )  # fmt: skip
+
+
+def _orders(knobs: list[Knob]) -> list[list[Knob]]:
+    """Amplitudes that stand or fall together: cosine and sine of one order, or all."""
+    groups: dict[str, list[Knob]] = {}
+    for knob in knobs:
+        order = knob.name.partition(".order_")[2]
+        groups.setdefault(order[:1] if order[:1].isdigit() else "", []).append(knob)
+    return list(groups.values())
+
+
+def _parts(knobs: list[Knob]) -> list[list[Knob]]:
+    """The first orders only, the first two, ..., all: few episodes cannot carry a test of many numbers."""
+    groups = _orders(knobs)
+    return [list(chain.from_iterable(groups[: count + 1])) for count in range(len(groups))] or [[]]
 
 
 def _is_shape(effect: Effect, knob: Knob) -> bool:

@@ -49,6 +49,8 @@ _FOREIGN = {
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
 }
+#: Largest delay drawn, s: a delay is undone to first order, which a longer one than a cycle and a half outgrows.
+_LONGEST_DELAY_S = 0.006
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
 
@@ -118,7 +120,8 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
     effect = next(e for e in REGISTRY if e.name == name)
     result = dict(values)
     for parameter in effect.amplitudes:
-        result[parameter.name] = float(np.clip(values[parameter.name] * factor, parameter.low, parameter.high))
+        high = _LONGEST_DELAY_S if name == "signal_delay" else parameter.high
+        result[parameter.name] = float(np.clip(values[parameter.name] * factor, max(parameter.low, -high), high))
     return result
 
 

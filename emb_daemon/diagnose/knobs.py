@@ -5,7 +5,7 @@ hide one, so every candidate is tested with all of its path's base knobs free.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -33,7 +33,7 @@ class Knob:
     step: float
     prior: float
     unit: str
-    apply: Callable[[np.void, float], None]
+    apply: Callable[[np.void, float], None] = field(compare=False)
     log: int | None = None
     low: float = -np.inf
     high: float = np.inf
