@@ -309,21 +309,22 @@ def test_a_log_too_short_to_tell_effect_from_chance_is_refused(calibration):
 # -- logs that nobody here made ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("case", "expected", "limit_N"),
-    [(0, [], 36.0), (3, ["disc_thickness_variation"], 36.0)],
-)
-def test_undeclared_effects_of_the_simulated_rig(rig, calibration, case, expected, limit_N):
-    folder = rig / "undeclared" / f"case{case}"
-    result = diagnose([load_log(folder / "fit.log.gz")], calibration, [load_log(folder / "val.log.gz")])
-    assert [finding.effect.name for finding in result.accepted if finding.channel in ("stiffness", "torque")] == expected
-    assert result.after.rmse("fused") < limit_N
+def _path_effects(result):
+    return {finding.effect.name for finding in result.accepted if finding.channel in ("stiffness", "torque")}
 
 
-def test_thesis_calibration_is_told_of_hysteresis_and_second_relaxation(rig, calibration):
-    thesis = msgspec.structs.replace(calibration, effects={})
+def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, calibration):
     folder = rig / "undeclared" / "case0"
+    result = diagnose([load_log(folder / "fit.log.gz")], calibration, [load_log(folder / "val.log.gz")])
+    assert not _path_effects(result)
+    assert result.after.rmse("fused") < 33.0
+
+
+def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calibration):
+    """The rig has hysteresis and a second relaxation of its own; in this case its disc is uneven as well."""
+    thesis = msgspec.structs.replace(calibration, effects={})
+    folder = rig / "undeclared" / "case3"
     result = diagnose([load_log(folder / "fit.log.gz")], thesis, [load_log(folder / "val.log.gz")])
-    found = {finding.effect.name for finding in result.accepted if finding.channel == "stiffness"}
-    assert found == {"stiffness_hysteresis", "second_relaxation"}
-    assert result.after.rmse("fused") < 0.3 * result.before.rmse("fused")
+    assert _path_effects(result) == {"stiffness_hysteresis", "second_relaxation", "disc_thickness_variation"}
+    assert result.before.rmse("fused") > 180.0
+    assert result.after.rmse("fused") < 36.0

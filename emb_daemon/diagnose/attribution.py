@@ -441,6 +441,10 @@ class Search:
             if not chosen:
                 break
             self.refine(chosen)
+        if self.accepted:
+            # The force that heats the pads has changed: everything once more, together.
+            self.progress("refitting everything together", 0.75)
+            self.refine(channels)
         self._revise(history)
         return self._outcome(history, recalibrated)
 

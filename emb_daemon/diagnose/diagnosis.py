@@ -64,6 +64,24 @@ class Diagnosis:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
 
+    def validated(self) -> dict[str, float]:
+        """By effect accepted, RMS by which it lowers its path's residual on the validation logs (in quadrature; negative if
+        it does harm there). Empty without validation logs. It judges and chooses nothing."""
+        if self.judged_on != "validate":
+            return {}
+        logs = [trial.log for trial in self.judged_bench.trials]
+        with_all = Bench(logs, to_parameters(self.calibration)).residuals({})
+        result = {}
+        for finding in self.accepted:
+            if finding.channel not in with_all:
+                continue
+            bare = to_parameters(self.calibration).copy()
+            bare["effects"][finding.effect.name] = np.zeros((), bare["effects"][finding.effect.name].dtype)
+            without = Bench(logs, bare).residuals({})[finding.channel]
+            gain = float(np.mean(without**2) - np.mean(with_all[finding.channel] ** 2))
+            result[finding.effect.name] = float(np.sign(gain) * np.sqrt(abs(gain)))
+        return result
+
     def judged_residual(self) -> dict:
         """RMS of each path's residual on the judging logs, before and after: of the torque path without the limit at zero
         force that its estimate has. Empty where the fit logs judge themselves."""
@@ -82,6 +100,7 @@ class Diagnosis:
         """Contents of report.json."""
         figures = self.figures()
         rest = self.unexplained
+        validated = self.validated()
         first = max((channel[0] for channel in self.rests.values() if channel), key=lambda r: r.share, default=None)
         return {
             "paths": {
@@ -96,7 +115,11 @@ class Diagnosis:
             },
             "judged_on": self.judged_on,
             "reference": "clamp_force" if self.bench.has_reference else "innovation",
-            "effects": [finding_json(finding) for finding in ranked(self.attribution.findings)],
+            "effects": [
+                finding_json(finding)
+                | ({"gain_on_validation": validated[finding.effect.name]} if finding.effect.name in validated else {})
+                for finding in ranked(self.attribution.findings)
+            ],
             "recalibrated": {
                 knob.name: {"change": value, "sigma": self.attribution.sigmas.get(knob, 0.0), "unit": knob.unit}
                 for knob, value in self.attribution.values.items()
