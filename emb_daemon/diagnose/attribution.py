@@ -18,6 +18,7 @@ effects only work together (a slow branch without slip gains nothing), so effect
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -39,8 +40,8 @@ _TORQUE_SHARE = 0.08
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
 _OF_MODEL_FREE = 0.6
 _OF_PLACEBO = 0.5
-#: Autocorrelation makes this many samples worth one; weighs priors against data.
-_INFLATION = 30.0
+#: Least number of samples that are worth one, when priors are weighed against data.
+_INFLATION = 5.0
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
 _CONFOUNDED = 0.8
 _GAUSS_NEWTON = 4
@@ -139,9 +140,16 @@ class Search:
         counted = residual != 0.0
         return float(np.mean(residual[counted] ** 2)) if counted.any() else 0.0
 
+    def inflation(self, channel: str) -> float:
+        """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""
+        residual, episode = self.residual[channel], self.bench.episode[channel]
+        sums = np.bincount(episode, residual, minlength=self.bench.episodes)
+        squares = np.bincount(episode, residual**2, minlength=self.bench.episodes)
+        return max(_INFLATION, float((sums**2).sum() / max(squares.sum(), 1e-300)))
+
     def penalty(self, knobs: list[Knob], channel: str) -> np.ndarray:
         prior = np.array([knob.prior for knob in knobs])
-        return _INFLATION * max(self.noise(channel), 1e-12) / prior**2
+        return self.inflation(channel) * max(self.noise(channel), 1e-12) / prior**2
 
     def moments(self, channel: str, columns: list[np.ndarray], residual: np.ndarray | None = None) -> Moments:
         residual = self.residual[channel] if residual is None else residual
@@ -172,7 +180,8 @@ class Search:
                 step = np.linalg.solve(normal / np.outer(size, size) + 1e-9 * np.eye(len(own)), right / size) / size
                 low, high = np.array([k.low for k in own]), np.array([k.high for k in own])
                 limit = np.array([_trust(knob, self.values[knob]) for knob in own])
-                step = np.clip(step, -limit, limit)
+                # Shortened as a whole: knobs that act against each other must move together.
+                step /= max(1.0, float(np.max(np.abs(step) / limit)))
                 steps.update(zip(own, np.clip(now + step, low, high) - now, strict=True))
             before = {channel: self.objective(self.residual, self.values, channel) for channel in channels}
             channels -= self._advance(steps, before, channels)
@@ -182,18 +191,19 @@ class Search:
     def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> set[str]:
         """Take the steps, shortened where they do not help; returns the channels that have converged."""
         share = dict.fromkeys(channels, 1.0)
-        for _ in range(5):
+        for _ in range(8):
             tried = dict(self.values)
             for knob, step in steps.items():
                 tried[knob] += share[knob.channel] * step
             residual = self.bench.residuals(tried)
             after = {channel: self.objective(residual, tried, channel) for channel in channels}
-            worse = {channel for channel in channels if after[channel] > before[channel] * (1.0 + 1e-9)}
+            # A channel that stands still gets worse only through another one, which is then to be followed.
+            worse = {c for c in channels if share[c] > 0.0 and after[c] > before[c] * (1.0 + 1e-9)}
             if not worse:
                 self.values, self.residual = tried, residual
-                return {c for c in channels if before[c] - after[c] < 2e-3 * before[c]}
+                return {c for c in channels if abs(before[c] - after[c]) < 2e-3 * before[c]}
             for channel in worse:
-                share[channel] = 0.0 if share[channel] < 0.1 else 0.3 * share[channel]
+                share[channel] = 0.0 if share[channel] < 0.02 else 0.25 * share[channel]
         return set(channels)
 
     # -- testing ------------------------------------------------------------------------------------------------------
@@ -205,9 +215,12 @@ class Search:
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         return max(_RESIDUAL_SHARE * np.sqrt(self.noise(channel)), share * self.scale[channel])
 
+    def counted(self, channel: str) -> int:
+        """Residuals of a channel that say something."""
+        return max(int(np.count_nonzero(self.residual[channel])), 1)
+
     def rms(self, gain: float, channel: str) -> float:
-        counted = max(int(np.count_nonzero(self.residual[channel])), 1)
-        return float(np.sqrt(max(gain, 0.0) / counted))
+        return float(np.sqrt(max(gain, 0.0) / self.counted(channel)))
 
     def variants(self, effect: Effect, channel: str) -> tuple[list[tuple[tuple[Knob, float], ...]], int]:
         """Shapes in which to test an effect, and how many were looked at to choose them."""
@@ -239,25 +252,31 @@ class Search:
             table = np.column_stack(columns)
             normal = table.T @ table + np.diag(self.penalty(knobs, channel) + 1e-12)
             residual = residual - table @ np.linalg.lstsq(normal, table.T @ residual, rcond=1e-12)[0]
-        score = np.zeros(len(orders))
-        for index, order in enumerate(orders):
-            if index == 0 or order > 1.3 * binned:
-                # Samples that pass more than a fifth of a period smear it; bins are a sixteenth wide.
-                binned = order
-                slow = (travel * order < 1.0) & (residual != 0.0)
-                width = 2.0 * np.pi / (16.0 * 1.3 * order)
-                bins = np.floor((angle[slow] - angle.min()) / width).astype(np.int64)
-                sums = np.bincount(bins, weight[slow] * residual[slow])
-                squares = np.bincount(bins, weight[slow] ** 2)
-                centre = angle.min() + (np.arange(len(sums)) + 0.5) * width
-                # One stop's long hold at one angle must not outvote the strokes.
-                typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
-                cap = np.minimum(1.0, typical / np.maximum(squares, typical))
-            phase = np.exp(1j * order * centre)
-            score[index] = abs((cap * sums) @ phase) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
-        if not score.any():
-            return None, len(orders)
-        return float(orders[np.argmax(score)]), len(orders)
+        best, found = 0.0, None
+        low = orders[0]
+        while low < orders[-1]:
+            # One octave at a time: samples that pass more than a sixth of a period smear it, bins are an eighth of one wide.
+            high = 2.0 * low
+            slow = (travel * high < 1.0) & (residual != 0.0)
+            width = 2.0 * np.pi / (8.0 * high)
+            bins = ((angle[slow] - angle.min()) / width).astype(np.int64)
+            if not len(bins):
+                break
+            sums, squares = np.bincount(bins, weight[slow] * residual[slow]), np.bincount(bins, weight[slow] ** 2)
+            # One stop's long hold at one angle must not outvote the strokes.
+            typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
+            cap = np.minimum(1.0, typical / np.maximum(squares, typical))
+            padded = 1 << int(np.ceil(np.log2(4 * len(sums))))
+            power = np.abs(np.fft.rfft(cap * sums, padded)) ** 2 / max(float((cap**2 * squares).sum()), 1e-300)
+            scanned = 2.0 * np.pi * np.arange(len(power)) / (padded * width)
+            chosen = orders[(orders >= low) & (orders < high)]
+            if whole and len(chosen):
+                power, scanned = np.interp(chosen, scanned, power), chosen
+            inside = (scanned >= max(low, orders[0])) & (scanned < min(high, orders[-1] + 1e-9))
+            if inside.any() and power[inside].max() > best:
+                best, found = float(power[inside].max()), float(scanned[inside][np.argmax(power[inside])])
+            low = high
+        return found, len(orders)
 
     def round(self, candidates: list[Effect]) -> dict[str, tuple[Finding, tuple]]:
         """Test all candidates against the present residual."""
@@ -272,14 +291,16 @@ class Search:
         columns = self.bench.regressors(self.values, probes, self.residual)
         tested = {}
         for finding, knobs, shapes, tried in plans:
-            best: tuple[Verdict, tuple, list[np.ndarray]] = (NOT_EXCITED, (), [])
+            best: tuple[Verdict, tuple, list[np.ndarray], list[Knob]] = (NOT_EXCITED, (), [], knobs)
+            parts = _parts(knobs)
             for shape in shapes:
-                own = [columns[Probe(knob, shape)] for knob in knobs]
-                verdict = self.verdict(finding.channel, own)
-                if not best[2] or (verdict.p_value, -verdict.gain) < (best[0].p_value, -best[0].gain):
-                    best = (verdict, shape, own)
-            verdict, shape, own = best
-            finding.p_value = min(1.0, verdict.p_value * tried)
+                for part in parts:
+                    own = [columns[Probe(knob, shape)] for knob in part]
+                    verdict = self.verdict(finding.channel, own)
+                    if not best[2] or (verdict.p_value, -verdict.gain) < (best[0].p_value, -best[0].gain):
+                        best = (verdict, shape, own, part)
+            verdict, shape, own, knobs = best
+            finding.p_value = min(1.0, verdict.p_value * tried * len(parts))
             if finding.channel:
                 finding.gain = self.rms(verdict.gain, finding.channel)
                 initial = float(self.initial[finding.channel] @ self.initial[finding.channel])
@@ -338,14 +359,15 @@ class Search:
         """Largest gain on left-out episodes of a smooth function of one signal, and that signal."""
         if channel not in self._free:
             best = (0.0, "")
-            for name, gain in self.dependence(channel).items():
-                if gain.sum() > best[0]:
-                    best = (float(gain.sum()), name)
+            for name, (without, with_) in self.dependence(channel).items():
+                gain = float((without - with_).sum())
+                if gain > best[0]:
+                    best = (gain, name)
             self._free[channel] = best
         return self._free[channel]
 
-    def dependence(self, channel: str) -> dict[str, np.ndarray]:
-        """Gain on left-out episodes of a smooth function of each signal, episode by episode."""
+    def dependence(self, channel: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Squared error of each left-out episode, without and with a smooth function of each signal."""
         if channel not in FORCE_CHANNELS:
             return {}
         knobs = self.channel_knobs(channel)
@@ -362,7 +384,7 @@ class Search:
             penalty = np.concatenate([self.penalty(knobs, channel), 1e-3 * np.maximum(own, 1e-300) + 1e-12])
             both = fit(moments, penalty)
             plain = fit(moments.select(list(range(len(knobs)))), penalty[: len(knobs)])
-            result[name] = plain.left_out - both.left_out
+            result[name] = (plain.left_out, both.left_out)
         return result
 
     def placebo(self, effect: Effect, channel: str) -> float | None:
@@ -407,29 +429,33 @@ class Search:
             for name, (finding, plan) in tested.items():
                 finding.reason = self.why_not(finding, plan)
                 earlier = history.get(name)
-                if earlier is None or not earlier.confounded_with:
+                if earlier is None or not earlier.confounded_with or not finding.reason:
                     history[name] = finding
             chosen: set[str] = set()
             for channel in self.bench.channels:
                 passed = [t for t in tested.values() if t[0].channel == channel and not t[0].reason]
                 if not passed:
                     continue
-                passed.sort(key=lambda t: -t[1][3].gain)
-                winner = passed[0]
-                self._mark_confounded(winner, passed[1:], history)
-                self._accept(winner)
+                self._accept(self._settle(passed, history))
                 chosen.add(channel)
             if not chosen:
                 break
             self.refine(chosen)
+        if self.accepted:
+            # The force that heats the pads has changed: everything once more, together.
+            self.progress("refitting everything together", 0.75)
+            self.refine(channels)
         self._revise(history)
         return self._outcome(history, recalibrated)
 
     def _accept(self, winner: tuple[Finding, tuple]) -> None:
         finding, (knobs, shape, _, verdict) = winner
         shapes = [knob for knob, _ in shape]
-        self.accepted[finding.effect.name] = [*knobs, *shapes]
-        self.knobs += [*knobs, *shapes]
+        # An effect enters with all its orders; those that prove nothing go at the end.
+        every = [effect_knob(finding.effect, p.name, finding.channel) for p in finding.effect.amplitudes]
+        self.values.update(dict.fromkeys(every, 0.0))
+        self.accepted[finding.effect.name] = [*every, *shapes]
+        self.knobs += [*every, *shapes]
         for knob, value in zip(knobs, verdict.values, strict=True):
             self.values[knob] = float(np.clip(value, knob.low, knob.high))
         for knob, start in shape:
@@ -437,27 +463,37 @@ class Search:
             self.values[knob] = start
         self.residual = self.bench.residuals(self.values)
 
-    def _mark_confounded(self, winner: tuple, others: list[tuple], history: dict[str, Finding]) -> None:
-        finding, (_, _, own, verdict) = winner
-        for rival, (_, _, columns, judged) in others:
-            if judged.gain < _CONFOUNDED * verdict.gain:
+    def _settle(self, passed: list[tuple], history: dict[str, Finding]) -> tuple:
+        """The candidate to accept out of those that passed in one channel, and why the others of equal gain are not.
+
+        Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
+        that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so."""
+        best = max(passed, key=lambda t: t[1][3].gain)
+        rivals = []
+        for other in passed:
+            if other is best or other[1][3].gain < _CONFOUNDED * best[1][3].gain:
                 continue
-            with_winner = self.verdict_given(finding.channel, own, columns)
-            if with_winner.p_value < Q_VALUE and with_winner.gain > 0.0:
+            beside_best = self.verdict_given(best[0].channel, best[1][2], other[1][2])
+            if beside_best.p_value < Q_VALUE and beside_best.gain > 0.0:
                 continue
-            without = self.verdict_given(finding.channel, columns, own)
-            separated = without.p_value < Q_VALUE and without.gain > 0.0
-            rival.reason = (
-                f"explained by {finding.effect.name}, which explains more than it"
-                if separated
-                else f"confounded with {finding.effect.name} on these logs; to separate them: {rival.effect.manoeuvre}"
+            beside_other = self.verdict_given(best[0].channel, other[1][2], best[1][2])
+            if beside_other.p_value < Q_VALUE and beside_other.gain > 0.0:
+                other[0].reason = f"explained by {best[0].effect.name}, beside which it says nothing"
+                history[other[0].effect.name] = other[0]
+            else:
+                rivals.append(other)
+        equal = sorted([best, *rivals], key=lambda t: REGISTRY.index(t[0].effect))
+        winner = equal[0]
+        for loser in equal[1:]:
+            for one, other in ((winner, loser), (loser, winner)):
+                one[0].confounded_with = other[0].effect.name
+                one[0].manoeuvre = other[0].effect.manoeuvre if one is winner else one[0].effect.manoeuvre
+            loser[0].reason = (
+                f"confounded with {winner[0].effect.name} on these logs, which is simpler; to separate them: "
+                f"{loser[0].effect.manoeuvre}"
             )
-            if not separated:
-                rival.confounded_with = finding.effect.name
-                rival.manoeuvre = rival.effect.manoeuvre
-                finding.confounded_with = rival.effect.name
-                finding.manoeuvre = finding.effect.manoeuvre
-            history[rival.effect.name] = rival
+            history[loser[0].effect.name] = loser[0]
+        return winner
 
     def verdict_given(self, channel: str, given: list[np.ndarray], own: list[np.ndarray]) -> Verdict:
         knobs = self.channel_knobs(channel)
@@ -467,54 +503,36 @@ class Search:
         return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
     def _revise(self, history: dict[str, Finding]) -> None:
-        """Test each accepted effect once more with all others in place; drop what no longer holds."""
+        """Test each accepted effect once more with all others in place; drop what, or which order, no longer holds."""
         for name in list(self.accepted):
-            knobs = self.accepted[name]
-            finding = history[name]
+            finding, knobs = history[name], self.accepted[name]
             channel = finding.channel
             own = self.channel_knobs(channel)
             values = np.array([self.values[k] for k in own])
             restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
             moments = self.moments(channel, [self.columns[k] for k in own], restored)
-            amplitudes = [i for i, k in enumerate(own) if k in knobs and not _is_shape(finding.effect, k)]
-            rest = [i for i, k in enumerate(own) if k not in knobs]
-            verdict = judge(moments, rest, amplitudes, self.penalty(own, channel))
-            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+            amplitudes = [knob for knob in knobs if not _is_shape(finding.effect, knob)]
+            groups = _orders(amplitudes)
+            dropped: list[Knob] = []
+            for group in groups:
+                tested = [own.index(knob) for knob in group]
+                rest = [i for i in range(len(own)) if i not in tested]
+                verdict = judge(moments, rest, tested, self.penalty(own, channel))
+                if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
+                    dropped += group
+            if not dropped:
+                continue
+            if len(dropped) == len(amplitudes):
                 finding.reason = "no longer holds beside the other effects"
                 del self.accepted[name]
-                self.knobs = [k for k in self.knobs if k not in knobs]
-                for knob in knobs:
-                    del self.values[knob]
-                self.residual = self.bench.residuals(self.values)
-                self.refine({channel})
+                dropped = knobs
             else:
-                self._prune(finding, knobs)
-
-    def _prune(self, finding: Finding, knobs: list[Knob]) -> None:
-        """Set those orders of a periodic effect to zero that the episodes do not prove."""
-        orders = sorted({knob.name.partition(".order_")[2][0] for knob in knobs if ".order_" in knob.name and not
-                         knob.name.endswith("per_turn")})  # fmt: skip
-        if len(orders) < 2:
-            return
-        channel = finding.channel
-        own = self.channel_knobs(channel)
-        values = np.array([self.values[k] for k in own])
-        restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
-        moments = self.moments(channel, [self.columns[k] for k in own], restored)
-        dropped = []
-        for order in orders:
-            pair = [i for i, k in enumerate(own) if k.name.startswith(f"{finding.effect.name}.order_{order}_")]
-            rest = [i for i in range(len(own)) if i not in pair]
-            verdict = judge(moments, rest, pair, self.penalty(own, channel))
-            if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
-                dropped += [own[i] for i in pair]
-        if dropped and len(dropped) < len(knobs):
+                self.accepted[name] = [knob for knob in knobs if knob not in dropped]
             for knob in dropped:
                 del self.values[knob]
-                knobs.remove(knob)
                 finding.values[knob.name.partition(".")[2]] = 0.0
                 finding.sigmas[knob.name.partition(".")[2]] = 0.0
-            self.knobs = [knob for knob in self.knobs if knob not in dropped]
+            self.knobs = [k for k in self.knobs if k not in dropped]
             self.residual = self.bench.residuals(self.values)
             self.refine({channel})
 
@@ -528,7 +546,8 @@ class Search:
             table = np.column_stack([self.columns[knob] for knob in knobs])
             moments = self.moments(channel, [table], self.initial[channel])
             gain = float((moments.products[:, -1, -1] - fit(moments, self.penalty(knobs, channel)).left_out).sum())
-            if self.rms(gain, channel) >= self.floor(channel):
+            # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
+            if channel != "innovation" and self.rms(gain, channel) >= self.floor(channel):
                 result[channel] = self.rms(gain, channel)
         return result
 
@@ -555,8 +574,9 @@ class Search:
             finding.accepted = True
             finding.share_explained = self._share(finding.channel, knobs)
             finding.reason = finding.reason or (
-                f"q = {finding.q_value:.1g} over episodes, {finding.gain:.3g} {UNITS[finding.channel]} RMS on left-out episodes"
+                f"q = {finding.q_value:.1g} over episodes, gains {finding.gain:.3g} {UNITS[finding.channel]} on left-out ones"
                 + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
+                + (", from the difference of both paths: no reference was recorded" if finding.channel == "innovation" else "")
             )
             for knob in knobs:
                 key = knob.name.partition(".")[2]
@@ -578,6 +598,21 @@ class Search:
             [history[effect.name] for effect in REGISTRY],
             self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, penalties,
         )  # fmt: skip
+
+
+def _orders(knobs: list[Knob]) -> list[list[Knob]]:
+    """Amplitudes that stand or fall together: cosine and sine of one order, or all."""
+    groups: dict[str, list[Knob]] = {}
+    for knob in knobs:
+        order = knob.name.partition(".order_")[2]
+        groups.setdefault(order[:1] if order[:1].isdigit() else "", []).append(knob)
+    return list(groups.values())
+
+
+def _parts(knobs: list[Knob]) -> list[list[Knob]]:
+    """The first orders only, the first two, ..., all: few episodes cannot carry a test of many numbers."""
+    groups = _orders(knobs)
+    return [list(chain.from_iterable(groups[: count + 1])) for count in range(len(groups))] or [[]]
 
 
 def _is_shape(effect: Effect, knob: Knob) -> bool:

@@ -15,8 +15,8 @@ import numpy as np
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.knobs import Knob
 from emb_daemon.effects import torque_constant_fade
-from emb_daemon.effects.disc_thickness_variation import track
 from emb_daemon.effects.disc_thickness_variation import STATE as WHEEL_STATE
+from emb_daemon.effects.disc_thickness_variation import track
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import njit

@@ -64,10 +64,43 @@ class Diagnosis:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
 
+    def validated(self) -> dict[str, float]:
+        """By effect accepted, RMS by which it lowers its path's residual on the validation logs (in quadrature; negative if
+        it does harm there). Empty without validation logs. It judges and chooses nothing."""
+        if self.judged_on != "validate":
+            return {}
+        logs = [trial.log for trial in self.judged_bench.trials]
+        with_all = Bench(logs, to_parameters(self.calibration)).residuals({})
+        result = {}
+        for finding in self.accepted:
+            if finding.channel not in with_all:
+                continue
+            bare = to_parameters(self.calibration).copy()
+            bare["effects"][finding.effect.name] = np.zeros((), bare["effects"][finding.effect.name].dtype)
+            without = Bench(logs, bare).residuals({})[finding.channel]
+            gain = float(np.mean(without**2) - np.mean(with_all[finding.channel] ** 2))
+            result[finding.effect.name] = float(np.sign(gain) * np.sqrt(abs(gain)))
+        return result
+
+    def judged_residual(self) -> dict:
+        """RMS of each path's residual on the judging logs, before and after: of the torque path without the limit at zero
+        force that its estimate has. Empty where the fit logs judge themselves."""
+        if self.judged_on != "validate":
+            return {}
+        before = self.judged_bench.residuals({})
+        after = Bench(
+            [trial.log for trial in self.judged_bench.trials], to_parameters(self.calibration)
+        ).residuals({})  # fmt: skip
+        return {
+            channel: {"unit": UNITS[channel], "rms_before": _rms(before[channel]), "rms_after": _rms(after[channel])}
+            for channel in self.judged_bench.channels
+        }
+
     def report(self) -> dict:
         """Contents of report.json."""
         figures = self.figures()
         rest = self.unexplained
+        validated = self.validated()
         first = max((channel[0] for channel in self.rests.values() if channel), key=lambda r: r.share, default=None)
         return {
             "paths": {
@@ -82,7 +115,11 @@ class Diagnosis:
             },
             "judged_on": self.judged_on,
             "reference": "clamp_force" if self.bench.has_reference else "innovation",
-            "effects": [finding_json(finding) for finding in ranked(self.attribution.findings)],
+            "effects": [
+                finding_json(finding)
+                | ({"gain_on_validation": validated[finding.effect.name]} if finding.effect.name in validated else {})
+                for finding in ranked(self.attribution.findings)
+            ],
             "recalibrated": {
                 knob.name: {"change": value, "sigma": self.attribution.sigmas.get(knob, 0.0), "unit": knob.unit}
                 for knob, value in self.attribution.values.items()
@@ -107,6 +144,7 @@ class Diagnosis:
                 }
                 for channel in self.bench.channels
             },
+            "judged_residual": self.judged_residual(),
             "episodes": self.bench.episodes,
             "seconds": self.seconds,
         }
@@ -199,13 +237,11 @@ def diagnose(
     search, attribution = attribute_with(bench, progress)
     progress("what is left", 0.85)
     after_rests = {
-        channel: rests(channel, search.dependence(channel), attribution.residual[channel], search.floor(channel))
+        channel: rests(channel, search.dependence(channel), search.counted(channel), search.floor(channel))
         for channel in bench.channels
         if channel in FORCE_CHANNELS
     }
-    before_rests = {
-        channel: rests(channel, gains, attribution.initial[channel], 0.0) for channel, gains in search.first.items()
-    }
+    before_rests = {channel: rests(channel, gains, search.counted(channel), 0.0) for channel, gains in search.first.items()}
     used = {knob: value for knob, value in attribution.values.items() if value != 0.0}
     augmented = calibrated(calibration, used) if used else calibration
     progress("judging", 0.9)
@@ -221,7 +257,11 @@ def diagnose(
         calibration, augmented, bench, attribution, "validate" if validate else "left_out_episodes",
         judges, before, after, after_rests, before_rests, time.monotonic() - begin,
     )  # fmt: skip
-    sources = tuple(Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest()) for log in fit_logs)
+    sources = tuple(
+        Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())
+        for log in fit_logs
+        if log.path.is_file()
+    )
     result.calibration = _with_provenance(result, sources)
     progress("done", 1.0)
     return result

@@ -5,6 +5,8 @@ little about the next. A log is therefore cut into brake applications, each with
 long (a drag, a burst, a park brake stroke) into pieces of a few seconds.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 #: Force (N) above which the brake is applied, and shortest pause (s) that ends an application.
@@ -39,7 +41,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray) -> np.ndarray:
     cuts.append(len(time_s))
     number = np.zeros(len(time_s), np.int64)
     count = 0
-    for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+    for start, stop in pairwise(cuts):
         duration = time_s[stop - 1] - time_s[start]
         pieces = max(1, round(duration / longest))
         share = (time_s[start:stop] - time_s[start]) / max(duration, 1e-9)

@@ -5,7 +5,7 @@ hide one, so every candidate is tested with all of its path's base knobs free.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -33,7 +33,7 @@ class Knob:
     step: float
     prior: float
     unit: str
-    apply: Callable[[np.void, float], None]
+    apply: Callable[[np.void, float], None] = field(compare=False)
     log: int | None = None
     low: float = -np.inf
     high: float = np.inf
@@ -98,7 +98,7 @@ def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     for index, value in enumerate(parameters["curve"]):
         if value != 0.0:
             name = f"stiffness.curves.coefficients[{index}]"
-            knobs.append(Knob(name, "stiffness", 0.01, 0.3, "1", _coefficient(index)))
+            knobs.append(Knob(name, "stiffness", 0.01, 0.1, "1", _coefficient(index)))
     thermal = parameters["thermal"]
     knobs += [
         Knob("stiffness.relaxation_time_s", "stiffness", 0.02, 0.5, "1", _scale("relaxation_time")),
@@ -161,6 +161,7 @@ def calibrated(calibration: Calibration, values: dict[Knob, float]) -> Calibrati
     table = data["thermal"]["friction"]
     effects = {effect.name: effect for effect in REGISTRY}
     for knob, value in values.items():
+        value = float(value)
         group, _, rest = knob.name.partition(".")
         if group in effects:
             parameter = next(p for p in effects[group].parameters if p.name == rest)

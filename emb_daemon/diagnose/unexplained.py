@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Evidence needed to say that something is left: mean gain over its standard error, over episodes.
-_SURE = 3.5
+#: Evidence needed to say that something is left: mean relative gain over its standard error, over episodes.
+_SURE = 2.5
 #: Share of the residual's mean square from which a rest is worth a word.
-_LEAST_SHARE = 0.03
+_LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -15,9 +15,9 @@ class Rest:
     """Dependence of one channel's residual on one signal.
 
     Attributes:
-        share: of the residual's mean square that smooth functions of the signal explain on left-out episodes.
+        share: of the left-out squared error that smooth functions of the signal take away.
         rms: the same as RMS in N.
-        certainty: mean gain over its standard error over episodes.
+        certainty: mean relative gain over its standard error; relative, so that one violent stop has one vote.
     """
 
     channel: str
@@ -28,26 +28,22 @@ class Rest:
     matters: bool
 
 
-def rests(channel: str, gains: dict[str, np.ndarray], residual: np.ndarray, floor: float) -> list[Rest]:
-    """One `Rest` for each signal, strongest first."""
-    counted = max(int(np.count_nonzero(residual)), 1)
-    total = max(float(residual @ residual), 1e-300)
+def rests(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], samples: int, floor: float) -> list[Rest]:
+    """One `Rest` for each signal, strongest first.
+
+    Args:
+        gains: by signal, squared error of each left-out episode without and with a smooth function of the signal.
+        samples: that the squared errors are summed over.
+        floor: RMS (N) from which a rest matters.
+    """
     result = []
-    for signal, gain in gains.items():
-        spread = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 2 else np.inf
-        certainty = float(gain.mean() / spread) if spread > 0.0 else 0.0
-        share = max(float(gain.sum()) / total, 0.0)
-        rms = float(np.sqrt(max(gain.sum(), 0.0) / counted))
-        result.append(Rest(channel, signal, share, rms, certainty, False))
-    result.sort(key=lambda rest: -rest.share)
-    return [
-        Rest(
-            r.channel,
-            r.signal,
-            r.share,
-            r.rms,
-            r.certainty,
-            r.share >= _LEAST_SHARE and r.rms >= floor and r.certainty >= _SURE,
-        )
-        for r in result
-    ]
+    for signal, (without, with_) in gains.items():
+        gain = without - with_
+        relative = gain / (without + without.mean() + 1e-300)
+        spread = relative.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 2 else np.inf
+        certainty = float(relative.mean() / spread) if spread > 0.0 else 0.0
+        share = max(float(gain.sum() / max(without.sum(), 1e-300)), 0.0)
+        rms = float(np.sqrt(max(gain.sum(), 0.0) / max(samples, 1)))
+        matters = share >= _LEAST_SHARE and rms >= floor and certainty >= _SURE
+        result.append(Rest(channel, signal, share, rms, certainty, matters))
+    return sorted(result, key=lambda rest: -rest.share)

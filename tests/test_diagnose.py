@@ -1,0 +1,330 @@
+"""diagnose: statistics that do not fool themselves, and the loop closed on simulated brakes that hide something."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.cli.main import main
+from emb_daemon.diagnose.blind import campaign, run_trial
+from emb_daemon.diagnose.channels import Bench
+from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.episodes import episodes
+from emb_daemon.diagnose.evidence import Moments, false_discovery, fit, judge
+from emb_daemon.diagnose.knobs import base_knobs, calibrated, effect_knob
+from emb_daemon.diagnose.text import verdict
+from emb_daemon.effects import REGISTRY
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.offline import estimate, load_log, log_of
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import simulate_log
+from emb_daemon.resources import resource
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+# -- statistics -------------------------------------------------------------------------------------------------------
+
+
+def _autocorrelated(rng, episodes_, samples):
+    noise = rng.standard_normal((episodes_, samples))
+    for k in range(1, samples):
+        noise[:, k] = 0.98 * noise[:, k - 1] + np.sqrt(1.0 - 0.98**2) * noise[:, k]
+    return noise.ravel()
+
+
+def test_autocorrelated_noise_is_no_effect():
+    """The figure of the engineering notes: rho 0.98, nothing there. Plain t-tests find something in most runs."""
+    rng = np.random.default_rng(1)
+    count, length, runs = 30, 60, 400
+    episode = np.repeat(np.arange(count), length)
+    clustered = naive = 0
+    for _ in range(runs):
+        residual, regressor = _autocorrelated(rng, count, length), _autocorrelated(rng, count, length)
+        moments = Moments.of(np.column_stack([np.ones(count * length), regressor]), residual, episode, count)
+        verdict_ = judge(moments, [0], [1], np.zeros(2))
+        clustered += verdict_.p_value < 0.01
+        slope = np.polyfit(regressor, residual, 1)[0]
+        naive += abs(slope) / (residual.std() / regressor.std() / np.sqrt(count * length)) > 2.576
+    assert naive > 0.3 * runs
+    # One per cent of 400 is 4; nine happen by chance less than once in fifty.
+    assert clustered <= 9
+
+
+def test_a_true_effect_is_seen_with_its_size_and_sigma():
+    rng = np.random.default_rng(2)
+    count, length = 30, 60
+    episode = np.repeat(np.arange(count), length)
+    values, sigmas, seen = [], [], 0
+    for _ in range(60):
+        regressor = _autocorrelated(rng, count, length)
+        moments = Moments.of(regressor[:, None], regressor + _autocorrelated(rng, count, length), episode, count)
+        verdict_ = judge(moments, [], [0], np.zeros(1))
+        seen += verdict_.p_value < 0.01 and verdict_.gain > 0.0
+        values.append(verdict_.values[0])
+        sigmas.append(verdict_.sigmas[0])
+    assert seen >= 55
+    assert np.mean(values) == pytest.approx(1.0, abs=0.06)
+    assert np.mean(sigmas) == pytest.approx(np.std(values), rel=0.35)
+
+
+def test_one_episode_proves_nothing():
+    rng = np.random.default_rng(3)
+    episode = np.repeat(np.arange(20), 50)
+    regressor = np.where(episode == 7, 1.0, 0.0)
+    moments = Moments.of(regressor[:, None], 10.0 * regressor + rng.standard_normal(1000), episode, 20)
+    assert judge(moments, [], [0], np.zeros(1)).p_value == 1.0
+
+
+def test_a_regressor_that_nuisances_span_is_not_credited():
+    rng = np.random.default_rng(4)
+    episode = np.repeat(np.arange(20), 50)
+    nuisance = rng.standard_normal(1000)
+    moments = Moments.of(np.column_stack([nuisance, 2.0 * nuisance]), 3.0 * nuisance, episode, 20)
+    assert judge(moments, [0], [1], np.zeros(2)).p_value == 1.0
+
+
+def test_left_out_error_is_that_of_fits_without_the_episode():
+    rng = np.random.default_rng(5)
+    episode = np.repeat(np.arange(6), 20)
+    table, target = rng.standard_normal((120, 3)), rng.standard_normal(120)
+    result = fit(Moments.of(table, target, episode, 6), np.zeros(3))
+    for number in range(6):
+        kept = episode != number
+        values = np.linalg.lstsq(table[kept], target[kept], rcond=None)[0]
+        assert result.left_out[number] == pytest.approx(np.sum((target - table @ values)[~kept] ** 2), rel=1e-6)
+
+
+def test_false_discovery_rate_of_benjamini_and_hochberg():
+    p = np.array([0.01, 0.04, 0.03, 0.5])
+    assert false_discovery(p) == pytest.approx([0.04, 0.16 / 3.0, 0.16 / 3.0, 0.5])
+
+
+def test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut():
+    time = np.arange(0.0, 100.0, 0.004)
+    force = np.where((time % 10.0 > 4.0) & (time < 50.0), 5000.0, 0.0)
+    force[time >= 60.0] = 4000.0
+    number = episodes(time, force)
+    assert np.all(np.diff(number) >= 0) and np.all(np.diff(number) <= 1)
+    ends = time[np.flatnonzero(np.diff(number))]
+    for release in (10.0, 20.0, 30.0, 40.0, 50.0):
+        assert np.abs(ends - release).min() < 0.01
+    assert max(np.bincount(number)) * 0.004 < 12.0
+
+
+# -- knobs ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_calibration_moved_by_knobs_gives_the_parameters_moved_by_them(calibration):
+    """What is written is what was fitted, for every knob there is."""
+    start = to_parameters(calibration)
+    knobs = base_knobs(start, 1)
+    for effect in REGISTRY:
+        initial = calibration.effects.get(effect.name, {})
+        knobs += [effect_knob(effect, p.name, "stiffness", initial.get(p.name, 0.0)) for p in effect.parameters]
+    for knob in knobs:
+        value = min(max(0.7 * knob.step, knob.low), knob.high)
+        moved = start.copy()
+        knob.apply(moved, value)
+        written = to_parameters(calibrated(calibration, {knob: value}))
+        for name in start.dtype.names:
+            if name == "effects":
+                group = knob.name.partition(".")[0]
+                if group in start["effects"].dtype.names:
+                    key = knob.name.partition(".")[2]
+                    assert written["effects"][group][key] == pytest.approx(moved["effects"][group][key], rel=1e-12)
+            elif name == "thermal":
+                for inner in start["thermal"].dtype.names:
+                    np.testing.assert_allclose(
+                        written["thermal"][inner], moved["thermal"][inner], rtol=1e-12, err_msg=knob.name
+                    )
+            else:
+                np.testing.assert_allclose(written[name], moved[name], rtol=1e-12, err_msg=knob.name)
+
+
+# -- the loop ---------------------------------------------------------------------------------------------------------
+
+
+def _logs(calibration, seed, effects, reference=True, stops=8):
+    plant = plant_from_calibration(calibration, seed=seed, effects=effects)
+    rng = np.random.default_rng(seed)
+    return [simulate_log(plant, campaign(plant, rng, stops), seed=seed + k, reference=reference)[0] for k in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def uneven_disc(calibration, tmp_path_factory):
+    """The command run on a brake whose disc is uneven; (folder, report)."""
+    folder = tmp_path_factory.mktemp("diagnose")
+    hidden = {"disc_thickness_variation": {"order_1_cosine_um": 9.0, "order_1_sine_um": -8.0, "order_2_sine_um": 5.0}}
+    for name, frames in zip(("fit", "val"), _logs(calibration, 11, hidden), strict=True):
+        (folder / f"{name}.log").write_text(format_candump(frames))
+    arguments = ["diagnose", str(folder / "fit.log"), "--calibration", str(resource("config/calibration.yaml"))]
+    assert main([*arguments, "--validate", str(folder / "val.log"), "--output", str(folder / "out")]) == 0
+    return folder, json.loads((folder / "out" / "report.json").read_text())
+
+
+def test_finds_names_and_sizes_what_was_hidden(uneven_disc):
+    _, report = uneven_disc
+    accepted = [e for e in report["effects"] if e["accepted"]]
+    assert [e["name"] for e in accepted] == ["disc_thickness_variation"]
+    parameters = accepted[0]["parameters"]
+    amplitude = parameters["order_1_amplitude_um"]
+    assert amplitude["value"] == pytest.approx(np.hypot(9.0, 8.0), rel=0.08)
+    assert parameters["order_2_amplitude_um"]["value"] == pytest.approx(5.0, rel=0.15)
+    assert 0.0 < amplitude["sigma"] < 1.0
+    assert accepted[0]["q_value"] <= 0.01
+    assert not report["unexplained"]["present"]
+
+
+def test_error_falls_to_that_of_a_brake_without_the_effect(uneven_disc):
+    _, report = uneven_disc
+    fused = report["paths"]["fused"]
+    assert report["judged_on"] == "validate"
+    assert fused["rmse_before_N"] > 100.0
+    assert fused["rmse_after_N"] < 40.0
+    assert fused["interval_after_N"][0] < fused["rmse_after_N"] < fused["interval_after_N"][1]
+
+
+def test_report_keeps_the_contract(uneven_disc):
+    folder, report = uneven_disc
+    assert {"paths", "judged_on", "effects", "unexplained"} <= report.keys()
+    assert {"stiffness", "torque", "fused"} <= report["paths"].keys()
+    assert {effect["name"] for effect in report["effects"]} == {effect.name for effect in REGISTRY}
+    for effect in report["effects"]:
+        keys = {"name", "path", "accepted", "share_explained", "gain_N", "q_value", "parameters", "equation", "reason"}
+        assert keys <= effect.keys()
+        assert effect["reason"], effect["name"]
+    accepted = [effect["accepted"] for effect in report["effects"]]
+    assert accepted == sorted(accepted, reverse=True)
+    page = (folder / "out" / "report.html").read_text()
+    assert "disc thickness variation" in page and "https://" not in page.split("<script")[0]
+
+
+def test_replay_with_the_written_calibration_gives_the_after_figure_to_the_last_digit(uneven_disc, capsys):
+    folder, report = uneven_disc
+    capsys.readouterr()
+    assert main(["replay", str(folder / "val.log"), "--calibration", str(folder / "out" / "calibration.yaml"), "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)["logs"][0]["force_N"]
+    for path in ("stiffness", "torque", "fused"):
+        # Sums over episodes or over all samples: the same number but for the last bits.
+        assert replayed[path]["rmse"] == pytest.approx(report["paths"][path]["rmse_after_N"], rel=1e-12)
+
+
+def test_nothing_is_invented_and_a_calibration_that_is_off_is_said_to_be_off(calibration):
+    plant = plant_from_calibration(calibration, seed=21)
+    plant["curve"] *= 1.03
+    rng = np.random.default_rng(21)
+    fit_log, val_log = (log_of(simulate_log(plant, campaign(plant, rng, 8), seed=k)[0]) for k in (1, 2))
+    result = diagnose([fit_log], calibration, [val_log])
+    assert not result.accepted
+    assert result.unexplained is None
+    assert result.before.rmse("fused") > 40.0
+    assert result.after.rmse("fused") < 35.0
+    assert "calibration itself was off" in verdict(result)
+
+
+def test_an_effect_is_not_hidden_by_a_calibration_that_is_off(calibration):
+    plant = plant_from_calibration(calibration, seed=31, effects={"viscous_friction": {"viscous_Nms_per_rad": 3e-4}})
+    plant["torque_constant"] *= 1.02
+    rng = np.random.default_rng(31)
+    fit_log, val_log = (log_of(simulate_log(plant, campaign(plant, rng, 8), seed=k)[0]) for k in (1, 2))
+    result = diagnose([fit_log], calibration, [val_log])
+    assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
+    assert result.accepted[0].values["viscous_Nms_per_rad"] == pytest.approx(3e-4, rel=0.05)
+    assert result.calibration.motor.torque_constant_Nm_per_A == pytest.approx(float(plant["torque_constant"]), rel=0.01)
+
+
+def test_without_reference_the_paths_judge_each_other(calibration):
+    frames = _logs(calibration, 5, {"viscous_friction": {"viscous_Nms_per_rad": 3e-4}}, reference=False)
+    result = diagnose([log_of(frames[0])], calibration, [log_of(frames[1])])
+    assert result.report()["reference"] == "innovation"
+    assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
+    assert "no reference" in verdict(result)
+
+
+def test_left_out_episodes_judge_where_no_other_log_does(calibration):
+    frames = _logs(calibration, 41, {"disc_thermal_expansion": {"growth_um_per_K": 0.4}})
+    result = diagnose([log_of(frames[0])], calibration)
+    assert result.report()["judged_on"] == "left_out_episodes"
+    assert [finding.effect.name for finding in result.accepted] == ["disc_thermal_expansion"]
+    assert result.after.rmse("fused") < 0.6 * result.before.rmse("fused")
+
+
+def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration):
+    trial = run_trial(calibration, 20020, "foreign", ("brake_torque_coupling",))
+    assert not trial.found
+    assert trial.unexplained in ("brake_torque", "disc_speed")
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind", "names", "size"),
+    [
+        (1003, "null", (), 0.0),
+        (51000, "single", ("signal_delay",), 100.0),
+        (52000, "single", ("friction_asymmetry",), 300.0),
+        (53000, "pair", ("disc_thickness_variation", "current_offset"), 300.0),
+    ],
+)
+def test_blind(calibration, seed, kind, names, size):
+    """The short version of the blind test; `python -m emb_daemon.diagnose.blind` is the whole."""
+    trial = run_trial(calibration, seed, kind, names, size)
+    assert trial.named, trial
+    assert trial.after < 45.0
+
+
+def test_bench_runs_the_production_estimator(calibration):
+    """With the contact angle held, the residual is reference minus what the daemon would say."""
+    log = log_of(_logs(calibration, 61, {})[0])
+    p = to_parameters(calibration).copy()
+    p["clearance_sigma"] = p["contact_walk"] = 0.0
+    bench = Bench([log], to_parameters(calibration))
+    expected = bench.trials[0].force_N - estimate(log.samples, p)["stiffness_force"]
+    np.testing.assert_array_equal(bench.residuals({})["stiffness"], np.nan_to_num(expected))
+
+
+# -- unusable input ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", ["log", "calibration"])
+def test_missing_files_are_named(tmp_path, capsys, missing):
+    calibration = resource("config/calibration.yaml") if missing == "log" else tmp_path / "none.yaml"
+    assert main(["diagnose", str(tmp_path / "none.log"), "--calibration", str(calibration), "--output", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"none.{'log' if missing == 'log' else 'yaml'}" in error
+
+
+def test_a_log_too_short_to_tell_effect_from_chance_is_refused(calibration):
+    plant = plant_from_calibration(calibration)
+    log = log_of(simulate_log(plant, campaign(plant, np.random.default_rng(0), 1), seconds=1.0)[0])
+    with pytest.raises(Exception, match="episodes"):
+        diagnose([log], calibration)
+
+
+# -- logs that nobody here made ---------------------------------------------------------------------------------------
+
+
+def _path_effects(result):
+    return {finding.effect.name for finding in result.accepted if finding.channel in ("stiffness", "torque")}
+
+
+def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, calibration):
+    folder = rig / "undeclared" / "case0"
+    result = diagnose([load_log(folder / "fit.log.gz")], calibration, [load_log(folder / "val.log.gz")])
+    assert not _path_effects(result)
+    assert result.after.rmse("fused") < 33.0
+
+
+def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calibration):
+    """The rig has hysteresis and a second relaxation of its own; in this case its disc is uneven as well."""
+    thesis = msgspec.structs.replace(calibration, effects={})
+    folder = rig / "undeclared" / "case3"
+    result = diagnose([load_log(folder / "fit.log.gz")], thesis, [load_log(folder / "val.log.gz")])
+    assert _path_effects(result) == {"stiffness_hysteresis", "second_relaxation", "disc_thickness_variation"}
+    assert result.before.rmse("fused") > 180.0
+    assert result.after.rmse("fused") < 36.0

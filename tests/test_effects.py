@@ -1,0 +1,196 @@
+"""The catalogue of effects: complete, exactly neutral at zero, and each with the sign and the conditions of its physics."""
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.channels import wheel_angle
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.gear_mesh_ripple import cycle_mean
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.offline import estimate
+from emb_daemon.resources import resource
+
+#: Names that scripts and people may rely on.
+CONTRACT = (
+    "disc_thickness_variation",
+    "disc_thermal_expansion",
+    "pad_wear",
+    "torque_constant_fade",
+    "current_offset",
+    "viscous_friction",
+    "stribeck_friction",
+    "friction_asymmetry",
+    "gear_mesh_ripple",
+    "cogging_torque",
+    "stiffness_hysteresis",
+    "second_relaxation",
+    "signal_delay",
+    "backlash",
+    "friction_coefficient_fade",
+    "disc_radiation",
+    "thermocouple_lag",
+)
+DT = 0.004
+
+
+def bare():
+    """The shipped calibration without any effect."""
+    p = to_parameters(load_calibration(resource("config/calibration.yaml"))).copy()
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    return p
+
+
+def with_effect(name, **values):
+    p = bare()
+    for effect in REGISTRY:
+        if effect.name == name:
+            for parameter in effect.shapes:
+                p["effects"][name][parameter.name] = parameter.starts[0]
+    for key, value in values.items():
+        p["effects"][name][key] = value
+    return p
+
+
+def drive(seconds=12.0, wheel_speed=20.0):
+    """A clamp from released to about 10 kN, held with a slow stroke on top, on a disc of constant speed; a fair current."""
+    count = round(seconds / DT)
+    samples = np.zeros(count, SAMPLE)
+    time = DT * np.arange(count)
+    angle = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * time) * (time > 2.0)
+    samples["dt"] = np.where(np.arange(count) == 0, 0.0, DT)
+    samples["angle"], samples["speed"] = angle, np.gradient(angle, DT)
+    samples["current_q"] = 0.5 * angle
+    samples["wheel_speed"] = wheel_speed
+    samples["wheel_pulse"] = np.floor(100.0 + 96.0 * wheel_speed * time / (2.0 * np.pi)) % 4096
+    samples["inner_backplate"] = samples["outer_backplate"] = 22.0 + time
+    samples["caliper"], samples["ambient"], samples["brake_torque"] = 40.0, 22.0, np.nan
+    for name in ("has_current", "has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
+        samples[name] = True
+    return samples
+
+
+def test_catalogue_is_that_of_the_contract():
+    assert sorted(effect.name for effect in REGISTRY) == sorted(CONTRACT)
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_exactly_neutral_at_zero_whatever_its_shape(effect):
+    samples, plain = drive(4.0), bare()
+    shaped = bare()
+    for parameter in effect.shapes:
+        shaped["effects"][effect.name][parameter.name] = parameter.starts[-1]
+    assert estimate(samples, plain).tobytes() == estimate(samples, shaped).tobytes()
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_acts_on_its_own_path(effect):
+    samples = drive()
+    p = with_effect(effect.name, **{parameter.name: parameter.prior for parameter in effect.amplitudes})
+    p["clearance_sigma"] = p["contact_walk"] = 0.0
+    q = bare()
+    q["clearance_sigma"] = q["contact_walk"] = 0.0
+    changed, plain = estimate(samples, p), estimate(samples, q)
+    stiffness = np.abs(changed["stiffness_force"] - plain["stiffness_force"]).max()
+    torque = np.nanmax(np.abs(changed["torque_force"] - plain["torque_force"]))
+    if effect.path == "stiffness":
+        assert stiffness > 5.0 and torque == 0.0
+    elif effect.path == "torque":
+        assert torque > 5.0
+        # What the torque path says reaches the stiffness path only through the heat of the fused force.
+        assert stiffness < 0.05 * torque
+    else:
+        assert np.nanmax(np.abs(changed["disc"] - plain["disc"])) > 1e-3
+        assert torque == 0.0
+
+
+def force(p, samples):
+    p["clearance_sigma"] = p["contact_walk"] = 0.0
+    return estimate(samples, p)["stiffness_force"]
+
+
+def test_thickness_variation_stands_still_with_the_wheel():
+    standing = drive(wheel_speed=0.0)
+    held = slice(600, None)
+    p = with_effect("disc_thickness_variation", order_1_cosine_um=15.0)
+    lever = with_effect("disc_thickness_variation")
+    lever["clearance"] += 1e-3
+    per_rad = (force(bare(), standing) - force(lever, standing))[held] / 1e-3
+    shift = (force(p, standing) - force(bare(), standing))[held] / per_rad
+    # One place on the disc: one shift of contact, whatever the force, and no more than 15 um of travel.
+    assert np.ptp(shift) < 0.03 * 15e-6 / bare()["gear_gain"]
+    assert np.abs(shift).max() < 1.1 * 15e-6 / bare()["gear_gain"]
+
+
+def test_thickness_variation_comes_once_per_turn():
+    samples = drive(20.0, wheel_speed=20.0)
+    change = force(with_effect("disc_thickness_variation", order_1_sine_um=10.0), samples) - force(bare(), samples)
+    held = change[2000:]
+    spectrum = np.abs(np.fft.rfft(held - held.mean()))
+    frequency = np.fft.rfftfreq(len(held), DT)
+    assert frequency[np.argmax(spectrum)] == pytest.approx(20.0 / (2.0 * np.pi), abs=0.1)
+
+
+def test_wheel_angle_goes_on_between_pulses_and_over_the_counter_s_end():
+    count, speed = 15000, 30.0
+    time = DT * np.arange(count)
+    true = 0.3 + speed * time
+    samples = np.zeros(count, SAMPLE)
+    samples["dt"] = np.where(np.arange(count) == 0, 0.0, DT)
+    # Messages come every 10 ms, pulses are counted modulo 4096, the speed is a little off.
+    sent = np.floor(time / 0.010) * 0.010
+    samples["wheel_pulse"] = np.floor((0.3 + speed * sent) * 96.0 / (2.0 * np.pi)) % 4096
+    samples["wheel_speed"] = 1.002 * speed
+    samples["has_wheel_pulse"] = samples["has_wheel_speed"] = True
+    error = wheel_angle(samples) - true
+    pulse = 2.0 * np.pi / 96.0
+    # The message is up to 10 ms old; nothing drifts, nothing jumps at the counter's end.
+    assert np.abs(error[100:]).max() < speed * 0.010 + 2.0 * pulse
+    assert np.ptp(error[1000:]) < speed * 0.010 + pulse
+
+
+def test_hot_disc_brings_contact_earlier_and_wear_brings_it_later():
+    samples = drive(wheel_speed=50.0)
+    plain = force(bare(), samples)
+    assert (force(with_effect("disc_thermal_expansion", growth_um_per_K=0.5), samples) - plain)[-1] > 5.0
+    assert (force(with_effect("pad_wear", wear_um_per_MJ=50.0), samples) - plain)[-1] < -5.0
+
+
+def test_backlash_is_lost_only_after_a_reversal():
+    samples = drive()
+    change = force(with_effect("backlash", play_rad=0.2), samples) - force(bare(), samples)
+    assert np.all(change[:480] == 0.0)
+    releasing = samples["speed"] < -1.0
+    assert change[releasing].mean() > 20.0
+
+
+def test_friction_terms_take_torque_with_the_sign_of_motion():
+    samples = drive()
+    plain = estimate(samples, bare())["torque_force"]
+    moving = (np.abs(samples["speed"]) > 1.0) & np.isfinite(plain) & (plain > 200.0)
+    up = samples["speed"] > 0.0
+    for name, values in (
+        ("viscous_friction", {"viscous_Nms_per_rad": 1e-3}),
+        ("stribeck_friction", {"rise": 0.5, "speed_rad_per_s": 20.0}),
+    ):
+        change = estimate(samples, with_effect(name, **values))["torque_force"] - plain
+        assert np.median(change[moving & up]) < 0.0 < np.median(change[moving & ~up]), name
+    asymmetric = estimate(samples, with_effect("friction_asymmetry", asymmetry=0.2))["torque_force"] - plain
+    assert np.median(asymmetric[moving & up]) < 0.0 and np.median(asymmetric[moving & ~up]) < 0.0
+
+
+def test_ripple_is_averaged_over_the_cycle():
+    fine = np.linspace(2.0, 3.0, 20001)
+    mean = np.trapezoid(0.3 * np.cos(7.0 * fine) - 0.2 * np.sin(7.0 * fine), fine)
+    assert cycle_mean(0.3, -0.2, 7.0, 3.0, 1.0) == pytest.approx(mean, abs=1e-8)
+    assert cycle_mean(0.3, -0.2, 7.0, 3.0, 1e-9) == pytest.approx(0.3 * np.cos(21.0) - 0.2 * np.sin(21.0))
+
+
+def test_lost_pulses_leave_no_stale_thickness():
+    samples = drive()
+    samples["has_wheel_pulse"][1500:] = False
+    p = with_effect("disc_thickness_variation", order_1_cosine_um=15.0)
+    change = force(p, samples) - force(bare(), samples)
+    assert np.abs(change[:1500]).max() > 20.0
+    assert np.abs(change[1700:]).max() < 1.0

@@ -1,0 +1,162 @@
+"""The EMPS benchmark as logs that `emb-daemon diagnose` reads, and the torque balance to start from.
+
+    python tools/emps_to_log.py DATA_EMPS.mat DATA_EMPS_PULSES.mat --output emps
+    emb-daemon diagnose emps/first_half.log --calibration emps/calibration.yaml \\
+        --validate emps/second_half.log emps/pulses.log --output emps/found
+
+A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS, Nonlinear System Identification Benchmarks, 2019
+(nonlinearbenchmark.org; not copied here): a DC motor drives a carriage over a ball screw. It is a brake's motor and gear
+in the clearance: the clamp force is known to be zero, and is written as the reference.
+
+The mapping onto the torque path, with a gear gain gamma that is a choice (0.5 mm per radian) and nothing more:
+
+    motor angle = q / gamma        motor torque = gamma x force, force = gtau x vir
+    torque-producing current = 10 A per volt of drive input, so that K_m = gamma gtau / 10
+    inertia = gamma^2 x mass       Coulomb torque = gamma x Coulomb force
+
+Measured at 1 kHz, written at the wire's 250 Hz: the current of a sample is the mean of the drive input over the 4 ms before
+it, as the wire contract wants it. The set has no speed: it is the position's derivative, smoothed forwards and backwards
+(zero phase) like the published identification does it.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.errors import InputError
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.resources import resource
+from emb_daemon.wire.e2e import COUNTER_MODULO, protect
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import load_database, pack, signal_columns
+
+GEAR_GAIN_M_PER_RAD = 5e-4
+AMPERE_PER_VOLT = 10.0
+#: Where the identification of the thesis starts from: what a datasheet would say, not what was published.
+NOMINAL_MASS_KG, NOMINAL_COULOMB_N = 80.0, 30.0
+#: Corner (Hz) of the zero-phase filter of position and drive input, and samples at 1 kHz for each sample on the wire.
+_CORNER_HZ = 60.0
+_DECIMATION = 4
+_CYCLE_NS = 4_000_000
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """Columns of an EMPS file.
+
+    Raises:
+        InputError: not an EMPS file.
+    """
+    from scipy.io import loadmat
+
+    try:
+        data = loadmat(path)
+        columns = {name: np.asarray(data[name], float).ravel() for name in ("t", "qm", "vir", "gtau")}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: not an EMPS file (t, qm, vir, gtau expected): {error}") from None
+    return columns
+
+
+def frames(columns: dict[str, np.ndarray], begin: float = 0.0, end: float = 1.0) -> np.ndarray:
+    """CAN frames of a part of a run, from share ``begin`` to share ``end``."""
+    from scipy.signal import butter, sosfiltfilt
+
+    rate = 1.0 / np.median(np.diff(columns["t"]))
+    low_pass = butter(4, _CORNER_HZ, fs=rate, output="sos")
+    position = sosfiltfilt(low_pass, columns["qm"])
+    speed = np.gradient(position, 1.0 / rate)
+    drive = sosfiltfilt(low_pass, columns["vir"])
+    count = len(position)
+    rows = np.arange(max(int(begin * count), _DECIMATION), int(end * count), _DECIMATION)
+    mean = np.cumsum(np.concatenate([[0.0], drive]))
+    # Trapezoidal mean over the four intervals that end at the sample.
+    current = (mean[rows + 1] - mean[rows + 1 - _DECIMATION] + 0.5 * (drive[rows - _DECIMATION] - drive[rows])) / _DECIMATION
+    result = np.zeros(3 * len(rows), FRAME)
+    wire, rig = load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc"))
+    time_ns = 1_000_000_000 + _CYCLE_NS * np.arange(len(rows))
+    messages = (
+        (wire, "EMB_FL_Resolver", {"MotorAngle": position[rows] / GEAR_GAIN_M_PER_RAD,
+                                   "MotorSpeed": speed[rows] / GEAR_GAIN_M_PER_RAD}),
+        (wire, "EMB_FL_Current", {"CurrentQ": AMPERE_PER_VOLT * current}),
+        (rig, "RIG_FL_Force", {"ClampForceRef": np.zeros(len(rows)), "DiscTempRef": np.full(len(rows), 20.0)}),
+    )  # fmt: skip
+    for place, (database, name, values) in enumerate(messages):
+        message = database.get_message_by_name(name)
+        signals = signal_columns(database, name, tuple(values))
+        for row in range(len(rows)):
+            payload = 0
+            for signal, column in zip(signals, values.values(), strict=True):
+                payload |= int(pack(column[row], signal))
+            frame = result[3 * row + place]
+            frame["time_ns"] = time_ns[row] + 100_000 * place
+            frame["can_id"] = message.frame_id
+            frame["length"] = message.length
+            frame["data"] = payload if database is rig else protect(message.frame_id, payload, row % COUNTER_MODULO, 0)
+    return result
+
+
+def starting_calibration(gtau: float) -> object:
+    """The thesis's torque balance: inertia and Coulomb friction, no other effect, and a clearance that never closes."""
+    base = load_calibration(resource("config/calibration.yaml"))
+    gamma = GEAR_GAIN_M_PER_RAD
+    replace = msgspec.structs.replace
+    return replace(
+        base,
+        actuator="EMPS",
+        motor=replace(
+            base.motor,
+            torque_constant_Nm_per_A=gamma * gtau / AMPERE_PER_VOLT,
+            inertia_kg_m2=gamma**2 * NOMINAL_MASS_KG,
+            gear_gain_m_per_rad=gamma,
+            maximum_speed_rad_per_s=1000.0,
+        ),
+        friction=replace(base.friction, load_m_per_rad=0.0, offset_Nm=gamma * NOMINAL_COULOMB_N, presliding_angle_rad=0.1),
+        contact=replace(base.contact, clearance_rad=1e4),
+        effects={},
+        provenance=None,
+    )
+
+
+def in_units_of_the_carriage(calibration) -> dict[str, float]:
+    """Mass kg, viscous N s/m, Coulomb N and offset N of a calibration that diagnose has written."""
+    gamma, effects = GEAR_GAIN_M_PER_RAD, calibration.effects
+    torque = calibration.motor.torque_constant_Nm_per_A
+    return {
+        "mass_kg": calibration.motor.inertia_kg_m2 / gamma**2,
+        "viscous_Ns_per_m": effects.get("viscous_friction", {}).get("viscous_Nms_per_rad", 0.0) / gamma**2,
+        "coulomb_N": calibration.friction.offset_Nm / gamma,
+        # The published model has force = ... + offset; ours adds a current on the other side.
+        "offset_N": -effects.get("current_offset", {}).get("offset_A", 0.0) * torque / gamma,
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="DATA_EMPS.mat")
+    parser.add_argument("pulses", type=Path, help="DATA_EMPS_PULSES.mat")
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    arguments = parser.parse_args(argv)
+    try:
+        run, pulses = read(arguments.run), read(arguments.pulses)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for name, part in (
+        ("first_half", frames(run, 0.0, 0.5)),
+        ("second_half", frames(run, 0.5, 1.0)),
+        ("pulses", frames(pulses)),
+    ):
+        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
+    save_calibration(starting_calibration(float(run["gtau"][0])), arguments.output / "calibration.yaml")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
