@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator import records as r
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import predict, step
@@ -88,6 +89,7 @@ class Pipeline:
         corners: names of the corners to estimate.
         layout: LAYOUT array, shape (1,).
         capacity: rows that one call of `consume` can hold.
+        adaptation: `adapt.adaptation.Adaptation` that learns into ``parameters``; without it nothing is asked for or learned.
 
     Attributes:
         states: STATE array, shape (4,): the estimators.
@@ -95,7 +97,7 @@ class Pipeline:
         disturbed: reason bits, shape (4,), that the loop raises on estimates: what bus and clock know and frames do not.
     """
 
-    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096):
+    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096, adaptation=None):
         self.parameters = parameters
         self.states = new_state(4)
         self.corners = np.zeros(4, CORNER)
@@ -109,6 +111,10 @@ class Pipeline:
         self.layout = wire.default_layout() if layout is None else layout
         self.receptions = new_reception()
         self.transmission = np.zeros(1, TRANSMISSION)
+        self.adaptation = adaptation
+        self._limits = adaptation.limits if adaptation else np.zeros(4, LIMITS)
+        if adaptation:
+            adaptation.restore(parameters)
         self._buffers = Buffers(self.layout, self.receptions, self.corners, self.disturbed, self.samples)
 
     def begin(self, time_ns: int) -> None:
@@ -129,7 +135,10 @@ class Pipeline:
 
     def answer(self, count: int) -> None:
         """Estimate the first ``count`` rows of ``self.samples`` into ``self.estimates``."""
-        answer(self.samples, count, self.states, self.parameters, self.estimates)
+        if self.adaptation:
+            self.adaptation.answer(self.samples, count, self.states, self.parameters, self.estimates)
+        else:
+            answer(self.samples, count, self.states, self.parameters, self.estimates)
 
     def consume(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
         """`collect` and `answer`."""
@@ -139,7 +148,7 @@ class Pipeline:
 
     def broadcast(self, count: int) -> np.ndarray:
         """The frames that announce the first ``count`` estimates, in sending order."""
-        return self.frames[: _broadcast(self.estimates, count, self.transmission, self.layout, self.frames)]
+        return self.frames[: _broadcast(self.estimates, count, self.transmission, self.layout, self._limits, self.frames)]
 
 
 @njit
@@ -325,35 +334,40 @@ def _head(b, row, index, age):
 
 @njit
 def answer(samples, count, states, parameters, estimates):
-    """Estimate ``samples[:count]``: the one place from which the estimator is run.
+    """Estimate ``samples[:count]``.
 
     ``states`` and ``parameters`` have one record for each corner, or one in all.
     """
     for number in range(count):
-        row, estimate = samples[number], estimates[number]
-        state, p = states[row.corner % len(states)], parameters[row.corner % len(parameters)]
-        estimate.time_ns = row.time_ns
-        estimate.cycle = row.cycle
-        estimate.elapsed_cycles = row.elapsed_cycles
-        estimate.age_cycles = row.age_cycles
-        estimate.corner = row.corner
-        estimate.counter = row.counter
-        estimate.is_sample = not row.is_prediction
-        if row.is_prediction:
-            predict(state, p, row.age_cycles * CYCLE_S, estimate)
-        else:
-            step(state, p, row, estimate)
-        estimate.reasons |= row.reasons
-        if not state.started:
-            estimate.mode = r.INIT
-        elif estimate.source == r.INVALID:
-            estimate.mode = r.FAULT
-        elif estimate.reasons and estimate.mode == r.RUNNING:
-            estimate.mode = r.DEGRADED
+        corner = samples[number].corner
+        answer_row(samples[number], states[corner % len(states)], parameters[corner % len(parameters)], estimates[number])
 
 
 @njit
-def _broadcast(estimates, count, transmission, layout, frames):
+def answer_row(row, state, p, estimate):
+    """Estimate one SAMPLE into one ESTIMATE: the one place from which the estimator is run."""
+    estimate.time_ns = row.time_ns
+    estimate.cycle = row.cycle
+    estimate.elapsed_cycles = row.elapsed_cycles
+    estimate.age_cycles = row.age_cycles
+    estimate.corner = row.corner
+    estimate.counter = row.counter
+    estimate.is_sample = not row.is_prediction
+    if row.is_prediction:
+        predict(state, p, row.age_cycles * CYCLE_S, estimate)
+    else:
+        step(state, p, row, estimate)
+    estimate.reasons |= row.reasons
+    if not state.started:
+        estimate.mode = r.INIT
+    elif estimate.source == r.INVALID:
+        estimate.mode = r.FAULT
+    elif estimate.reasons and estimate.mode == r.RUNNING:
+        estimate.mode = r.DEGRADED
+
+
+@njit
+def _broadcast(estimates, count, transmission, layout, limits, frames):
     """Encode estimates; cycles that pass a message's period make it due. Returns the number of frames."""
     wires, counters = layout[0], transmission[0].counter
     values = np.zeros(wire.SENT_SIGNALS)
@@ -383,7 +397,10 @@ def _broadcast(estimates, count, transmission, layout, frames):
                 values[2] = e.contact_angle
                 values[3] = e.reasons
             else:
-                values[:] = 0.0
+                asked = limits[e.corner]
+                values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result
+                values[3], values[4] = 0.0, 1e-3 * asked.high_force
+                values[5], values[6] = asked.dither_amplitude, asked.dither_frequency
             payload = np.uint64(0)
             for column in range(wires.sent_count[kind]):
                 payload |= pack(values[column], wires.sent[kind, column])

@@ -1,10 +1,13 @@
 """Logs through the daemon's pipeline, one after the other as one drive."""
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
@@ -16,6 +19,11 @@ from emb_daemon.pipeline import Pipeline
 
 #: Pause between two logs of which the second's clock does not go on from the first's.
 _PAUSE_NS = 1_000_000_000
+
+
+def _log_date(time_ns: int) -> str:
+    """The date by a log's clock, so that a replay writes the same file whenever it runs."""
+    return datetime.fromtimestamp(1e-9 * time_ns, UTC).isoformat(timespec="seconds")
 
 
 @dataclass(frozen=True)
@@ -47,15 +55,18 @@ class Replay:
         calibration: of the corner's actuator.
         corner: FL, FR, RL or RR.
         measured_torque: heat the pads with the rig's brake torque sensor instead of the estimated force.
+        state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
+            learned.
     """
 
-    def __init__(self, calibration: Calibration, corner: str = "FL", measured_torque: bool = False):
+    def __init__(self, calibration: Calibration, corner: str = "FL", measured_torque: bool = False, state: Path | None = None):
         self._corner = corner
         self._index = corner_index(corner)
         self._parameters = np.zeros(4, PARAMETERS)
         self._parameters[self._index] = to_parameters(calibration)
         self._measured_torque = measured_torque
-        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14)
+        self.adaptation = Adaptation({corner: calibration}, Memory(state), _log_date) if state else None
+        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, adaptation=self.adaptation)
         self._end_ns: int | None = None
 
     def _on_the_drive(self, frames: np.ndarray) -> int:

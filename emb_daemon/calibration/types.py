@@ -185,6 +185,43 @@ class Thermal(Struct, kw_only=True):
     sigma_K: Positive = 5.0
 
 
+class Adaptation(Struct, kw_only=True):
+    """Limits of park brake adaptation (thesis 3.4): when it may run, what it asks for, and what it may accept."""
+
+    enabled: bool = True
+    #: Ambient temperatures, and rise of the pads over ambient, at which training teaches something.
+    minimum_ambient_C: float = -10.0
+    maximum_ambient_C: float = 45.0
+    maximum_rise_K: Positive = 25.0
+    #: Clamp force up to which training motion is asked for, and the share of it that must be reached.
+    high_force_N: Positive = 18000.0
+    coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
+    #: The small fast sinusoid on top.
+    dither_amplitude_rad: NonNegative = 0.9
+    dither_frequency_Hz: Positive = 5.0
+    #: Standing quietly with the park brake applied before training is asked for; waiting for motion; longest training.
+    settling_time_s: NonNegative = 5.0
+    answer_time_s: Positive = 10.0
+    longest_training_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 45.0
+    #: Samples needed in each force range and direction.
+    samples_per_range: Annotated[int, Meta(ge=1)] = 50
+    #: Residual current over the noise that the calibration knows.
+    residual_ratio: Positive = 1.5
+    #: Largest relative change of the travel to high_force_N and of the friction there against the values in use, and of
+    #: the clearance, for one training.
+    curve_change: Positive = 0.35
+    friction_change: Positive = 0.6
+    clearance_change_rad: Positive = 5.0
+    #: Friction torque over clamp torque that a gear can have.
+    maximum_friction_share: Share = 0.6
+    #: Largest standard deviation of the learned force, and RMS difference of the pairs of passes from the learned curve as a
+    #: share of the largest force.
+    maximum_sigma_N: Positive = 200.0
+    pairs_difference: Positive = 0.04
+    #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
+    torque_constant_relative: NonNegative = 0.002
+
+
 class Source(Struct, kw_only=True):
     """One log that a calibration rests on."""
 
@@ -222,6 +259,8 @@ class Calibration(Struct, kw_only=True):
     thermal: Thermal
     #: Effects switched on, by name, with their parameters.
     effects: dict[str, dict[str, float]] = {}
+    #: Limits of park brake adaptation.
+    adaptation: Adaptation = Adaptation()
     provenance: Provenance | None = None
 
     def __post_init__(self):

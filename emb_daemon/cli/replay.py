@@ -16,6 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--measured-torque", action="store_true", help="heat the pads with the rig's brake torque sensor, which no car has"
     )
     parser.add_argument(
+        "--state", type=Path, metavar="DIR", help="adapt: read what was learned from DIR, learn, and keep it there"
+    )
+    parser.add_argument(
         "--output", type=Path, metavar="FILE", help="estimates as .csv or .parquet, or frames as .log, .blf, .asc, .trc, .mf4"
     )
     parser.add_argument("--json", action="store_true", help="error figures as JSON")
@@ -42,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
-    replay = Replay(calibration, arguments.corner, arguments.measured_torque)
+    replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state)
     if ending in FRAME_ENDINGS:
         if arguments.measured_torque:
             raise InputError("--measured-torque: the daemon has no such input, so there are no frames it would have sent")

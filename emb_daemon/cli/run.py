@@ -19,6 +19,7 @@ def run(arguments: argparse.Namespace) -> int:
     # python-can imports asammdf, and with it pandas, wherever it is installed: a third of the daemon's memory and start-up
     # time for a file format that it never reads.
     sys.modules.setdefault("asammdf", None)
+    from emb_daemon.adapt.memory import state_directory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.cli.busoptions import bus_options
     from emb_daemon.runtime.bus import open_bus
@@ -32,7 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
     set_up_logging(configuration.log_level)
     ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
-    daemon = Daemon(setup, bus, ServiceManager())
+    state = state_directory(configuration.state_directory, arguments.config.parent)
+    daemon = Daemon(setup, bus, ServiceManager(), state)
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
     signal.signal(signal.SIGINT, lambda *_: daemon.stop())
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())

@@ -3,6 +3,7 @@
 import numpy as np
 
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
+from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.thermal import CHAIN, NODES
 
@@ -158,10 +159,12 @@ STATE = np.dtype(
         # Torque path.
         ("friction_state", "f8"),
         ("slid_angle", "f8"),
+        ("friction_mean", "f8"),
         ("friction_variance", "f8"),
         ("torque_age", "f8"),
         ("balance", "f8"),
         ("leverage", "f8"),
+        ("contact", CONTACT),
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
@@ -207,6 +210,10 @@ ESTIMATE = np.dtype(
         ("source", "i8"),
         ("reasons", "i8"),
         ("is_sample", "?"),
+        ("engaged", "?"),
+        ("adapt_request", "i8"),
+        ("adapt_progress", "i8"),
+        ("adapt_result", "i8"),
         ("force", "f8"),
         ("sigma", "f8"),
         ("stiffness_force", "f8"),

@@ -21,10 +21,21 @@ from emb_daemon.estimator.records import (
     RUNNING,
     STIFFNESS_ONLY,
     TEMPERATURE_UNCERTAIN,
+    TORQUE_ONLY,
 )
 from emb_daemon.jit import njit
+from emb_daemon.models.contact import (
+    NOTHING,
+    TOO_EARLY,
+    engaged,
+    start_anew,
+    threshold,
+    torque_share,
+    torque_sigma,
+    watch_closing,
+)
 from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
-from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.thermal import (
     NODES,
     at_depth,
@@ -58,6 +69,12 @@ FLICKER_RAD = 0.0008
 #: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
 _SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
+#: Standard deviations of the contact angle, rad: doubtful from, known again below, reported as uncertain from, and unknown.
+_DOUBTFUL_RAD, _KNOWN_RAD, _UNCERTAIN_RAD, _UNKNOWN_RAD = 0.05, 0.3, 0.5, 1.0
+#: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
+_CLAMPED = 0.1
+#: A time after which everything has settled, s.
+_LONG_S = 1e6
 #: Variance that the torque path's relative error gains, 1/s: friction changes over months.
 _TORQUE_GAIN_WALK = 1e-9
 
@@ -73,7 +90,7 @@ def _start(s, p, m):
     s.torque_age = 1e9
     s.covariance[:, :] = 0.0
     s.covariance[0, 0] = 1.0
-    s.covariance[1, 1] = p.clearance_sigma * p.clearance_sigma
+    s.covariance[1, 1] = s.contact.prior = p.clearance_sigma * p.clearance_sigma
     s.covariance[2, 2] = p.torque_relative_sigma * p.torque_relative_sigma
     s.covariance[3, 3] = (p.torque_constant * p.current_sigma) ** 2
     s.balance = np.nan
@@ -93,6 +110,8 @@ def _follow_zero(s, p, m):
     s.slid_angle += jump
     s.contact_angle += jump
     s.covariance[1, 1] += reach * reach
+    s.contact.prior += reach * reach
+    s.contact.confirmed = False
     return True
 
 
@@ -181,11 +200,17 @@ def _heat(s, p, m):
 
 
 @njit
-def stiffness_path(s, p, m, factor):
-    """Stiffness path: advances the dynamic force and its slope."""
+def position(s, p, m):
+    """Motor angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
-    x = m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
+    return m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
+
+
+@njit
+def stiffness_path(s, p, m, factor):
+    """Stiffness path: advances the dynamic force and its slope."""
+    x = position(s, p, m)
     dt = m.dt
     if dt > _ONE_CYCLE_S:
         # Over a gap the way is unknown but for its end, which the speed tells and the lag remembers best.
@@ -200,6 +225,9 @@ def _deform(s, p, x, dt, factor):
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x
+    doubt = s.covariance[1, 1]
+    if doubt > _DOUBTFUL_RAD * _DOUBTFUL_RAD:
+        slope = mean_slope(x, sqrt(doubt), p.curve)
     drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
     s.force = first_order_lag(s.force, s.drive, drive, dt, p.relaxation_time)
     s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, p.relaxation_time)
@@ -208,7 +236,14 @@ def _deform(s, p, x, dt, factor):
 
 
 @njit
-def _torque(s, p, m):
+def rest(s, p, x, factor):
+    """Bring the stiffness path to where it settles ``x`` rad past contact."""
+    s.past_contact = x
+    _deform(s, p, x, _LONG_S, factor)
+
+
+@njit
+def torque_path(s, p, m):
     """Torque path over the cycle that ends at this sample.
 
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
@@ -220,6 +255,7 @@ def _torque(s, p, m):
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, _DISSOLVING_PER_S, m.dt
     )
+    s.friction_mean = mean
     e, mean_speed = p.effects, 0.5 * (m.speed + s.speed)
     gear, friction = effects.gear(e, m.angle, travel, mean_speed, mean)
     leverage = p.gear_gain * gear + p.load_friction * friction * mean
@@ -230,6 +266,46 @@ def _torque(s, p, m):
     torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)
     return torque, leverage, s.friction_variance + turning * turning
+
+
+@njit
+def _watch_contact(s, p, m, force_before, torque, leverage):
+    """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
+    c, x, doubt = s.contact, s.past_contact, sqrt(s.covariance[1, 1])
+    sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / _CYCLE_S)
+    limit = threshold(current_share, p.current_correlation_time, _CYCLE_S)
+    predicted = leverage * 0.5 * (force_before + s.force)
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt)
+    seen = predicted + c.excess
+    if found == TOO_EARLY:
+        _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD)
+    elif found != NOTHING:
+        _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage)
+    elif not c.confirmed and c.excess > max(predicted, leverage * _CLAMPED * p.maximum_force, 5.0 * sigma / sqrt(c.watched)):
+        # Power came while the brake was clamped: no angle from which to count the clearance.
+        force = (seen + c.level) / leverage
+        friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
+        c.level = c.samples = 0.0
+        c.engaged = True
+        _start_contact(s, p, m, force, (sigma + friction) / leverage)
+    doubt = sqrt(s.covariance[1, 1])
+    if doubt < _KNOWN_RAD:
+        c.lost = False
+    engaged(c, s.past_contact, doubt)
+
+
+@njit
+def _start_contact(s, p, m, force, sigma):
+    """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more."""
+    travel = travel_at(force / s.factor, p.curve) if force > 0.0 else 0.0
+    s.contact_angle += s.past_contact - travel
+    rest(s, p, travel, s.factor)
+    slope = s.factor * max(characteristic_curve(max(travel, 1.0), p.curve)[1], p.curve[0])
+    lag = p.relaxation_time * m.speed
+    for i in range(STATES):
+        s.covariance[1, i] = s.covariance[i, 1] = 0.0
+    s.covariance[1, 1] = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
+    start_anew(s.contact, s.covariance[1, 1])
 
 
 @njit
@@ -246,8 +322,11 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     if m.dt > _ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         P[0, 0] += (lag_error / spread) ** 2
+    s.contact.prior += walked
+    # What friction's offset may be wrong by, the torque reads as contact angle, and no number of samples averages it out.
+    offset = torque_share(s.contact, P[1, 1]) * p.torque_relative_sigma * p.offset_friction / (p.gear_gain * p.curve[0])
     h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
-    out.stiffness_sigma = sqrt(variance_along(P, h))
+    out.stiffness_sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
     out.innovation = out.innovation_sigma = np.nan
     mean_force = 0.5 * (force_before + s.force)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
@@ -277,7 +356,8 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
-    out.sigma = sqrt(variance_along(P, h))
+    out.sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
+    out.contact_sigma = sqrt(P[1, 1] + offset * offset)
 
 
 @njit
@@ -296,9 +376,10 @@ def step(s, p, m, out):
     _heat(s, p, m)
     force_before = s.force
     stiffness_path(s, p, m, s.factor)
-    torque, leverage, friction_variance = _torque(s, p, m)
+    torque, leverage, friction_variance = torque_path(s, p, m)
     if moved_zero:
         torque = np.nan
+    _watch_contact(s, p, m, force_before, torque, leverage)
     _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
@@ -311,7 +392,6 @@ def step(s, p, m, out):
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
     s.fused, s.fused_sigma = out.force, out.sigma
     out.contact_angle = s.contact_angle
-    out.contact_sigma = sqrt(s.covariance[1, 1])
     out.stiffness_factor = s.factor
     _temperatures(s, out)
     out.mode = RUNNING
@@ -319,8 +399,11 @@ def step(s, p, m, out):
     reasons = OUT_OF_RANGE if moved_zero else 0
     if not s.temperature_known or s.temperature_doubt > _DOUBTED_K:
         reasons |= TEMPERATURE_UNCERTAIN
-    if out.contact_sigma > 0.5:
+    out.engaged = s.contact.engaged
+    if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD:
         reasons |= CONTACT_UNCERTAIN
+        if out.stiffness_sigma > out.torque_sigma and s.torque_age < 0.05:
+            out.source = TORQUE_ONLY
     if out.force > p.maximum_force or abs(m.speed) > _SPEED_MARGIN * p.maximum_speed:
         reasons |= OUTSIDE_RANGE
     out.reasons = reasons

@@ -7,6 +7,8 @@ that belongs to one sample time.
 
 from math import exp
 
+import numpy as np
+
 from emb_daemon.jit import njit
 
 
@@ -23,6 +25,32 @@ def characteristic_curve(x, coefficients):
         slope = slope * x + (order + 1) * coefficients[order]
         force = (force + coefficients[order]) * x
     return force, slope
+
+
+@njit
+def mean_slope(x, spread, coefficients):
+    """Slope (N/rad) of the curve between ``spread`` rad below and above ``x``: what the force tells of an uncertain contact
+    angle (statistical linearisation; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 5). Not zero just before contact."""
+    above, _ = characteristic_curve(x + spread, coefficients)
+    below, _ = characteristic_curve(x - spread, coefficients)
+    return (above - below) / (2.0 * spread)
+
+
+@njit
+def travel_at(force, coefficients):
+    """Travel past contact (rad) at which a rising curve reaches ``force`` (N); infinite beyond 1000 rad."""
+    low, high = 0.0, 1.0
+    while characteristic_curve(high, coefficients)[0] < force:
+        high *= 2.0
+        if high > 1000.0:
+            return np.inf
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        if characteristic_curve(middle, coefficients)[0] < force:
+            low = middle
+        else:
+            high = middle
+    return high
 
 
 @njit

@@ -9,9 +9,13 @@ keeps ticking by itself, so that silence is reported too.
 import math
 import threading
 import time
+from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.errors import InputError
@@ -31,6 +35,10 @@ _TOGETHER_NS = 400_000
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
 _OF_THE_LOOP = records.BUS_DISTURBED | records.DEADLINE_MISSED
+
+
+def _date(_time_ns: int) -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 class Pacer:
@@ -88,21 +96,24 @@ class Daemon:
     Args:
         setup: checked configuration.
         bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
+        state: folder of what adaptation learns; without one nothing is learned.
 
     Attributes:
         ticks, missed: periods run, and periods in which the loop did not wake.
     """
 
-    def __init__(self, setup: Setup, bus, manager: ServiceManager | None = None):
+    def __init__(self, setup: Setup, bus, manager: ServiceManager | None = None, state: Path | None = None):
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
-        self.pipeline = Pipeline(setup.parameters, tuple(setup.configuration.corners), setup.layout)
+        self._adaptation = Adaptation(setup.calibrations, Memory(state), _date, threaded=True) if state else None
+        corners = tuple(setup.configuration.corners)
+        self.pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self.ticks = self.missed = 0
         self._invalid = 0
         self._stop = threading.Event()
         self._reload = threading.Event()
-        self._reloaded: Setup | None = None
+        self._reloaded: tuple[Setup, list] | None = None
         self._disturbed_ns = dict.fromkeys((records.BUS_DISTURBED, records.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
@@ -125,6 +136,8 @@ class Daemon:
         scratch.answer(count)
         scratch.broadcast(count)
         _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
+        if self._adaptation:
+            self._adaptation.warm_up(scratch)
         self._bus.drain()
 
     def run(self) -> None:
@@ -159,6 +172,8 @@ class Daemon:
                 next_status = now + _STATUS_NS
                 self._manager.notify(f"STATUS={self.ticks} ticks, {self.missed} missed, {self._bus.dropped} frames dropped")
         self._manager.notify("STOPPING=1")
+        if self._adaptation:
+            self._adaptation.close()
         log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
 
     def tick(self, now_ns: int, pacer: Pacer) -> None:
@@ -218,8 +233,10 @@ class Daemon:
 
     def _take_calibration(self) -> None:
         if self._reloaded is not None:
-            setup, self._reloaded = self._reloaded, None
+            (setup, learned), self._reloaded = self._reloaded, None
             self.pipeline.parameters[:] = setup.parameters
+            if self._adaptation:
+                self._adaptation.replace(learned, self.pipeline.parameters)
             for name, calibration in setup.calibrations.items():
                 log.info("corner %s: calibration %s in use", name, calibration_hash(calibration))
         if self._reload.is_set():
@@ -234,7 +251,7 @@ class Daemon:
         except InputError as error:
             log.error("calibration not reloaded, the old one stays: %s", error)
         else:
-            self._reloaded = setup
+            self._reloaded = setup, self._adaptation.read(setup.calibrations) if self._adaptation else []
 
     def _ping(self) -> None:
         """Tell the watchdog that the loop is well: it ticks, and no estimate came out that is not a number."""

@@ -1,0 +1,199 @@
+"""What can be said of contact and adaptation only by many repetitions: false alarms, wear over a life, kills while writing.
+
+    python -m emb_daemon.adapt.evidence alarms
+    python -m emb_daemon.adapt.evidence wear --output DIR
+    python -m emb_daemon.adapt.evidence kills
+
+Everything here is simulated.
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import tempfile
+import time
+from math import exp, sqrt
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Entry, Memory, Store
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.jit import njit
+from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
+from emb_daemon.pipeline import CYCLE_S, Pipeline
+from emb_daemon.resources import resource
+
+
+@njit
+def _false_alarms(state, releases, p, contact_sigma, rng):
+    """Alarms in ``releases`` moves from just before contact to the released position and back, at speeds spread evenly on a
+    logarithmic scale up to the motor's; noise of current and speed as the calibration has it. Returns (alarms, samples)."""
+    sigma, share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
+    limit = threshold(share, p.current_correlation_time, CYCLE_S)
+    rho = exp(-CYCLE_S / p.current_correlation_time)
+    coloured = speed = 0.0
+    alarms = samples = 0
+    for _ in range(releases):
+        pace = exp(rng.uniform(0.0, np.log(p.maximum_speed)))
+        offset = 0.02 * p.offset_friction * rng.standard_normal()
+        believed = contact_sigma * rng.standard_normal()
+        alarmed = False
+        for leg in range(2):
+            x = -4.0 * contact_sigma if leg == 0 else -p.clearance
+            direction = -1.0 if leg == 0 else 1.0
+            while -p.clearance <= x <= -4.0 * contact_sigma or x == -p.clearance:
+                before = speed
+                speed = p.speed_sigma * rng.standard_normal()
+                coloured = rho * coloured + sqrt(1.0 - rho * rho) * rng.standard_normal()
+                torque = p.torque_constant * p.current_sigma * coloured - p.inertia * (speed - before) / CYCLE_S + offset
+                watch_closing(state, torque, 0.0, direction, sigma, limit, x + believed, contact_sigma)
+                alarmed |= engaged(state, x + believed, contact_sigma)
+                x += direction * pace * CYCLE_S
+                samples += 1
+        alarms += alarmed
+        state.engaged = False
+    return alarms, samples
+
+
+def false_alarms(calibration: Calibration, releases: int = 100_000, contact_sigma: float = 0.1, seed: int = 1) -> dict:
+    """False engagements in the clearance; simulated."""
+    p = to_parameters(calibration)
+    alarms, samples = _false_alarms(np.zeros(1, CONTACT)[0], releases, p, contact_sigma, np.random.default_rng(seed))
+    return {"releases": releases, "samples": int(samples), "false_alarms": int(alarms)}
+
+
+def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear_mm: float = 9.0, seed: int = 1) -> dict:
+    """Force error of a brake whose pads wear by ``wear_mm`` over ``cycles`` park cycles, with adaptation and without.
+
+    Training motion is driven in every ``cycles / trainings``-th cycle, and the force is judged on random motor angles
+    (thesis 3.3.2) afterwards, in the state of wear then reached; the cycles between only wear the pads. The daemon is
+    started anew each time, so what it learned comes from its memory. Contact is where the released position puts it: the
+    actuator follows wear. Simulated car, whose brake shares no force model with the estimator.
+    """
+    from emb_daemon.plant.car import Car
+    from emb_daemon.plant.derive import plant_from_calibration
+    from emb_daemon.plant.scenarios import commands_of, random_angle, training
+
+    thickness = calibration.pad_thickness_mm
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(trainings + 1):
+            mounted = thickness - wear_mm * number / trainings
+            plant = plant_from_calibration(calibration, pad_thickness_mm=mounted)
+            rng = np.random.default_rng(seed + number)
+            schedule = training(plant, high_N=18000.0) + random_angle(plant, 10.0, rng)
+            car = Car(np.atleast_1d(plant), ("FL",), seed + number)
+            frames, truth = car.run(commands_of(schedule, ("FL",)), schedule.drives)
+            row = {"cycle": number * cycles // trainings, "pads_mm": mounted}
+            for name, state in (("with", Path(folder)), ("without", None)):
+                parameters = np.zeros(4, PARAMETERS)
+                parameters[0] = to_parameters(calibration)
+                learner = Adaptation({"FL": calibration}, Memory(state), str) if state else None
+                pipeline = Pipeline(parameters, ("FL",), capacity=1 << 14, adaptation=learner)
+                pipeline.begin(0)
+                estimates, start = [], 0
+                while start < len(frames):
+                    start, count = pipeline.consume(frames, start, predictions=False)
+                    estimates.append(pipeline.estimates[:count].copy())
+                estimates = np.concatenate(estimates)
+                judged = round(10.0 / CYCLE_S)
+                error = estimates["force"][-judged:] - truth["force"][:, 0][-judged:]
+                row[name] = {
+                    "rmse_N": float(np.sqrt(np.mean(error**2))),
+                    "inside_two_sigma": float(np.mean(np.abs(error) < 2.0 * estimates["sigma"][-judged:])),
+                }
+                if learner:
+                    row["verdict"] = learner.last_verdict("FL")
+            rows.append(row)
+    return {"cycles": cycles, "trainings": trainings, "wear_mm": wear_mm, "rows": rows}
+
+
+def plot_wear(result: dict, path: Path) -> None:
+    """Force error over park cycles as a picture."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = figure.subplots()
+    for name, label in (("without", "calibration only"), ("with", "park brake adaptation")):
+        cycles = [row["cycle"] for row in result["rows"]]
+        axes.plot(cycles, [1e-3 * row[name]["rmse_N"] for row in result["rows"]], marker="o", markersize=3, label=label)
+    axes.set(xlabel="park cycles", ylabel="clamp force RMSE / kN", ylim=(0.0, None))
+    axes.set_title(f"{result['wear_mm']:g} mm of pad wear, simulated car")
+    axes.legend()
+    figure.savefig(path)
+
+
+def specimen(number: int) -> Store:
+    """A store whose every value tells ``number``, so that a mixture of two would show."""
+    value = float(number)
+    entry = Entry(
+        date=str(number), verdict="accepted", ambient_C=value, pad_rise_K=value, curve=(value,) * 5,
+        load_friction_m_per_rad=value, offset_friction_Nm=value, presliding_angle_rad=value, stiffness_sigma_N=value,
+        stiffness_relative_sigma=value, clearance_rad=value, samples=number, residual_A=value, residual_ratio=value,
+        contact_sigma_rad=value, force_sigma_N=value, top_force_N=value, pairs_difference=value, curve_change=value,
+    )  # fmt: skip
+    return Store(format=1, corner="FL", actuator="specimen", calibration=str(number), current=entry, history=(entry,) * 50)
+
+
+def _write_for_ever(memory: Memory, number: int) -> None:
+    while True:
+        number += 1
+        memory.save(specimen(number))
+
+
+def kills(count: int = 500, seed: int = 1) -> dict:
+    """Kill a process that writes without pause, ``count`` times at random moments, and read what it left."""
+    rng = np.random.default_rng(seed)
+    whole = changed = 0
+    newest = 1
+    with tempfile.TemporaryDirectory() as folder:
+        memory = Memory(Path(folder))
+        memory.save(specimen(newest))
+        for _ in range(count):
+            writer = os.fork()
+            if writer == 0:
+                try:
+                    _write_for_ever(memory, newest)
+                finally:
+                    os._exit(1)
+            time.sleep(rng.uniform(0.0, 0.02))
+            os.kill(writer, signal.SIGKILL)
+            os.waitpid(writer, 0)
+            try:
+                store = memory.read("FL")
+            except ValueError:
+                continue
+            found = int(store.calibration)
+            whole += store == specimen(found)
+            changed += found != newest
+            newest = found
+    return {"kills": count, "whole": whole, "newer_set_found": changed}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("alarms", "wear", "kills"))
+    parser.add_argument("--count", type=int, help="releases, trainings or kills")
+    parser.add_argument("--output", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
+    arguments = parser.parse_args()
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    if arguments.what == "alarms":
+        result = false_alarms(calibration, arguments.count or 100_000)
+    elif arguments.what == "kills":
+        result = kills(arguments.count or 500)
+    else:
+        result = wear(msgspec.structs.replace(calibration, pad_thickness_mm=10.0), trainings=arguments.count or 20)
+        plot_wear(result, arguments.output / "wear.svg")
+    json.dump(result, sys.stdout, indent=1)
+    print()
+
+
+if __name__ == "__main__":
+    main()

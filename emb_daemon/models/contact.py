@@ -1,0 +1,142 @@
+"""Contact of pads and disc: when the brake engages, and when what was believed of the contact angle cannot be true.
+
+Thesis 2.5 signals contact when lambda = dT_m/dtheta exceeds a threshold. A difference of torques at 4 ms is mostly noise, so
+lambda is used in its integrated form: the rise of the torque over its level in the clearance, summed one-sidedly (Page,
+"Continuous inspection schemes", Biometrika 41, 1954). The level is learned in each clearance, so that an offset of current or
+friction raises no alarm. At speed the torque says nothing within a few radians; there the tracked contact angle signals, as
+soon as it is passed by several of its standard deviations.
+"""
+
+from math import exp, log, sqrt
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+#: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
+#: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``excess``: torque not believed, smoothed
+#: over ``watched`` samples. ``agreed``: closing samples that confirm. ``prior``: variance of the contact angle but for what
+#: torque told of it.
+CONTACT = np.dtype(
+    [
+        ("engaged", "?"),
+        ("lost", "?"),
+        ("confirmed", "?"),
+        ("level", "f8"),
+        ("samples", "f8"),
+        ("rise", "f8"),
+        ("shortfall", "f8"),
+        ("agreed", "i8"),
+        ("excess", "f8"),
+        ("watched", "f8"),
+        ("prior", "f8"),
+    ],
+    align=True,
+)
+
+#: What a watch found: nothing, force where clearance was believed, or clearance where force was believed.
+NOTHING, TOO_LATE, TOO_EARLY = range(3)
+
+#: Torque (standard deviations of one sample) that a sum gives away with each sample, and logarithm of the number of samples
+#: between false alarms: an hour of nothing but closing makes 1e6.
+_DRIFT, _LOG_RUN = 0.45, 17.0
+#: Friction must have turned over by this much for the torque to count.
+_TURNED_OVER = 0.9
+#: Samples from which the clearance level may raise an alarm, from which it counts half, and over which it averages at most.
+_LEAST, _HALF_KNOWN, _MOST = 100.0, 30.0, 500.0
+#: Samples over which torque is smoothed, and closing samples in agreement that confirm the contact angle.
+_SMOOTHED, _CONFIRMING = 15.0, 100
+#: Share of the force by which curve and friction may be wrong without the contact angle being blamed, and torque (standard
+#: deviations of one sample) from which agreement means something.
+_TOLERANCE, _TELLING = 0.07, 3.0
+#: Standard deviations of the contact angle beyond which it counts as passed.
+_CERTAIN = 4.0
+
+
+@njit
+def threshold(current_share, correlation_time, dt):
+    """Alarm threshold of the sums for noise of which ``current_share`` of the variance is correlated over
+    ``correlation_time``: the sum of correlated noise wanders further (Siegmund, Sequential Analysis, 1985, ch. 2)."""
+    rho = exp(-dt / correlation_time)
+    inflation = current_share * (1.0 + rho) / (1.0 - rho) + 1.0 - current_share
+    return 0.5 * inflation * (_LOG_RUN + log(2.0 * _DRIFT * _DRIFT)) / _DRIFT
+
+
+@njit
+def engaged(state, x, contact_sigma):
+    """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; keeps what it said
+    last while that is open."""
+    if x > _CERTAIN * contact_sigma:
+        state.engaged = True
+    elif x < -_CERTAIN * contact_sigma or (x < 0.0 and state.rise == 0.0):
+        state.engaged = False
+    return state.engaged
+
+
+@njit
+def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, contact_sigma):
+    """Compare torque with belief for one sample.
+
+    Args:
+        state: CONTACT record.
+        torque: motor torque left to the clamp force, N m; NaN if it says nothing.
+        predicted: what the believed clamp force needs of it, N m.
+        friction_mean: friction state over the cycle; near +1 while closing.
+        sigma: standard deviation of ``torque``, N m.
+        limit: `threshold`.
+        x, contact_sigma: rad past the believed contact angle, and its standard deviation.
+
+    Returns:
+        NOTHING, TOO_LATE or TOO_EARLY: how the believed contact angle is wrong.
+    """
+    if not np.isfinite(torque):
+        return NOTHING
+    state.watched = min(state.watched + 1.0, _SMOOTHED)
+    state.excess += (torque - predicted - state.level - state.excess) / state.watched
+    if friction_mean < _TURNED_OVER:
+        return NOTHING
+    clear = x < -_CERTAIN * contact_sigma
+    if clear:
+        state.samples = min(state.samples + 1.0, _MOST)
+        state.level += (torque - state.level) / state.samples
+    # A level of few samples is mostly noise.
+    level = state.level * state.samples / (state.samples + _HALF_KNOWN)
+    above, tolerated = torque - predicted - level, _TOLERANCE * predicted
+    if state.samples >= _LEAST or not clear:
+        state.rise = max(0.0, state.rise + (above - tolerated) / sigma - _DRIFT)
+    state.shortfall = max(0.0, state.shortfall - (above + tolerated) / sigma - _DRIFT)
+    if state.rise > limit:
+        state.rise, state.agreed = 0.0, 0
+        was_engaged, state.engaged = state.engaged, True
+        if clear or (was_engaged and not state.confirmed):
+            return TOO_LATE
+    if state.shortfall > limit:
+        state.shortfall, state.agreed = 0.0, 0
+        if x > 0.0 and not state.confirmed:
+            state.engaged = False
+            return TOO_EARLY
+    if x > 0.0 and predicted > _TELLING * sigma and max(state.rise, state.shortfall) < 0.5 * limit:
+        state.agreed += 1
+        state.confirmed = state.confirmed or state.agreed >= _CONFIRMING
+    return NOTHING
+
+
+@njit
+def start_anew(state, variance):
+    """Forget what was summed; ``variance`` (rad^2) of the contact angle that is now believed."""
+    state.lost, state.confirmed, state.agreed = True, False, 0
+    state.rise = state.shortfall = state.excess = state.watched = 0.0
+    state.prior = variance
+
+
+@njit
+def torque_share(state, variance):
+    """Share of what is known of the contact angle that torque told, when its variance is ``variance``."""
+    return max(0.0, 1.0 - variance / state.prior) if state.prior > 0.0 else 0.0
+
+
+@njit
+def torque_sigma(current_torque, speed_torque):
+    """Standard deviation of one sample's torque from noise of current and of both speeds, N m, and the current's share."""
+    variance = current_torque * current_torque + 2.0 * speed_torque * speed_torque
+    return sqrt(variance), current_torque * current_torque / variance

@@ -1,0 +1,185 @@
+"""Contact: engagement is signalled in time and not in the clearance; a contradicted contact angle is found anew."""
+
+import adaptkit
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.adapt.evidence import false_alarms
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.records import CONTACT_UNCERTAIN, FUSED, TORQUE_ONLY
+from emb_daemon.offline import estimate, load_log
+
+#: Where the reference force starts to rise on the simulated rig's logs, rad past the released position; the stroke is the
+#: same in all of them (fit of curve and contact to the reference force).
+RIG_CONTACT = 7.497
+
+LOGS = {
+    "training_5mm": 5.0, "gear_new_training": 10.0, "gear_worn_in_training": 10.0, "random_0p5mm": 0.5, "random_9p5mm": 9.5,
+    "curve_9p5mm": 9.5,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def logs(rig):
+    return {name: load_log(rig / "static" / f"{name}.log.gz") for name in LOGS}
+
+
+def rig_parameters(thickness_mm: float):
+    return to_parameters(adaptkit.shipped(pad_thickness_mm=thickness_mm))
+
+
+def ideal(parameters):
+    """A brake of the thesis's models alone, with a clearance known to 0.02 rad."""
+    p = parameters[0].copy()
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    return p
+
+
+def noisy(rows, p, seed=1):
+    """SAMPLE rows with the noise of current and speed that the parameters name."""
+    rng = np.random.default_rng(seed)
+    rho = np.exp(-0.004 / p["current_correlation_time"])
+    noise = np.zeros(len(rows))
+    for i in range(1, len(rows)):
+        noise[i] = rho * noise[i - 1] + np.sqrt(1.0 - rho * rho) * rng.normal()
+    rows = rows.copy()
+    rows["current_q"] += p["current_sigma"] * noise
+    rows["speed"] += p["speed_sigma"] * rng.normal(size=len(rows))
+    return rows
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_contact_is_signalled_within_two_and_a_half_radians_on_the_rig(logs, name):
+    log = logs[name]
+    estimates = estimate(log.samples, rig_parameters(LOGS[name]))
+    past = log.samples["angle"] - log.samples["angle"][0] - RIG_CONTACT
+    closing = np.flatnonzero((past[1:] > 0.0) & (past[:-1] <= 0.0)) + 1
+    assert len(closing) > 0
+    for first in closing:
+        after = np.flatnonzero((past[first:] > 2.5) | (past[first:] <= 0.0))
+        end = first + (after[0] if len(after) else len(past) - first - 1)
+        if past[end] > 2.5:
+            assert estimates["engaged"][first:end].any() or estimates["engaged"][end]
+    assert not np.any(estimates["engaged"] & (past < -0.6))
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0, 60.0, 210.0])
+def test_contact_is_signalled_in_time_at_any_motor_speed(parameters, speed):
+    p = ideal(parameters)
+    rows, _ = brake.samples(p, brake.clamp(p, 12.0, (p["clearance"] + 12.0) / speed))
+    estimates = estimate(noisy(rows, p), p)
+    signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
+    assert -0.6 < signalled < 2.5
+
+
+@pytest.mark.parametrize("speed", [1.0, 5.0])
+def test_torque_alone_signals_contact_where_the_angle_says_nothing(parameters, speed):
+    """Power-on clearance unknown by three radians: at moderate speed the rise of torque is what tells."""
+    p = ideal(parameters)
+    p["clearance_sigma"] = 3.0
+    rows, _ = brake.samples(p, brake.clamp(p, 6.0, (p["clearance"] + 6.0) / speed))
+    estimates = estimate(noisy(rows, p), p)
+    signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
+    assert 0.0 < signalled < 2.5
+
+
+def test_an_offset_of_the_current_is_no_contact(parameters):
+    p = ideal(parameters)
+    approach = brake.clamp(p, -1.0, 4.0)
+    rows, _ = brake.samples(p, np.concatenate([approach, approach[::-1]] * 4))
+    rows["current_q"] += 0.8
+    assert not estimate(noisy(rows, p), p)["engaged"].any()
+
+
+def test_false_alarms_are_rarer_than_one_in_ten_thousand_releases():
+    """Simulated; the command `python -m emb_daemon.adapt.evidence alarms` runs ten times as many."""
+    result = false_alarms(adaptkit.shipped(), releases=30_000)
+    assert result["samples"] > 10_000_000
+    assert result["false_alarms"] <= 1
+
+
+@pytest.mark.parametrize("wrong_rad", [-1.8, -1.0, 1.0, 1.8])
+def test_a_clearance_that_was_said_to_be_uncertain_is_found_in_one_application(logs, wrong_rad):
+    """On the simulated rig: power-on clearance wrong by up to two of its standard deviations."""
+    log = logs["training_5mm"]
+    p = rig_parameters(5.0)
+    p["clearance"] += wrong_rad
+    p["clearance_sigma"] = 1.0
+    rows = log.samples[:5250]
+    estimates = estimate(rows, p)
+    force = log.force_N[:5250]
+    assert estimates["reasons"][0] & CONTACT_UNCERTAIN
+    error = estimates["contact_angle"] - rows["angle"][0] - RIG_CONTACT
+    clamped = np.flatnonzero(force > 2000.0)[0]
+    assert np.all(np.abs(error[clamped:]) < 0.3)
+    assert not np.any(estimates["reasons"][clamped:] & CONTACT_UNCERTAIN)
+    # From the start on sigma covers the error, reference noise of 25 N included.
+    inside = np.abs(estimates["force"] - force) < 2.0 * np.hypot(estimates["sigma"], 25.0)
+    assert np.mean(inside) > 0.9
+    assert np.mean(np.abs(error) < 2.0 * estimates["contact_sigma"]) > 0.9
+
+
+@pytest.mark.parametrize("wrong_rad", [-2.0, 2.0])
+def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
+    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that."""
+    log = logs["curve_9p5mm"]
+    p = rig_parameters(9.5)
+    p["clearance"] += wrong_rad
+    estimates = estimate(log.samples, p)
+    error = estimates["contact_angle"] - log.samples["angle"][0] - RIG_CONTACT
+    lost = np.flatnonzero(estimates["reasons"] & CONTACT_UNCERTAIN)
+    assert len(lost) and lost[0] > 100
+    clamped = np.flatnonzero(log.force_N > 2000.0)[0]
+    assert np.all(np.abs(error[clamped:]) < 0.3)
+    assert estimates["source"][-1] == FUSED
+
+
+@pytest.mark.parametrize("from_N", [3000.0, 8000.0, 15000.0])
+def test_power_that_comes_while_clamped_is_noticed(logs, from_N):
+    """On the simulated rig: the first sample stands at 3 to 15 kN, the angle tells nothing of it."""
+    log = logs["training_5mm"]
+    first = np.flatnonzero(log.force_N > from_N)[0]
+    rows, force = log.samples[first:].copy(), log.force_N[first:]
+    rows["dt"][0] = 0.0
+    estimates = estimate(rows, rig_parameters(5.0))
+    assert np.any(estimates["reasons"][:10] & CONTACT_UNCERTAIN)
+    assert np.any(estimates["source"][:25] == TORQUE_ONLY)
+    error = estimates["contact_angle"] - log.samples["angle"][0] - RIG_CONTACT
+    assert np.all(np.abs(error[250:]) < 0.3)
+    assert np.abs(estimates["force"] - force)[250:].max() < 1000.0
+    inside = np.abs(estimates["force"] - force) < 2.0 * np.hypot(estimates["sigma"], 25.0)
+    assert np.mean(inside[5:]) > 0.95
+
+
+def test_the_contact_angle_that_fits_is_left_alone(logs):
+    """No alarm on the simulated rig's logs with the right calibration, random motion at full speed included."""
+    for name, thickness in LOGS.items():
+        p = rig_parameters(thickness)
+        if "worn_in" in name:
+            p["load_friction"], p["offset_friction"] = 5.7e-6, 0.0294
+        estimates = estimate(logs[name].samples, p)
+        assert not np.any(estimates["reasons"] & CONTACT_UNCERTAIN), name
+
+
+def test_contact_follows_slow_growth_between_applications(parameters):
+    """The disc grows 20 µm over forty seconds of stops: the walk lets the contact angle follow, and sigma covers the rest."""
+    p = ideal(parameters)
+    p["clearance_sigma"] = 0.05
+    p["contact_walk"] = 0.1
+    up = brake.clamp(p, 15.0, 0.8)
+    stroke = np.concatenate([up, np.full(50, up[-1]), up[::-1], np.zeros(50)])
+    growth = 20e-6 / p["gear_gain"]
+    angle = np.tile(stroke, 20)
+    moved = np.linspace(0.0, growth, len(angle))
+    rows, force = brake.samples(p, angle + moved)
+    rows["angle"] -= moved
+    estimates = estimate(noisy(rows, p), p)
+    late = slice(len(angle) // 2, None)
+    error = estimates["contact_angle"] - (p["clearance"] - moved)
+    assert np.abs(error[late]).max() < 0.3
+    assert np.mean(np.abs(estimates["force"] - force)[late] < 2.0 * estimates["sigma"][late]) > 0.9
+    fixed = p.copy()
+    fixed["contact_walk"], fixed["clearance_sigma"] = 0.0, 1e-3
+    stuck = estimate(noisy(rows, p), fixed)
+    assert np.abs(estimates["force"] - force)[late].mean() < 0.3 * np.abs(stuck["force"] - force)[late].mean()
