@@ -39,7 +39,8 @@ _OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
 #: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
-#: ``agreed`` how many samples in a row counter and clock agreed on; ``stranger_ns`` when somebody else last sent one of our messages.
+#: ``agreed`` how many samples in a row counter and clock agreed on; ``stranger_ns`` when somebody else
+#: last sent one of our messages.
 CORNER = np.dtype(
     [
         ("active", "?"),

@@ -284,7 +284,7 @@ def test_speed_beyond_the_motor(car, good):  # noqa: F811
 
 
 def test_foreign_frames_change_nothing(car, good):  # noqa: F811
-    """Other ids, extended, remote, error and FD frames, other corners: not a bit differs; our own ids from others: reported."""
+    """Other ids, extended, remote, error and FD frames, other corners: no bit differs. Our own ids from others: reported."""
     rng = np.random.default_rng(9)
 
     def among(frame, cycle):

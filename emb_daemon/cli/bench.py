@@ -67,7 +67,8 @@ def _print(result: dict) -> None:
         print(f"  {100 * loop['core_share']:.1f} % of one core, {last:.0f} MiB resident ({last - first:+.1f} over the run)")
     logs = result["logs"]
     print(
-        f"\nlogs: {logs['read_frames_per_s'] / 1e6:.2f} million frames/s read, {logs['replay_frames_per_s'] / 1e6:.2f} replayed "
+        f"\nlogs: {logs['read_frames_per_s'] / 1e6:.2f} million frames/s read, "
+        f"{logs['replay_frames_per_s'] / 1e6:.2f} replayed "
         f"({logs['replay_times_real_time']:.0f} times real time), step {logs['step_us']:.2f} us; "
         f"cantools frame by frame decodes {logs['cantools_decode_frames_per_s'] / 1e6:.2f} million/s"
     )
