@@ -113,5 +113,6 @@ def test_contact_angle_is_learned_from_the_torque(parameters):
     before, after = estimates["contact_angle"][0], estimates["contact_angle"][-1]
     assert before == pytest.approx(true["clearance"] - 0.1)
     assert abs(after - true["clearance"]) < 0.03
-    assert estimates["contact_sigma"][-1] < 0.06
+    # Friction may be off by its own share, which torque tells as contact angle: less is left than there was, but not little.
+    assert 0.05 < estimates["contact_sigma"][-1] < 0.1
     assert abs(estimates["force"][-1] - force[-1]) < 2.0 * estimates["sigma"][-1]

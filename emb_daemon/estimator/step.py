@@ -27,10 +27,11 @@ from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
     NOTHING,
     TOO_EARLY,
+    clearly_above,
     engaged,
     start_anew,
     threshold,
-    torque_share,
+    torque_bias,
     torque_sigma,
     watch_closing,
 )
@@ -281,7 +282,7 @@ def _watch_contact(s, p, m, force_before, torque, leverage):
         _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD)
     elif found != NOTHING:
         _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage)
-    elif not c.confirmed and c.excess > max(predicted, leverage * _CLAMPED * p.maximum_force, 5.0 * sigma / sqrt(c.watched)):
+    elif not c.confirmed and c.excess > max(predicted, leverage * _CLAMPED * p.maximum_force, clearly_above(c, sigma)):
         # Power came while the brake was clamped: no angle from which to count the clearance.
         force = (seen + c.level) / leverage
         friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
@@ -324,7 +325,8 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         P[0, 0] += (lag_error / spread) ** 2
     s.contact.prior += walked
     # What friction's offset may be wrong by, the torque reads as contact angle, and no number of samples averages it out.
-    offset = torque_share(s.contact, P[1, 1]) * p.torque_relative_sigma * p.offset_friction / (p.gear_gain * p.curve[0])
+    misread = p.torque_relative_sigma * p.offset_friction / (p.gear_gain * p.curve[0])
+    offset = torque_bias(s.contact, P[1, 1], misread)
     h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
     out.stiffness_sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
     out.innovation = out.innovation_sigma = np.nan

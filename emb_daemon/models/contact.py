@@ -130,9 +130,20 @@ def start_anew(state, variance):
 
 
 @njit
-def torque_share(state, variance):
-    """Share of what is known of the contact angle that torque told, when its variance is ``variance``."""
-    return max(0.0, 1.0 - variance / state.prior) if state.prior > 0.0 else 0.0
+def torque_bias(state, variance, misread):
+    """Standard deviation (rad) that the contact angle of ``variance`` has beside it because torque told of it, which itself
+    may be off by ``misread`` rad: none if nothing came from torque, and never more than was unknown before."""
+    if not state.prior > 0.0:
+        return 0.0
+    share = max(0.0, 1.0 - variance / state.prior)
+    return share * misread * sqrt(state.prior / (state.prior + misread * misread))
+
+
+@njit
+def clearly_above(state, sigma):
+    """Smoothed excess (N m) that noise of standard deviation ``sigma`` per sample does not reach; infinite before the first
+    sample."""
+    return 5.0 * sigma / sqrt(state.watched) if state.watched > 0.0 else np.inf
 
 
 @njit
