@@ -61,13 +61,17 @@ def drive(seconds=12.0, wheel_speed=20.0):
     angle = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * time) * (time > 2.0)
     samples["dt"] = np.where(np.arange(count) == 0, 0.0, DT)
     samples["angle"], samples["speed"] = angle, np.gradient(angle, DT)
-    samples["current_q"] = 0.5 * angle
     samples["wheel_speed"] = wheel_speed
     samples["wheel_pulse"] = np.floor(100.0 + 96.0 * wheel_speed * time / (2.0 * np.pi)) % 4096
     samples["inner_backplate"] = samples["outer_backplate"] = 22.0 + time
     samples["caliper"], samples["ambient"], samples["brake_torque"] = 40.0, 22.0, np.nan
-    for name in ("has_current", "has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
+    for name in ("has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
         samples[name] = True
+    # The current that this motion takes: one that contradicts it would put the contact angle in doubt.
+    p = bare()
+    force, turning = estimate(samples, p)["stiffness_force"], np.sign(samples["speed"])
+    torque = p["gear_gain"] * force + turning * (p["offset_friction"] + p["load_friction"] * force)
+    samples["current_q"], samples["has_current"] = torque / p["torque_constant"], True
     return samples
 
 

@@ -298,7 +298,9 @@ def _watch_contact(s, p, m, force_before, torque, leverage):
 @njit
 def _start_contact(s, p, m, force, sigma):
     """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more."""
-    travel = travel_at(force / s.factor, p.curve) if force > 0.0 else 0.0
+    travel = travel_at(min(force, p.maximum_force) / s.factor, p.curve) if force > 0.0 else 0.0
+    if not np.isfinite(travel):
+        return
     s.contact_angle += s.past_contact - travel
     rest(s, p, travel, s.factor)
     slope = s.factor * max(characteristic_curve(max(travel, 1.0), p.curve)[1], p.curve[0])
