@@ -21,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", type=Path, metavar="FILE", help="estimates as .csv or .parquet, or frames as .log, .blf, .asc, .trc, .mf4"
     )
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="a page to look at: forces, errors, heat, events")
     parser.add_argument("--json", action="store_true", help="error figures as JSON")
 
 
@@ -30,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     import msgspec
     import numpy as np
 
-    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.files import calibration_hash, load_calibration
     from emb_daemon.errors import InputError
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, table_columns, write_frames, write_table
     from emb_daemon.replay import Replay
@@ -42,11 +43,15 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"{output}: unknown ending, expected one of {', '.join(TABLE_ENDINGS + FRAME_ENDINGS)}")
     if output and not output.parent.is_dir():
         raise InputError(f"{output}: no such folder: {output.parent}")
+    if arguments.report and not arguments.report.absolute().parent.is_dir():
+        raise InputError(f"{arguments.report}: no such folder: {arguments.report.absolute().parent}")
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
     replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state)
     if ending in FRAME_ENDINGS:
+        if arguments.report:
+            raise InputError(f"--report: expected together with a table ({', '.join(TABLE_ENDINGS)}) or without --output")
         if arguments.measured_torque:
             raise InputError("--measured-torque: the daemon has no such input, so there are no frames it would have sent")
         write_frames(output, np.concatenate([part for log in arguments.logs for part in replay.frames(log)]))
@@ -55,6 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
     if output:
         tables = [table_columns(result.estimates, 1e-9 * result.time_ns) for result in results]
         write_table(output, {name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
+    if arguments.report:
+        from emb_daemon.report.replay import replay_page
+
+        described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
+        replay_page(results, arguments.corner, described).write(arguments.report)
     report = [result.figures() for result in results]
     if arguments.json:
         json.dump({"logs": report}, sys.stdout, indent=1)
