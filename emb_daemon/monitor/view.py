@@ -60,8 +60,8 @@ def _adaptation(corner: Corner) -> Text:
         return Text("")
     asked, progress, result = (int(value) for value in request.values[:3])
     if REQUESTS[asked] == "run":
-        done = round(progress / 10)
-        return Text(f"adapting {'█' * done}{'·' * (10 - done)} {progress} %", style="cyan")
+        done = round(progress / 20)
+        return Text(f"adapting {'█' * done}{'·' * (5 - done)} {progress} %", style="cyan")
     if RESULTS.get(result, "?") == "none":
         return Text("")
     return Text(f"adaptation {RESULTS.get(result, '?')}", style="green" if result == 1 else "yellow")
@@ -87,11 +87,11 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     first.append(sparkline(history, cells, full), style="cyan")
     first.append(f"▏{full:.0f} kN", style="dim")
 
-    second = Text("   pads ")
+    second = Text("   ")
     for name, surface, mean in (("inner", "inner_surface_C", "inner_mean_C"), ("outer", "outer_surface_C", "outer_mean_C")):
-        second.append(f"{name} {_number(state[surface], 0):>3} / {_number(state[mean], 0):>3} °C  ")
+        second.append(f"{name} pad {_number(state[surface], 0):>3}/{_number(state[mean], 0):>3} °C  ")
     factor, contact = _number(state["stiffness_factor"], 3), _number(state["contact_angle_rad"], 1)
-    second.append(f"stiffness × {factor}  contact {contact} rad", style="dim" if not heat.usable else "")
+    second.append(f"stiffness {factor}  contact {contact} rad", style="dim" if not heat.usable else "")
 
     third = Text("   ")
     if silent > _SILENT_S:
@@ -99,7 +99,7 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     else:
         third.append(STATUSES.get(force.status, "?"), style=_STATUS_COLOURS.get(force.status, "red"))
         if state["input_age_ms"]:
-            third.append(f"  input {state['input_age_ms']} ms old", style="yellow")
+            third.append(f"  {state['input_age_ms']} ms old", style="yellow")
     third.append(f"  {state['forces_per_s']:.0f}/s  ")
     third.append(f"{corner.missing} missing", style="yellow" if corner.missing else "dim")
     third.append("  ")

@@ -12,6 +12,7 @@ from emb_daemon.report.page import Page
 _SEEN = 1.0 / 1000.0
 _CYCLE_S = 0.004
 _BINS = 120
+_LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
 _INNER, _OUTER, _DISC = Style("#c2662d", 1.4), Style("#1b7f4b", 1.4), Style(INK, 1.2, "dot")
 _INNER_MEAN, _OUTER_MEAN = Style("#e3a982", 1.2), Style("#86bfa0", 1.2)
 _STRETCH = Style(MODEL.colour, 7.0)
@@ -71,7 +72,7 @@ def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> l
             Panel(
                 "Estimate minus reference, and two sigma about zero",
                 "N",
-                [Trace("", at, -2.0 * doubt, BAND), Trace("", at, 2.0 * doubt, BAND), Trace("error", at, error, MODEL)],
+                [Trace("", at, -2.0 * doubt, BAND), Trace("", at, 2.0 * doubt, BAND), Trace("", at, error, MODEL)],
                 height=200,
             )
         )
@@ -93,8 +94,8 @@ def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> l
 
 
 def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Share of the samples in each bin, percent; what lies outside counts in the outermost bins."""
-    counts, _ = np.histogram(np.clip(error, edges[0], edges[-1]), edges)
+    """Share of all samples in each bin, percent."""
+    counts, _ = np.histogram(error, edges)
     return 100.0 * counts / max(len(error), 1)
 
 
@@ -102,7 +103,7 @@ def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: lis
     section = page.section("Errors", "Estimate minus reference. Conditions overlap; figures without a sample are left out.")
     for log in figures:
         rows = []
-        for path, label in (("fused", "estimate"), ("stiffness", "stiffness path"), ("torque", "torque path")):
+        for path, label in _LABELS.items():
             part = log["force_N"].get(path, {"samples": 0})
             if part["samples"]:
                 rows.append([label, *_cells(part)])
@@ -114,8 +115,7 @@ def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: lis
             table = [[name.replace("_", " "), *_cells(part)] for name, part in log["temperature_K"].items() if part["samples"]]
             section.table(["temperature", "RMSE / K", "bias / K", "95 % / K", "max / K", "samples"], table, log["log"])
     known = np.isfinite(force_N)
-    errors = {label: (estimates[PATHS[path]] - force_N)[known]
-              for path, label in (("fused", "estimate"), ("stiffness", "stiffness path"), ("torque", "torque path"))}  # fmt: skip
+    errors = {label: (estimates[PATHS[path]] - force_N)[known] for path, label in _LABELS.items()}
     errors = {label: error[np.isfinite(error)] for label, error in errors.items()}
     reach = max(1.0, float(np.percentile(np.abs(errors["estimate"]), 99.5)) * 1.5)
     edges = np.linspace(-reach, reach, _BINS + 1)
@@ -124,7 +124,11 @@ def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: lis
     traces = [Trace(label, centre, _histogram(error, edges), styles[label]) for label, error in errors.items() if len(error)]
     section.figure(
         xy_figure([Panel("Distribution of the error", "% of samples", traces)], "error / N"),
-        "The outermost bins hold everything beyond them.",
+        "Beyond the axis: "
+        + ", ".join(
+            f"{100.0 * np.mean(np.abs(error) > reach):.1f} % of the {label}" for label, error in errors.items() if len(error)
+        )
+        + ".",
     )
 
 
