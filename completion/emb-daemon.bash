@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay identify diagnose simulate monitor bench --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay identify diagnose simulate monitor bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -15,12 +15,13 @@ _emb_daemon() {
         demo) options="--corners --seconds --picture" ;;
         run) options="--config -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         check) options="--config" ;;
-        replay) options="--calibration --mapping --corner --pad-thickness --measured-torque --output --report --json" ;;
+        replay) options="--calibration --mapping --corner --pad-thickness --measured-torque --state --output --report --json" ;;
         identify) options="--output --report" ;;
         diagnose) options="--calibration --validate --output --corner" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         bench) options="--seconds --corners --json" ;;
+        adaptation) options="--state --corner" ;;
     esac
     if [[ $word == -* ]]; then
         mapfile -t COMPREPLY < <(compgen -W "$options --help" -- "$word")

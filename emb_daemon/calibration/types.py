@@ -213,35 +213,43 @@ class Thermal(Struct, kw_only=True):
 class Adaptation(Struct, kw_only=True):
     """Limits of park brake adaptation (thesis 3.4): when it may run, what it asks for, and what it may accept."""
 
+    #: Whether training is asked for and learned from at all.
     enabled: bool = True
-    #: Ambient temperatures, and rise of the pads over ambient, at which training teaches something.
+    #: Lowest ambient temperature at which training teaches something.
     minimum_ambient_C: float = -10.0
+    #: Highest such ambient temperature.
     maximum_ambient_C: float = 45.0
+    #: Largest rise of the pads over ambient at which training teaches something.
     maximum_rise_K: Positive = 25.0
-    #: Clamp force up to which training motion is asked for, and the share of it that must be reached.
+    #: Clamp force up to which training motion is asked for.
     high_force_N: Positive = 18000.0
+    #: Share of that force that must be reached.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
-    #: The small fast sinusoid on top.
+    #: Amplitude of the small fast sinusoid on top.
     dither_amplitude_rad: NonNegative = 0.9
+    #: Its frequency.
     dither_frequency_Hz: Positive = 5.0
-    #: Standing quietly with the park brake applied before training is asked for; waiting for motion; longest training.
+    #: Standing quietly with the park brake applied before training is asked for.
     settling_time_s: NonNegative = 5.0
+    #: Waiting for the motion that was asked for.
     answer_time_s: Positive = 10.0
+    #: Longest training.
     longest_training_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 45.0
     #: Samples needed in each force range and direction.
     samples_per_range: Annotated[int, Meta(ge=1)] = 50
     #: Residual current over the noise that the calibration knows.
     residual_ratio: Positive = 1.5
-    #: Largest relative change of the travel to high_force_N and of the friction there against the values in use, and of
-    #: the clearance, for one training.
+    #: Largest relative change of the travel to high_force_N against the values in use, for one training.
     curve_change: Positive = 0.35
+    #: Largest relative change of the friction there, for one training.
     friction_change: Positive = 0.6
+    #: Largest change of the clearance, for one training.
     clearance_change_rad: Positive = 5.0
     #: Friction torque over clamp torque that a gear can have.
     maximum_friction_share: Share = 0.6
-    #: Largest standard deviation of the learned force, and RMS difference of the pairs of passes from the learned curve as a
-    #: share of the largest force.
+    #: Largest standard deviation of the learned force.
     maximum_sigma_N: Positive = 200.0
+    #: Largest RMS difference of the pairs of passes from the learned curve, as a share of the largest force.
     pairs_difference: Positive = 0.04
     #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
     torque_constant_relative: NonNegative = 0.002
