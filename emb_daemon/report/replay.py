@@ -171,6 +171,8 @@ def replay_page(results: list, corner: str, calibration: str) -> Page:
         tickvals=list(range(len(labels))), ticktext=labels, range=[-0.6, len(labels) - 0.4], automargin=True,
         row=len(panels) + 1, col=1,
     )  # fmt: skip
+    # The legend takes two rows, above which the tool bar stands.
+    figure.update_layout(margin={"t": 108}, height=figure.layout.height + 40)
     page.section("The drive", "Drag across any plot to zoom all of them, double-click to see everything again.").figure(
         figure, "Curves are reduced for the screen; the smallest and largest value of every stretch are kept."
     )
