@@ -37,6 +37,11 @@ def _keys():
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
+def _discard(bus) -> None:
+    """Frames that came while this program was still loading: the socket's buffer held some, and the gap after them is ours."""
+    bus.drain()
+
+
 def watch(bus, title: str) -> None:
     """Show broadcasts on the terminal until the user quits."""
     from rich.console import Console
@@ -46,6 +51,7 @@ def watch(bus, title: str) -> None:
 
     listener, console = Listener(), Console()
     drawn_ns, paused = 0, False
+    _discard(bus)
     with _keys() as read, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
             key = read(_DRAIN_S)
@@ -71,6 +77,7 @@ def listen(bus, wait_s: float = 3.0, whole_seconds: int = 1) -> tuple[Listener, 
     """
     listener, start = Listener(), time.monotonic_ns()
     heard_ns = 0
+    _discard(bus)
     while True:
         bus.wait(_DRAIN_S)
         listener.hear(bus.drain())
