@@ -1,3 +1,42 @@
-"""Virtual clamp force sensor for electro-mechanical brakes."""
+"""Virtual clamp force sensor for electro-mechanical brakes.
+
+For Python programs: `load_log`, `run`, `Estimator`, `Mapping`, `load_calibration` and more; see `emb_daemon.api`.
+"""
+
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from emb_daemon.api import (
+        Answer,
+        Calibration,
+        Estimator,
+        Log,
+        Mapping,
+        load_calibration,
+        load_log,
+        run,
+        shipped_calibration,
+    )
+
+__all__ = [
+    "Answer",
+    "Calibration",
+    "Estimator",
+    "Log",
+    "Mapping",
+    "load_calibration",
+    "load_log",
+    "run",
+    "shipped_calibration",
+]
+
+
+def __getattr__(name: str):
+    # The daemon and --help need none of this, and it takes half a second to import.
+    if name in __all__:
+        from emb_daemon import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -41,13 +41,13 @@ class Log:
         return 1e-9 * (self.time_ns - self.time_ns[0])
 
 
-def load_log(path: str | Path, corner: str = "FL") -> Log:
-    """Read a log into samples.
+def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
+    """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
 
     Raises:
         InputError: unreadable, or no resolver sample of that corner in it.
     """
-    return log_of(read_frames(path), corner, Path(path))
+    return log_of(read(path), corner, Path(path))
 
 
 def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:

@@ -57,9 +57,18 @@ class Replay:
         measured_torque: heat the pads with the rig's brake torque sensor instead of the estimated force.
         state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
             learned.
+        read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
     """
 
-    def __init__(self, calibration: Calibration, corner: str = "FL", measured_torque: bool = False, state: Path | None = None):
+    def __init__(
+        self,
+        calibration: Calibration,
+        corner: str = "FL",
+        measured_torque: bool = False,
+        state: Path | None = None,
+        read=read_frames,
+    ):
+        self._read = read
         self._corner = corner
         self._index = corner_index(corner)
         self._parameters = np.zeros(4, PARAMETERS)
@@ -83,7 +92,7 @@ class Replay:
 
     def frames(self, path: Path):
         """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
-        frames = read_frames(path)
+        frames = self._read(path)
         self._on_the_drive(frames)
         start = 0
         while start < len(frames):
@@ -96,7 +105,7 @@ class Replay:
         Raises:
             InputError: unreadable, or without a usable resolver sample of the corner.
         """
-        frames = read_frames(path)
+        frames = self._read(path)
         shift = self._on_the_drive(frames)
         reference = References(frames, self._corner)
         pipeline, estimates, samples, start = self._pipeline, [], [], 0

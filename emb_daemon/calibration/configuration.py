@@ -17,8 +17,11 @@ from emb_daemon.wire.layout import CORNERS, load_layout
 class Bus(Struct, kw_only=True):
     """The CAN bus, in python-can's words; the command line and CAN_* variables come before it."""
 
+    #: python-can's name of the interface, such as socketcan.
     interface: str | None = None
+    #: Such as can0.
     channel: str | None = None
+    #: In bit/s, for interfaces that set it.
     bitrate: Annotated[int, Meta(gt=0)] | None = None
 
 
@@ -36,12 +39,14 @@ class Realtime(Struct, kw_only=True):
     fifo_priority: Annotated[int, Meta(ge=1, le=99)] | None = 60
     #: CPU to run the loop on, or null for any.
     cpu: Annotated[int, Meta(ge=0)] | None = None
+    #: Keep all memory in RAM (mlockall).
     lock_memory: bool = True
 
 
 class Configuration(Struct, kw_only=True):
     """config/emb.yaml."""
 
+    #: Version of this file format.
     format: Annotated[int, Meta(ge=1, le=1)]
     bus: Bus = Bus()
     #: FL, FR, RL, RR: those that this process estimates.
@@ -51,6 +56,7 @@ class Configuration(Struct, kw_only=True):
     #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
     state_directory: str | None = None
     realtime: Realtime = Realtime()
+    #: What the journal gets: debug, info, warning or error.
     log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"
 
     def __post_init__(self):

@@ -57,6 +57,7 @@ class Friction(Struct, kw_only=True):
 class Curve(Struct, kw_only=True):
     """Characteristic curve of one pad thickness: F = sum of coefficients[n] x^(n+1), x in rad past contact."""
 
+    #: Thickness of the pads, friction material alone.
     pad_thickness_mm: Positive
     #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
     coefficients: Annotated[tuple[float, ...], Meta(min_length=1, max_length=CURVE_TERMS)]
@@ -96,13 +97,15 @@ class Contact(Struct, kw_only=True):
 class Noise(Struct, kw_only=True):
     """Errors of both paths, as the filter needs them; identified from data that did not fit the models."""
 
-    #: Error of the stiffness path that does not grow with force, and the part that does.
+    #: Error of the stiffness path that does not grow with force.
     stiffness_N: Positive
+    #: Error of the stiffness path that grows with force, as a share of it.
     stiffness_relative: NonNegative
     #: Time over which the stiffness path's error stays the same.
     stiffness_correlation_s: Positive
-    #: Noise of the current, and the time over which it stays correlated.
+    #: Noise of the current.
     current_A: Positive
+    #: Time over which the noise of the current stays correlated.
     current_correlation_s: Positive
     #: White noise of the motor speed.
     speed_rad_per_s: Positive
@@ -115,20 +118,29 @@ class Noise(Struct, kw_only=True):
 class Pad(Struct, kw_only=True):
     """Both brake pads (thesis 7.4 to 8.1). Conductivity is k0 (1 + rise (T - 20 degC)), specific heat likewise."""
 
+    #: Friction surface of one pad.
     area_m2: Positive
+    #: Density of the friction material.
     density_kg_per_m3: Positive
+    #: Heat conductivity k0 at 20 degC.
     conductivity_W_per_mK: Positive
+    #: Its relative rise with temperature.
     conductivity_rise_per_K: float = 0.0
+    #: Specific heat C0 at 20 degC.
     specific_heat_J_per_kgK: Positive
+    #: Its relative rise with temperature.
     specific_heat_rise_per_K: float = 0.0
-    #: Shares of the friction power that enter the inner and the outer pad directly (thesis p).
+    #: Share of the friction power that enters the inner pad directly (thesis p).
     inner_heat_share: Share
+    #: Share of the friction power that enters the outer pad directly.
     outer_heat_share: Share
-    #: Between pad surface and disc, braking and released; between pad and backing plate's thermocouple.
+    #: Between pad surface and disc while they touch.
     contact_conductance_W_per_m2K: NonNegative
+    #: Between pad surface and disc when the brake is released.
     gap_conductance_W_per_m2K: NonNegative
     #: From the released pad surface to the air that the wheel stirs, per wheel speed.
     surface_cooling_per_speed_J_per_rad_m2K: NonNegative = 0.0
+    #: Between pad and the thermocouple on its backing plate.
     backplate_conductance_W_per_m2K: Positive
 
     def __post_init__(self):
@@ -139,18 +151,26 @@ class Pad(Struct, kw_only=True):
 class Disc(Struct, kw_only=True):
     """The lumped disc (thesis 8.2). Loses cooling + cooling_per_speed * wheel speed, and radiates."""
 
+    #: Of the whole disc.
     heat_capacity_J_per_K: Positive
+    #: At which the pads' friction acts.
     effective_radius_m: Positive
+    #: Loss to the air at standstill.
     cooling_W_per_K: NonNegative
+    #: Loss to the air per wheel speed.
     cooling_per_speed_J_per_rad_K: NonNegative
+    #: Area times emissivity; radiation follows the fourth power of temperature.
     radiating_area_m2: NonNegative = 0.0
 
 
 class FrictionTable(Struct, kw_only=True):
     """Pad-on-disc friction coefficient for service without a brake torque sensor (thesis 8.5)."""
 
+    #: Clamp forces of the table's grid.
     force_N: Annotated[tuple[float, ...], Meta(min_length=FORCE_GRID, max_length=FORCE_GRID)]
+    #: Disc speeds of the grid.
     disc_speed_rad_per_s: Annotated[tuple[float, ...], Meta(min_length=SPEED_GRID, max_length=SPEED_GRID)]
+    #: Pad surface temperatures of the grid.
     surface_temperature_C: Annotated[tuple[float, ...], Meta(min_length=TEMPERATURE_GRID, max_length=TEMPERATURE_GRID)]
     #: coefficient[force][speed][temperature]
     coefficient: tuple[tuple[tuple[Share, ...], ...], ...]
@@ -169,14 +189,19 @@ class Softening(Struct, kw_only=True):
     """alpha = 1 - per_K * rise - history_per_K * (rise through a first-order lag); rise of the mean pad temperature over
     that at which the curves were identified (thesis 8.4)."""
 
+    #: Mean pad temperature at which the curves were identified.
     reference_C: float = 20.0
-
+    #: Loss of stiffness per kelvin now.
     per_K: float = 0.0
+    #: Loss of stiffness per kelvin of the rise's history.
     history_per_K: float = 0.0
+    #: Time constant of that history.
     history_time_s: Positive = 1000.0
 
 
 class Thermal(Struct, kw_only=True):
+    """Heat and what it does to the stiffness."""
+
     pad: Pad
     disc: Disc
     friction: FrictionTable
@@ -188,35 +213,43 @@ class Thermal(Struct, kw_only=True):
 class Adaptation(Struct, kw_only=True):
     """Limits of park brake adaptation (thesis 3.4): when it may run, what it asks for, and what it may accept."""
 
+    #: Whether training is asked for and learned from at all.
     enabled: bool = True
-    #: Ambient temperatures, and rise of the pads over ambient, at which training teaches something.
+    #: Lowest ambient temperature at which training teaches something.
     minimum_ambient_C: float = -10.0
+    #: Highest such ambient temperature.
     maximum_ambient_C: float = 45.0
+    #: Largest rise of the pads over ambient at which training teaches something.
     maximum_rise_K: Positive = 25.0
-    #: Clamp force up to which training motion is asked for, and the share of it that must be reached.
+    #: Clamp force up to which training motion is asked for.
     high_force_N: Positive = 18000.0
+    #: Share of that force that must be reached.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
-    #: The small fast sinusoid on top.
+    #: Amplitude of the small fast sinusoid on top.
     dither_amplitude_rad: NonNegative = 0.9
+    #: Its frequency.
     dither_frequency_Hz: Positive = 5.0
-    #: Standing quietly with the park brake applied before training is asked for; waiting for motion; longest training.
+    #: Standing quietly with the park brake applied before training is asked for.
     settling_time_s: NonNegative = 5.0
+    #: Waiting for the motion that was asked for.
     answer_time_s: Positive = 10.0
+    #: Longest training.
     longest_training_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 45.0
     #: Samples needed in each force range and direction.
     samples_per_range: Annotated[int, Meta(ge=1)] = 50
     #: Residual current over the noise that the calibration knows.
     residual_ratio: Positive = 1.5
-    #: Largest relative change of the travel to high_force_N and of the friction there against the values in use, and of
-    #: the clearance, for one training.
+    #: Largest relative change of the travel to high_force_N against the values in use, for one training.
     curve_change: Positive = 0.35
+    #: Largest relative change of the friction there, for one training.
     friction_change: Positive = 0.6
+    #: Largest change of the clearance, for one training.
     clearance_change_rad: Positive = 5.0
     #: Friction torque over clamp torque that a gear can have.
     maximum_friction_share: Share = 0.6
-    #: Largest standard deviation of the learned force, and RMS difference of the pairs of passes from the learned curve as a
-    #: share of the largest force.
+    #: Largest standard deviation of the learned force.
     maximum_sigma_N: Positive = 200.0
+    #: Largest RMS difference of the pairs of passes from the learned curve, as a share of the largest force.
     pairs_difference: Positive = 0.04
     #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
     torque_constant_relative: NonNegative = 0.002
@@ -225,16 +258,22 @@ class Adaptation(Struct, kw_only=True):
 class Source(Struct, kw_only=True):
     """One log that a calibration rests on."""
 
+    #: File name.
     log: str
+    #: Of its content.
     sha256: str
 
 
 class Provenance(Struct, kw_only=True):
     """Where the numbers come from."""
 
+    #: Of the identification.
     date: str
+    #: What wrote the file.
     tool: str
+    #: Campaign file.
     campaign: str = ""
+    #: Logs that were fitted.
     logs: tuple[Source, ...] = ()
     #: Error figures on logs that fitted nothing, by name.
     figures: dict[str, float] = {}

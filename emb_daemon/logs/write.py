@@ -12,8 +12,32 @@ from emb_daemon.estimator.records import MODES, SOURCES
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.wire.layout import CORNERS
 
-TABLE_ENDINGS = (".csv", ".parquet")
+TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
 FRAME_ENDINGS = (".log", ".blf", ".asc", ".trc", ".mf4")
+
+
+#: What each column of a table is, for files that can say so: by ending of its name after the unit is taken off.
+_COMMENTS = {
+    "clamp_force": "estimate, both paths fused",
+    "clamp_force_sigma": "one standard deviation of clamp_force",
+    "stiffness_force": "from motor angle by the characteristic curve",
+    "torque_force": "from motor current by the torque balance",
+    "ml_force": "both paths weighted by their variances, without memory",
+    "contact_angle": "motor angle at which the pads touch",
+    "stiffness_factor": "stiffness over that at the calibration's temperature",
+    "surface": "friction surface",
+    "mean": "mean over the pad's thickness",
+    "disc": "brake disc, lumped",
+    "mode": "mode of the estimator",
+    "source": "what clamp_force rests on",
+    "corner": "wheel",
+}
+_UNITS = {"N": "N", "rad": "rad", "C": "degC"}
+
+
+def ending_of(path: Path) -> str:
+    """What decides an output's format: the last ending, or ``.signals.mf4`` for measurement channels instead of CAN frames."""
+    return ".signals.mf4" if path.name.lower().endswith(".signals.mf4") else path.suffix.lower()
 
 
 def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
@@ -47,7 +71,9 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
 
 
 def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """CSV or Parquet by ending; a NaN is an empty cell."""
+    """CSV, Parquet or an MDF4 measurement by ending; a NaN is an empty cell, or an invalid sample."""
+    if ending_of(path) == ".signals.mf4":
+        return _write_measurement(path, columns)
     import pyarrow
     import pyarrow.csv
     import pyarrow.parquet
@@ -61,6 +87,42 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
     _write(path, sink.getvalue().to_pybytes())
 
 
+def _unit_and_comment(name: str) -> tuple[str, str]:
+    stem, _, last = name.rpartition("_")
+    unit = _UNITS.get(last, "")
+    quantity = stem if unit else name
+    if quantity.endswith("mm"):
+        side, depth = quantity.split("_")
+        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface"
+    pad = f"{quantity.split('_')[0]} pad, " if quantity.startswith(("inner_", "outer_")) else ""
+    return unit, pad + _COMMENTS.get(quantity, _COMMENTS.get(quantity.rpartition("_")[2], ""))
+
+
+def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """MDF4 as measurement tools open it: one channel group, channels with unit and comment, texts as value tables."""
+    try:
+        from asammdf import MDF, Signal
+    except ImportError as error:
+        raise InputError(f"{path}: writing this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+    signals = []
+    for name, values in columns.items():
+        if name == "time_s":
+            continue
+        unit, comment = _unit_and_comment(name)
+        conversion = None
+        if values.dtype.kind in "UO":
+            texts, values = np.unique(values, return_inverse=True)
+            values = values.astype(np.uint8)
+            conversion = {f"val_{code}": code for code in range(len(texts))}
+            conversion |= {f"text_{code}": text.encode() for code, text in enumerate(texts.tolist())}
+        signals.append(Signal(values, columns["time_s"], name=name, unit=unit, comment=comment, conversion=conversion))
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        with MDF(version="4.10") as file:
+            file.append(signals, acq_name="emb_daemon", comment="estimates of emb_daemon replay", common_timebase=True)
+            part = file.save(Path(folder) / "signals.mf4", compression=2)
+        os.replace(part, path)
+
+
 def write_frames(path: Path, frames: np.ndarray) -> None:
     """A CAN log of FRAME rows, by ending."""
     if path.suffix.lower() == ".log":
@@ -68,7 +130,8 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
     import can
 
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        part = Path(folder) / path.name
+        # python-can takes every dot in a name for part of the format.
+        part = Path(folder) / f"frames{path.suffix.lower()}"
         try:
             with can.Logger(part) as logger:
                 for frame in frames:

@@ -1,0 +1,32 @@
+# bash completion for emb-daemon: install -m 644 emb-daemon.bash /usr/share/bash-completion/completions/emb-daemon
+_emb_daemon() {
+    local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
+    COMPREPLY=()
+    if ((COMP_CWORD == 1)); then
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay identify diagnose simulate monitor bench adaptation --help --version" -- "$word")
+        return
+    fi
+    case $before in
+        --corner) mapfile -t COMPREPLY < <(compgen -W "FL FR RL RR" -- "$word"); return ;;
+        -c | --channel) mapfile -t COMPREPLY < <(compgen -W "$(command ls /sys/class/net)" -- "$word"); return ;;
+        -i | --interface) mapfile -t COMPREPLY < <(compgen -W "socketcan udp_multicast virtual" -- "$word"); return ;;
+    esac
+    case ${COMP_WORDS[1]} in
+        demo) options="--corners --seconds --picture" ;;
+        run) options="--config -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        check) options="--config" ;;
+        replay) options="--calibration --mapping --corner --pad-thickness --measured-torque --state --output --report --json" ;;
+        identify) options="--output --report" ;;
+        diagnose) options="--calibration --validate --output --corner" ;;
+        simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        bench) options="--seconds --corners --json" ;;
+        adaptation) options="--state --corner" ;;
+    esac
+    if [[ $word == -* ]]; then
+        mapfile -t COMPREPLY < <(compgen -W "$options --help" -- "$word")
+    else
+        mapfile -t COMPREPLY < <(compgen -f -- "$word")
+    fi
+}
+complete -o filenames -F _emb_daemon emb-daemon

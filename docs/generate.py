@@ -1,0 +1,167 @@
+"""Writes the reference pages that restate code: calibration.md, configuration.md and catalogue.md.
+
+python docs/generate.py            writes them
+python docs/generate.py --check    exit status 1 if one is not current
+"""
+
+import ast
+import inspect
+import sys
+import typing
+from pathlib import Path
+
+import msgspec
+
+from emb_daemon.calibration import configuration, types
+from emb_daemon.effects import REGISTRY
+
+_HERE = Path(__file__).parent
+_PATHS = {"stiffness": "the stiffness path", "torque": "the torque path", "thermal": "heat"}
+
+
+def _comments(module) -> dict[str, dict[str, str]]:
+    """The ``#:`` comment of every field, by class."""
+    lines = inspect.getsource(module).splitlines()
+    found: dict[str, dict[str, str]] = {}
+    for node in ast.parse("\n".join(lines)).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        found[node.name] = {}
+        for item in node.body:
+            if isinstance(item, ast.AnnAssign):
+                text, above = [], item.lineno - 2
+                while lines[above].strip().startswith("#:"):
+                    text.insert(0, lines[above].strip()[2:].strip())
+                    above -= 1
+                found[node.name][item.target.id] = " ".join(text)
+    return found
+
+
+def _bounds(meta: msgspec.Meta) -> str:
+    signs = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"))
+    parts = [f"{sign} {getattr(meta, name):g}" for name, sign in signs if getattr(meta, name) is not None]
+    if meta.pattern:
+        parts.append("one of " + meta.pattern.strip("^()$").replace("|", ", "))
+    if meta.min_length is not None and meta.min_length == meta.max_length:
+        parts.append(f"{meta.min_length} entries")
+    elif meta.min_length is not None or meta.max_length is not None:
+        parts.append(f"{meta.min_length or 0} to {meta.max_length} entries" if meta.max_length else "not empty")
+    return ", ".join(parts)
+
+
+def _describe(kind) -> tuple[str, type | None]:
+    """A type in words, and the struct in it if there is one."""
+    if typing.get_origin(kind) is typing.Annotated:
+        base, *metas = typing.get_args(kind)
+        text, struct = _describe(base)
+        return ", ".join([text, *filter(None, (_bounds(meta) for meta in metas))]), struct
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple:
+        text, struct = _describe(arguments[0])
+        return f"list of {text}", struct
+    if origin is dict:
+        text, struct = _describe(arguments[1])
+        return f"name: {text}", struct
+    if type(None) in arguments:
+        text, struct = _describe(next(argument for argument in arguments if argument is not type(None)))
+        return f"{text}, or null", struct
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return "keys below", kind
+    return {float: "number", int: "whole number", str: "text", bool: "true or false"}[kind], None
+
+
+def _default(field) -> str:
+    if field.required:
+        return ""
+    value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
+    if isinstance(value, msgspec.Struct) or value in ((), {}, ""):
+        return "may be left out"
+    text = {None: "null", True: "true", False: "false"}.get(value, value) if not isinstance(value, float) else f"{value:g}"
+    return f"default {text}"
+
+
+def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
+    out += [f"## `{path}`" if path else "## The file", "", inspect.getdoc(kind) or "", ""]
+    out += ["| key | what | meaning |", "| --- | --- | --- |"]
+    below = []
+    for field in msgspec.structs.fields(kind):
+        text, struct = _describe(field.type)
+        what = ", ".join(filter(None, (text, _default(field))))
+        meaning = comments[kind.__name__][field.name]
+        if struct and not meaning:
+            meaning = (inspect.getdoc(struct) or "").splitlines()[0]
+        out.append(f"| `{field.encode_name}` | {what} | {_cell(meaning)} |")
+        if struct:
+            below.append((struct, f"{path}.{field.encode_name}" if path else field.encode_name))
+    out.append("")
+    for struct, name in below:
+        _struct(struct, name, comments, out)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _structs(title: str, text: str, kind: type, module) -> str:
+    out = [f"# {title}", "", text, ""]
+    _struct(kind, "", _comments(module), out)
+    return "\n".join(out).rstrip() + "\n"
+
+
+def _catalogue() -> str:
+    out = ["# Catalogue of effects", "", "What the thesis's models lack and the estimator knows; each is one file in"]
+    out += ["`emb_daemon/effects`, switched on by an entry in a calibration's `effects`. `emb-daemon diagnose` finds which"]
+    out += ["of them a log proves. [How to add one](effects.md).", ""]
+    for path, words in _PATHS.items():
+        out += [f"## Effects on {words}", ""]
+        for effect in REGISTRY:
+            if effect.path != path:
+                continue
+            summary = inspect.getdoc(sys.modules[f"emb_daemon.effects.{effect.name}"]).splitlines()[0]
+            out += [f"### {effect.name}", "", summary, "", f"    {effect.equation}", ""]
+            out += ["| parameter | unit | from | to | usual size | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+            for p in effect.parameters:
+                out.append(f"| `{p.name}` | {p.unit} | {p.low:g} | {p.high:g} | {p.prior:g} | {_cell(p.meaning)} |")
+            out += ["", f"Shown by: {effect.manoeuvre}. Source: {effect.source}.", ""]
+    return "\n".join(out).rstrip() + "\n"
+
+
+def pages() -> dict[str, str]:
+    """The text of every generated page, by file name."""
+    return {
+        "calibration.md": _structs(
+            "Calibration file",
+            "Everything identified of one actuator with its pads and disc. `emb-daemon identify` writes it, "
+            "`emb-daemon check` lists every fault of one with its line. Keys carry their unit; an unknown key, a key that "
+            "stands twice or a number that is not finite is refused. [Learned values](integration.md#files) are never "
+            "written into it.",
+            types.Calibration, types,
+        ),
+        "configuration.md": _structs(
+            "Configuration file",
+            "What `emb-daemon run` and `check` read, for example `config/emb.yaml`. Bus options on the command line and "
+            "python-can's `CAN_*` variables come before what stands here.",
+            configuration.Configuration, configuration,
+        ),
+        "catalogue.md": _catalogue(),
+    }  # fmt: skip
+
+
+def main() -> int:
+    stale = [name for name, text in pages().items() if not _is_current(name, text)]
+    if "--check" in sys.argv[1:]:
+        if stale:
+            print(f"{', '.join(stale)}: not current, run docs/generate.py", file=sys.stderr)
+        return int(bool(stale))
+    for name, text in pages().items():
+        (_HERE / name).write_text(text, encoding="utf-8")
+    return 0
+
+
+def _is_current(name: str, text: str) -> bool:
+    path = _HERE / name
+    return path.is_file() and path.read_text(encoding="utf-8") == text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""The estimator for Python programs: over logs, and inside somebody else's control loop.
+
+import emb_daemon
+
+log = emb_daemon.load_log("stop.log.gz")
+estimates = emb_daemon.run(log)
+estimates["force"], estimates["sigma"]          # N, one value per resolver sample
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator import records as r
+from emb_daemon.estimator.records import ESTIMATE, MODES, REASONS, SAMPLE, SOURCES, new_state
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.offline import Log, estimate, load_log
+from emb_daemon.pipeline import answer
+from emb_daemon.resources import resource
+
+__all__ = [
+    "Answer",
+    "Calibration",
+    "Estimator",
+    "Log",
+    "Mapping",
+    "load_calibration",
+    "load_log",
+    "run",
+    "shipped_calibration",
+]
+
+_NAN = float("nan")
+
+
+class Answer(NamedTuple):
+    """One estimate: force and its standard deviation in N, what they rest on, pad temperatures in degC (NaN before they are
+    known), and why to doubt them."""
+
+    force_N: float
+    sigma_N: float
+    source: str
+    mode: str
+    stiffness_force_N: float
+    torque_force_N: float
+    contact_angle_rad: float
+    stiffness_factor: float
+    inner_surface_C: float
+    inner_mean_C: float
+    outer_surface_C: float
+    outer_mean_C: float
+    reasons: tuple[str, ...]
+
+
+def shipped_calibration() -> Calibration:
+    """The calibration that comes with the package: of a simulated rig, for trying things out."""
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.ndarray:
+    """Estimates of a log as the daemon would have made them, one row per resolver sample.
+
+    Args:
+        calibration: or a file's path; None takes `shipped_calibration`.
+
+    Returns:
+        Structured array (`estimator.records.ESTIMATE`), shape (samples,): ``force``, ``sigma``, ``stiffness_force``,
+        ``torque_force`` in N, ``contact_angle`` in rad, ``surface``, ``mean`` (n, 2) and ``depth`` (n, 2, 4) in degC for the
+        inner and the outer pad, ``disc`` in degC, ``stiffness_factor``, ``mode``, ``source``, ``reasons``. Times are
+        ``log.time_s``, reference forces ``log.force_N``.
+
+    Raises:
+        InputErrors: the calibration file is faulty.
+    """
+    return estimate(log.samples, to_parameters(_calibration(calibration)))
+
+
+def _calibration(given: Calibration | str | Path | None) -> Calibration:
+    if given is None:
+        return shipped_calibration()
+    return given if isinstance(given, Calibration) else load_calibration(Path(given))
+
+
+class Estimator:
+    """One corner's estimator, for a program that has its own bus, clock or simulation.
+
+    It is the daemon's: the same inputs give the same answers. Calls after the first take some microseconds; the first
+    compiles, or loads from the cache.
+    """
+
+    def __init__(self, calibration: Calibration | str | Path | None = None):
+        """``calibration`` as in `run`."""
+        self._parameters = np.atleast_1d(to_parameters(_calibration(calibration)))
+        self._state = new_state()
+        self._sample = np.zeros(1, SAMPLE)
+        self._estimate = np.zeros(1, ESTIMATE)
+        self._sample["brake_torque"] = np.nan
+
+    def step(
+        self,
+        angle_rad: float,
+        speed_rad_per_s: float,
+        current_A: float | None = None,
+        *,
+        dt_s: float = 0.004,
+        backplates_C: tuple[float, float] | None = None,
+        caliper_C: float | None = None,
+        ambient_C: float = 20.0,
+        wheel_speed_rad_per_s: float | None = None,
+        wheel_pulse: float | None = None,
+        vehicle_speed_m_per_s: float = 0.0,
+    ) -> Answer:
+        """Take one sample and answer it.
+
+        Args:
+            angle_rad: motor angle, multi-turn, any zero; the pads are released at the first call.
+            speed_rad_per_s: motor speed, both at the sample.
+            current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
+            dt_s: time since the last sample.
+            backplates_C: inner and outer backing plate; None if unknown, and the pads' temperatures then stay unknown.
+            caliper_C: taken for the mean of the backing plates if None.
+            wheel_speed_rad_per_s, wheel_pulse: speed of the disc, and 96 counts per turn modulo 4096; None if unknown.
+        """
+        row = self._sample[0]
+        row["dt"] = dt_s if self._state["started"][0] else 0.0
+        row["angle"], row["speed"] = angle_rad, speed_rad_per_s
+        row["has_current"], row["current_q"] = current_A is not None, _NAN if current_A is None else current_A
+        row["has_thermocouple"] = backplates_C is not None
+        inner, outer = backplates_C or (_NAN, _NAN)
+        row["inner_backplate"], row["outer_backplate"] = inner, outer
+        row["caliper"] = 0.5 * (inner + outer) if caliper_C is None else caliper_C
+        row["has_status"], row["ambient"], row["vehicle_speed"] = True, ambient_C, vehicle_speed_m_per_s
+        row["has_wheel_speed"] = wheel_speed_rad_per_s is not None
+        row["wheel_speed"] = 0.0 if wheel_speed_rad_per_s is None else wheel_speed_rad_per_s
+        row["has_wheel_pulse"], row["wheel_pulse"] = wheel_pulse is not None, 0.0 if wheel_pulse is None else wheel_pulse
+        row["reasons"] = (
+            r.CURRENT_LOST * (current_A is None)
+            | r.THERMOCOUPLE_LOST * (backplates_C is None)
+            | r.WHEEL_SPEED_LOST * (wheel_speed_rad_per_s is None)
+            | r.WHEEL_PULSE_LOST * (wheel_pulse is None)
+        )
+        answer(self._sample, 1, self._state, self._parameters, self._estimate)
+        e = self._estimate[0]
+        return Answer(
+            force_N=float(e["force"]),
+            sigma_N=float(e["sigma"]),
+            source=SOURCES[int(e["source"])],
+            mode=MODES[int(e["mode"])],
+            stiffness_force_N=float(e["stiffness_force"]),
+            torque_force_N=float(e["torque_force"]),
+            contact_angle_rad=float(e["contact_angle"]),
+            stiffness_factor=float(e["stiffness_factor"]),
+            inner_surface_C=float(e["surface"][0]),
+            inner_mean_C=float(e["mean"][0]),
+            outer_surface_C=float(e["surface"][1]),
+            outer_mean_C=float(e["mean"][1]),
+            reasons=tuple(text for bit, text in enumerate(REASONS) if int(e["reasons"]) >> bit & 1),
+        )

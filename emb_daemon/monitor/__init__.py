@@ -1,0 +1,1 @@
+"""What a running daemon says, seen from its broadcasts alone."""

@@ -1,0 +1,205 @@
+"""Broadcasts off the bus: last values, gaps in the E2E counters, and the forces of the last minute."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from emb_daemon.estimator.records import MODES, REASONS, SOURCES
+from emb_daemon.wire.e2e import COUNTER_MODULO, crc
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
+from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP, default_layout
+
+HISTORY_S = 60
+SECOND_NS = 1_000_000_000
+STATUSES = {0: "ok", 1: "degraded", 2: "fault", 15: "not available"}
+REQUESTS = ("none", "run", "abort", "?")
+RESULTS = {0: "none", 1: "accepted", 2: "rejected", 3: "aborted"}
+
+
+@dataclass
+class Stream:
+    """One of a corner's four messages.
+
+    Attributes:
+        values: signals of the last good frame in the DBC's order and units; empty before the first.
+        received, missing, damaged: good frames, frames that the counter says were sent besides, and frames whose CRC is wrong
+            or whose counter stands still.
+    """
+
+    cycle_ns: int
+    values: list[float] = field(default_factory=list)
+    status: int = 15
+    counter: int = -1
+    time_ns: int = 0
+    received: int = 0
+    missing: int = 0
+    damaged: int = 0
+
+    @property
+    def usable(self) -> bool:
+        """Whether the sender says that the values may be used."""
+        return self.status <= 1
+
+    def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
+        """Count a frame with a good CRC; returns whether its values are new."""
+        if self.counter >= 0:
+            step, elapsed = (counter - self.counter) % COUNTER_MODULO, (time_ns - self.time_ns) / self.cycle_ns
+            if step == 0 and elapsed < COUNTER_MODULO / 2:
+                self.damaged += 1
+                return False
+            # Whole turns of the counter are told by the time that passed.
+            step += COUNTER_MODULO * max(0, round((elapsed - step) / COUNTER_MODULO))
+            self.missing += max(step - 1, 0)
+        self.values, self.status, self.counter, self.time_ns = values, status, counter, time_ns
+        self.received += 1
+        return True
+
+
+class Corner:
+    """One corner's broadcasts."""
+
+    def __init__(self, name: str, cycles_ns: list[int]):
+        self.name = name
+        self.streams = [Stream(cycle) for cycle in cycles_ns]
+        # Largest force in kN and number of forces of each second; `_second` says which second an entry is of.
+        self._largest = [math.nan] * (HISTORY_S + 1)
+        self._count = [0] * (HISTORY_S + 1)
+        self._second = [-1] * (HISTORY_S + 1)
+
+    def remember(self, force_kN: float, time_ns: int) -> None:
+        second = time_ns // SECOND_NS
+        entry = second % len(self._second)
+        if self._second[entry] != second:
+            self._second[entry], self._largest[entry], self._count[entry] = second, math.nan, 0
+        self._count[entry] += 1
+        if not math.isnan(force_kN):
+            self._largest[entry] = force_kN if math.isnan(self._largest[entry]) else max(self._largest[entry], force_kN)
+
+    def forces_kN(self, now_ns: int) -> list[float]:
+        """Largest usable force of each of the last HISTORY_S whole seconds, oldest first; NaN where there was none."""
+        now = now_ns // SECOND_NS
+        entries = [(second, second % len(self._second)) for second in range(now - HISTORY_S, now)]
+        return [self._largest[entry] if self._second[entry] == second else math.nan for second, entry in entries]
+
+    def rate_Hz(self, now_ns: int) -> float:
+        """Clamp forces received in the last whole second."""
+        second = now_ns // SECOND_NS - 1
+        entry = second % len(self._second)
+        return float(self._count[entry]) if self._second[entry] == second else 0.0
+
+    @property
+    def heard(self) -> bool:
+        return any(stream.received for stream in self.streams)
+
+    @property
+    def missing(self) -> int:
+        return sum(stream.missing for stream in self.streams)
+
+    @property
+    def damaged(self) -> int:
+        return sum(stream.damaged for stream in self.streams)
+
+    def silent_s(self, now_ns: int) -> float:
+        """Time since any good frame, s."""
+        return max(0.0, 1e-9 * (now_ns - max(stream.time_ns for stream in self.streams)))
+
+    def reasons(self) -> list[str]:
+        """Why the estimate is degraded, in words."""
+        status = self.streams[ESTIMATOR_STATUS]
+        bits = int(status.values[3]) if status.values else 0
+        return [text for bit, text in enumerate(REASONS) if bits >> bit & 1]
+
+    def state(self, now_ns: int) -> dict:
+        """Everything known, for scripts. None: not heard yet, or the sender says not to use it."""
+        force, heat, status, request = (
+            self.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS, ADAPT_REQUEST)
+        )
+
+        def value(stream: Stream, column: int, digits: int) -> float | None:
+            return round(stream.values[column], digits) if stream.values and stream.usable else None
+
+        return {
+            "status": STATUSES.get(force.status, "?"),
+            "clamp_force_kN": value(force, 0, 3),
+            "clamp_force_sigma_kN": value(force, 1, 3),
+            "source": SOURCES.get(int(force.values[3]), "?") if force.values else None,
+            "input_age_ms": int(force.values[4]) if force.values else None,
+            "mode": mode_name(status),
+            "reasons": self.reasons(),
+            "stiffness_factor": value(status, 1, 4),
+            "contact_angle_rad": value(status, 2, 1),
+            "inner_surface_C": value(heat, 0, 2),
+            "inner_mean_C": value(heat, 1, 2),
+            "outer_surface_C": value(heat, 2, 2),
+            "outer_mean_C": value(heat, 3, 2),
+            "adaptation": {
+                "request": REQUESTS[int(request.values[0])] if request.values else None,
+                "progress_percent": int(request.values[1]) if request.values else None,
+                "result": RESULTS.get(int(request.values[2]), "?") if request.values else None,
+            },
+            "forces_per_s": self.rate_Hz(now_ns),
+            "received": sum(stream.received for stream in self.streams),
+            "missing": self.missing,
+            "damaged": self.damaged,
+            "silent_s": round(self.silent_s(now_ns), 3),
+        }
+
+
+def mode_name(status: Stream) -> str | None:
+    """The mode in words, None before it was heard."""
+    if not status.values:
+        return None
+    mode = int(status.values[0])
+    return MODES[mode] if mode < len(MODES) else "?"
+
+
+class Listener:
+    """All corners' broadcasts. `hear` takes FRAME arrays as a bus gives them, times on the monotonic clock."""
+
+    def __init__(self):
+        layout = default_layout()[0]
+        self._cycles = layout["sent_cycle_ns"].tolist()
+        self._place = {int(layout["sent_id"][kind, row]): (kind, row) for kind in range(4) for row in range(len(CORNERS))}
+        self._signals = [layout["sent"][kind, : layout["sent_count"][kind]].tolist() for kind in range(4)]
+        # Loading compiled code takes long enough for a socket's buffer to overflow.
+        crc(0, np.uint64(0))
+        self.reset()
+
+    @property
+    def ids(self) -> list[int]:
+        return list(self._place)
+
+    @property
+    def heard(self) -> list[Corner]:
+        """The corners that somebody estimates."""
+        return [corner for corner in self.corners if corner.heard]
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.corners = [Corner(name, self._cycles) for name in CORNERS]
+
+    def hear(self, frames: np.ndarray) -> None:
+        for time_ns, data, can_id, length, flags in frames.tolist():
+            place = self._place.get(can_id)
+            if place is None or flags & (EXTENDED | REMOTE | ERROR | FD):
+                continue
+            kind, row = place
+            stream = self.corners[row].streams[kind]
+            counter = data >> 8 & 0xF
+            if length != 8 or counter >= COUNTER_MODULO or int(crc(can_id, np.uint64(data))) != data & 0xFF:
+                stream.damaged += 1
+                continue
+            values = [_physical(data, signal) for signal in self._signals[kind]]
+            fresh = stream.take(values, data >> 12 & 0xF, counter, time_ns)
+            if fresh and kind == CLAMP_FORCE:
+                self.corners[row].remember(values[0] if stream.usable else math.nan, time_ns)
+
+
+def _physical(data: int, signal: tuple) -> float:
+    """`wire.layout.unpack` without a call into compiled code, which would cost more than it computes."""
+    start, length, signed, factor, offset, *_ = signal
+    raw = data >> start & (1 << length) - 1
+    if signed and raw >> length - 1:
+        raw -= 1 << length
+    return raw * factor + offset

@@ -1,0 +1,90 @@
+"""The monitor's loop: bus in, screen out, keys."""
+
+import contextlib
+import select
+import sys
+import termios
+import time
+import tty
+
+from emb_daemon.errors import Unavailable
+from emb_daemon.monitor.listener import SECOND_NS, Listener
+
+_DRAIN_S, _DRAW_NS = 0.05, 250_000_000
+
+
+@contextlib.contextmanager
+def _keys():
+    """Keys as they are pressed, without Enter or echo: yields ``read(timeout_s)``, the key or an empty string."""
+    if not sys.stdin.isatty():
+
+        def sleep(timeout_s: float) -> str:
+            time.sleep(timeout_s)
+            return ""
+
+        yield sleep
+        return
+    handle = sys.stdin.fileno()
+    before = termios.tcgetattr(handle)
+
+    def read(timeout_s: float) -> str:
+        return sys.stdin.read(1) if select.select([handle], [], [], timeout_s)[0] else ""
+
+    tty.setcbreak(handle)
+    try:
+        yield read
+    finally:
+        termios.tcsetattr(handle, termios.TCSADRAIN, before)
+
+
+def _discard(bus) -> None:
+    """Frames that came while this program was still loading: the socket's buffer held some, and the gap after them is ours."""
+    bus.drain()
+
+
+def watch(bus, title: str) -> None:
+    """Show broadcasts on the terminal until the user quits."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from emb_daemon.monitor.view import render
+
+    listener, console = Listener(), Console()
+    drawn_ns, paused = 0, False
+    _discard(bus)
+    with _keys() as read, Live(console=console, screen=True, auto_refresh=False) as live:
+        while True:
+            key = read(_DRAIN_S)
+            if key in ("q", "Q", "\x04"):
+                return
+            if key in ("r", "R"):
+                listener.reset()
+            listener.hear(bus.drain())
+            now = time.monotonic_ns()
+            pressed = key == " "
+            paused ^= pressed
+            if pressed or (not paused and now - drawn_ns >= _DRAW_NS):
+                drawn_ns = now
+                width, height = console.size
+                live.update(render(listener, now, title, width, height, paused), refresh=True)
+
+
+def listen(bus, wait_s: float = 3.0, whole_seconds: int = 1) -> tuple[Listener, int]:
+    """Listen until ``whole_seconds`` of the clock's seconds were heard from beginning to end; returns listener and time.
+
+    Raises:
+        Unavailable: nothing is heard within ``wait_s``.
+    """
+    listener, start = Listener(), time.monotonic_ns()
+    heard_ns = 0
+    _discard(bus)
+    while True:
+        bus.wait(_DRAIN_S)
+        listener.hear(bus.drain())
+        now = time.monotonic_ns()
+        if not heard_ns and listener.heard:
+            heard_ns = now
+        if heard_ns and now // SECOND_NS > heard_ns // SECOND_NS + whole_seconds:
+            return listener, now
+        if not heard_ns and now - start > wait_s * SECOND_NS:
+            raise Unavailable(f"bus: no broadcast of a daemon (0x200 to 0x233) within {wait_s:g} s; is one running on it?")

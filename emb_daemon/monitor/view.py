@@ -1,0 +1,151 @@
+"""The view of a terminal: five lines to a corner, four corners in 80 x 24."""
+
+import math
+
+from rich.console import Group
+from rich.text import Text
+
+from emb_daemon.estimator.records import MODES, SOURCES
+from emb_daemon.monitor.listener import REQUESTS, RESULTS, STATUSES, Corner, Listener, mode_name
+from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP
+
+#: Without a frame for this long the values on the screen are history.
+_SILENT_S = 0.5
+_LINES_PER_CORNER = 5
+_BLOCKS = "▁▂▃▄▅▆▇█"
+_MODE_COLOURS = dict(zip(MODES, ("dim", "green", "cyan", "yellow", "bold red"), strict=True))
+_STATUS_COLOURS = {0: "green", 1: "yellow", 2: "bold red", 15: "dim"}
+_MISSING = "–"
+
+
+def sparkline(values: list[float], width: int, full: float) -> str:
+    """The largest of each of ``width`` equal parts of ``values``, from 0 to ``full``; a blank where there was none."""
+    text = ""
+    for cell in range(width):
+        part = values[cell * len(values) // width : max((cell + 1) * len(values) // width, cell * len(values) // width + 1)]
+        known = [value for value in part if not math.isnan(value)]
+        if not known:
+            text += " "
+        else:
+            text += _BLOCKS[min(int(max(known) / full * len(_BLOCKS)), len(_BLOCKS) - 1)] if full > 0.0 else _BLOCKS[0]
+    return text
+
+
+def _number(value: float | None, digits: int) -> str:
+    return _MISSING if value is None else f"{value:.{digits}f}"
+
+
+def _two_lines(texts: list[str], width: int) -> list[str]:
+    """Texts with commas between them on at most two lines; what finds no room is counted."""
+    lines, left = [""], list(texts)
+    while left:
+        more = f" … and {len(left)} more"
+        candidate = f"{lines[-1]}, {left[0]}" if lines[-1] else left[0]
+        reserve = len(more) if len(lines) == 2 and len(left) > 1 else 1
+        if len(candidate) + reserve <= width:
+            lines[-1] = candidate
+            left.pop(0)
+        elif len(lines) == 1:
+            lines[-1] += ","
+            lines.append("")
+        else:
+            lines[-1] += more
+            break
+    return [*lines, ""][:2]
+
+
+def _adaptation(corner: Corner) -> Text:
+    request = corner.streams[ADAPT_REQUEST]
+    if not request.values:
+        return Text("")
+    asked, progress, result = (int(value) for value in request.values[:3])
+    if REQUESTS[asked] == "run":
+        done = round(progress / 20)
+        return Text(f"adapting {'█' * done}{'·' * (5 - done)} {progress} %", style="cyan")
+    if RESULTS.get(result, "?") == "none":
+        return Text("")
+    return Text(f"adaptation {RESULTS.get(result, '?')}", style="green" if result == 1 else "yellow")
+
+
+def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
+    force, heat, status = (corner.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS))
+    state = corner.state(now_ns)
+    silent = corner.silent_s(now_ns)
+
+    first = Text(f"{corner.name} ", style="bold")
+    first.append(f"{_number(state['clamp_force_kN'], 2):>6} kN", style="bold")
+    first.append(f" ± {_number(state['clamp_force_sigma_kN'], 2):<5}")
+    source = SOURCES.get(int(force.values[3]), "?") if force.values else ""
+    first.append(f"{source:<10}")
+    mode = mode_name(status) or ""
+    first.append(f"{mode:<9}", style=_MODE_COLOURS.get(mode, ""))
+    history = corner.forces_kN(now_ns)
+    known = [value for value in history if not math.isnan(value)]
+    full = max(1.0, max(known, default=0.0))
+    cells = max(10, min(60, width - len(first) - 10))
+    first.append(" ▕")
+    first.append(sparkline(history, cells, full), style="cyan")
+    first.append(f"▏{full:.0f} kN", style="dim")
+
+    second = Text("   ")
+    for name, surface, mean in (("inner", "inner_surface_C", "inner_mean_C"), ("outer", "outer_surface_C", "outer_mean_C")):
+        second.append(f"{name} pad {_number(state[surface], 0):>3}/{_number(state[mean], 0):>3} °C  ")
+    factor, contact = _number(state["stiffness_factor"], 3), _number(state["contact_angle_rad"], 1)
+    second.append(f"stiffness {factor}  contact {contact} rad", style="dim" if not heat.usable else "")
+
+    third = Text("   ")
+    if silent > _SILENT_S:
+        third.append(f"SILENT for {silent:.0f} s; last values shown", style="bold red")
+    else:
+        third.append(STATUSES.get(force.status, "?"), style=_STATUS_COLOURS.get(force.status, "red"))
+        if state["input_age_ms"]:
+            third.append(f"  {state['input_age_ms']} ms old", style="yellow")
+    third.append(f"  {state['forces_per_s']:.0f}/s  ")
+    third.append(f"{corner.missing} missing", style="yellow" if corner.missing else "dim")
+    third.append("  ")
+    third.append(f"{corner.damaged} damaged", style="red" if corner.damaged else "dim")
+    third.append("  ")
+    third.append_text(_adaptation(corner))
+
+    reasons = [Text(f"   {line}", style="yellow") for line in _two_lines(state["reasons"], width - 4)]
+    return [first, second, third, *reasons]
+
+
+def render(listener: Listener, now_ns: int, title: str, width: int, height: int, paused: bool = False) -> Group:
+    """The whole screen, ``width`` x ``height`` characters."""
+    head = Text(f"emb-daemon monitor  {title}", style="bold", no_wrap=True, overflow="ellipsis")
+    lines = [head]
+    corners = listener.heard
+    if not corners:
+        lines += [
+            Text(""),
+            Text("nothing heard yet: no EMB_c_ClampForce, PadTemp, EstimatorStatus or AdaptRequest", style="yellow"),
+        ]
+    room = max(1, (height - 2) // _LINES_PER_CORNER)
+    for corner in corners[:room]:
+        lines += _corner(corner, now_ns, width)
+    if len(corners) > room:
+        lines[0].append(f"  (a taller window shows {', '.join(corner.name for corner in corners[room:])})", style="yellow")
+    lines = lines[: height - 1] + [Text("")] * (height - 1 - len(lines))
+    foot = Text("q quit  space pause  r reset counts and history", style="reverse")
+    if len(corners) and len(corners) < len(CORNERS):
+        foot.append(f"  only {', '.join(corner.name for corner in corners)} heard")
+    if paused:
+        foot.append("  PAUSED", style="bold yellow")
+    for line in lines:
+        line.truncate(width)
+    foot.truncate(width)
+    return Group(*lines, foot)
+
+
+def summary(listener: Listener, now_ns: int) -> list[str]:
+    """One line to a corner, for output that is no terminal."""
+    lines = []
+    for corner in listener.heard:
+        state = corner.state(now_ns)
+        force, sigma = _number(state["clamp_force_kN"], 3), _number(state["clamp_force_sigma_kN"], 3)
+        pads = f"pads {_number(state['inner_surface_C'], 0)} and {_number(state['outer_surface_C'], 0)} °C"
+        counts = f"{state['forces_per_s']:.0f}/s, {state['missing']} missing, {state['damaged']} damaged"
+        reasons = f"; {', '.join(state['reasons'])}" if state["reasons"] else ""
+        lines.append(f"{corner.name} {force} ± {sigma} kN {state['source']}, {state['mode']}, {pads}, {counts}{reasons}")
+    return lines

@@ -1,0 +1,181 @@
+"""The page of a replay: estimates, errors and events of a drive on one time axis."""
+
+import numpy as np
+
+from emb_daemon import __version__
+from emb_daemon.estimator.records import MODES, REASONS, SOURCES
+from emb_daemon.judging import PATHS
+from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
+from emb_daemon.report.page import Page
+
+#: Shortest stretch that is still seen on the whole time axis, as a share of it; closer stretches are drawn as one.
+_SEEN = 1.0 / 1000.0
+_CYCLE_S = 0.004
+_BINS = 120
+_LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
+_INNER, _OUTER, _DISC = Style("#c2662d", 1.4), Style("#1b7f4b", 1.4), Style(INK, 1.2, "dot")
+_INNER_MEAN, _OUTER_MEAN = Style("#e3a982", 1.2), Style("#86bfa0", 1.2)
+_STRETCH = Style(MODEL.colour, 7.0)
+_REASON = Style("#b3261e", 7.0)
+
+
+def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Begin and end of each stretch in which ``active`` holds; those too close or short to be seen are joined and widened."""
+    edges = np.diff(np.concatenate([[False], active, [False]]).astype(np.int8))
+    begin, end = time_s[np.flatnonzero(edges == 1)], time_s[np.flatnonzero(edges == -1) - 1]
+    if not len(begin):
+        return begin, end
+    least = max(_CYCLE_S, _SEEN * float(time_s[-1] - time_s[0]))
+    apart = np.concatenate([[True], begin[1:] - end[:-1] > least])
+    first = np.flatnonzero(apart)
+    last = np.concatenate([first[1:] - 1, [len(begin) - 1]])
+    begin, end = begin[first], end[last]
+    return begin, np.maximum(end, begin + least)
+
+
+def _row(name: str, time_s: np.ndarray, active: np.ndarray, height: float, style: Style) -> Trace:
+    begin, end = stretches(time_s, active)
+    x = np.column_stack([begin, end, end]).ravel()
+    y = np.column_stack([np.full(len(begin), height), np.full(len(begin), height), np.full(len(begin), np.nan)]).ravel()
+    return Trace("", x, y, style)
+
+
+def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]]:
+    """A row for each mode, source and reason that occurs; lowest row first."""
+    rows: list[tuple[str, np.ndarray, Style]] = []
+    for bit in reversed(range(len(REASONS))):
+        rows.append((REASONS[bit], (estimates["reasons"] >> bit & 1).astype(bool), _REASON))
+    for code, name in reversed(SOURCES.items()):
+        rows.append((f"source: {name}", estimates["source"] == code, Style(PALE.colour, 7.0)))
+    for code, name in reversed(list(enumerate(MODES))):
+        rows.append((f"mode: {name}", estimates["mode"] == code, _STRETCH))
+    rows = [row for row in rows if row[1].any()]
+    traces = [_row(name, time_s, active, float(height), style) for height, (name, active, style) in enumerate(rows)]
+    return Panel("Mode, source and reasons for doubt", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
+
+
+def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> list[Panel]:
+    force, sigma = 1e-3 * estimates["force"], 1e-3 * estimates["sigma"]
+    traces = [
+        Trace("", time_s, force - 2.0 * sigma, BAND),
+        Trace("± 2 sigma", time_s, force + 2.0 * sigma, BAND),
+        Trace("stiffness path", time_s, 1e-3 * estimates["stiffness_force"], Style("#7fa7d1", 1.0)),
+        Trace("torque path", time_s, 1e-3 * estimates["torque_force"], THESIS),
+        Trace("estimate", time_s, force, MODEL),
+    ]
+    panels = [Panel("Clamp force", "kN", traces, height=320)]
+    known = np.isfinite(force_N)
+    if known.any():
+        traces.append(Trace("reference", time_s[known], 1e-3 * force_N[known], REFERENCE))
+        at, error, doubt = time_s[known], (estimates["force"] - force_N)[known], estimates["sigma"][known]
+        panels.append(
+            Panel(
+                "Estimate minus reference, and two sigma about zero",
+                "N",
+                [Trace("", at, -2.0 * doubt, BAND), Trace("", at, 2.0 * doubt, BAND), Trace("", at, error, MODEL)],
+                height=200,
+            )
+        )
+    surface, mean = estimates["surface"], estimates["mean"]
+    panels += [
+        Panel(
+            "Temperatures", "°C",
+            [
+                Trace("inner surface", time_s, surface[:, 0], _INNER), Trace("inner mean", time_s, mean[:, 0], _INNER_MEAN),
+                Trace("outer surface", time_s, surface[:, 1], _OUTER), Trace("outer mean", time_s, mean[:, 1], _OUTER_MEAN),
+                Trace("disc", time_s, estimates["disc"], _DISC),
+            ],
+            height=220,
+        ),
+        Panel("Contact angle", "rad", [Trace("", time_s, estimates["contact_angle"])], height=150),
+        Panel("Stiffness factor", "", [Trace("", time_s, estimates["stiffness_factor"])], height=130),
+    ]  # fmt: skip
+    return panels
+
+
+def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Share of all samples in each bin, percent."""
+    counts, _ = np.histogram(error, edges)
+    return 100.0 * counts / max(len(error), 1)
+
+
+def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: list[dict]) -> None:
+    section = page.section("Errors", "Estimate minus reference. Conditions overlap; figures without a sample are left out.")
+    for log in figures:
+        rows = []
+        for path, label in _LABELS.items():
+            part = log["force_N"].get(path, {"samples": 0})
+            if part["samples"]:
+                rows.append([label, *_cells(part)])
+                if path == "fused":
+                    rows += [[f"– {name}", *_cells(some)] for name, some in part["conditions"].items() if some["samples"]]
+        if rows:
+            section.table(["", "RMSE / N", "bias / N", "95 % / N", "max / N", "samples"], rows, log["log"])
+        if log["temperature_K"]:
+            table = [[name.replace("_", " "), *_cells(part)] for name, part in log["temperature_K"].items() if part["samples"]]
+            section.table(["temperature", "RMSE / K", "bias / K", "95 % / K", "max / K", "samples"], table, log["log"])
+    known = np.isfinite(force_N)
+    errors = {label: (estimates[PATHS[path]] - force_N)[known] for path, label in _LABELS.items()}
+    errors = {label: error[np.isfinite(error)] for label, error in errors.items()}
+    reach = max(1.0, float(np.percentile(np.abs(errors["estimate"]), 99.5)) * 1.5)
+    edges = np.linspace(-reach, reach, _BINS + 1)
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    styles = {"estimate": MODEL, "stiffness path": Style("#7fa7d1", 1.2), "torque path": THESIS}
+    traces = [Trace(label, centre, _histogram(error, edges), styles[label]) for label, error in errors.items() if len(error)]
+    section.figure(
+        xy_figure([Panel("Distribution of the error", "% of samples", traces)], "error / N"),
+        "Beyond the axis: "
+        + ", ".join(
+            f"{100.0 * np.mean(np.abs(error) > reach):.1f} % of the {label}" for label, error in errors.items() if len(error)
+        )
+        + ".",
+    )
+
+
+def _cells(part: dict) -> list[str]:
+    return [*(f"{part[name]:.1f}" for name in ("rmse", "bias", "p95", "max")), f"{part['samples']}"]
+
+
+def replay_page(results: list, corner: str, calibration: str) -> Page:
+    """The page of one or more `replay.Result`, one after the other as the drive that they are.
+
+    Args:
+        calibration: which one it was, in words.
+    """
+    estimates = np.concatenate([result.estimates for result in results])
+    force_N = np.concatenate([result.force_N for result in results])
+    time_s = 1e-9 * (estimates["time_ns"] - estimates["time_ns"][0])
+    figures = [result.figures() for result in results]
+    page = Page(f"Replay, corner {corner}", f"{', '.join(result.path.name for result in results)} · emb-daemon {__version__}")
+    doubtful = float(np.mean(estimates["reasons"] != 0))
+    details = [
+        f"{len(estimates)} samples, {time_s[-1]:.1f} s; a reason for doubt in {100.0 * doubtful:.1f} % of them.",
+        f"Calibration: {calibration}.",
+    ]
+    known = np.isfinite(force_N)
+    if known.any():
+        error = (estimates["force"] - force_N)[known]
+        inside = 100.0 * float(np.mean(np.abs(error) <= 2.0 * estimates["sigma"][known]))
+        headline = (
+            f"Clamp force: RMSE {np.sqrt(np.mean(error**2)):.0f} N, 95 % within {np.percentile(np.abs(error), 95):.0f} N, "
+            f"largest {np.abs(error).max():.0f} N"
+        )
+        details.insert(0, f"{inside:.1f} % of the errors lie inside two sigma; 95.4 % would if they were normal.")
+    else:
+        headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; no reference in the log to judge it by"
+    page.verdict(None, headline, details)
+    panels = _panels(time_s, estimates, force_N)
+    events, labels = _events(time_s, estimates)
+    figure = time_figure([*panels, events])
+    figure.update_yaxes(
+        tickvals=list(range(len(labels))), ticktext=labels, range=[-0.6, len(labels) - 0.4], automargin=True,
+        row=len(panels) + 1, col=1,
+    )  # fmt: skip
+    # The legend takes two rows, above which the tool bar stands.
+    figure.update_layout(margin={"t": 108}, height=figure.layout.height + 40)
+    page.section("The drive", "Drag across any plot to zoom all of them, double-click to see everything again.").figure(
+        figure, "Curves are reduced for the screen; the smallest and largest value of every stretch are kept."
+    )
+    if known.any():
+        _errors(page, estimates, force_N, figures)
+    return page

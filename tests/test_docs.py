@@ -1,0 +1,80 @@
+"""The documentation is current, its links lead somewhere, and it builds."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from emb_daemon import __version__
+from emb_daemon.cli.main import COMMANDS
+
+_ROOT = Path(__file__).parent.parent
+_PAGES = [*sorted(_ROOT.glob("docs/*.md")), _ROOT / "README.md", _ROOT / "CHANGELOG.md"]
+_LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def _anchors(path: Path) -> set[str]:
+    """Anchors of a page's headings, as Markdown renderers make them."""
+    headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def _prose(path: Path) -> str:
+    return "\n".join(line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("    "))
+
+
+@pytest.mark.parametrize("script", ["generate.py", "completion.py"])
+def test_what_is_generated_is_current(script):
+    """Otherwise: python docs/generate.py; python docs/completion.py."""
+    command = [sys.executable, str(_ROOT / "docs" / script), "--check"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=_ROOT, env=_environment())
+    assert result.returncode == 0, result.stderr or f"docs/{script} has to be run again"
+
+
+def _environment():
+    import os
+
+    return os.environ | {"PYTHONPATH": str(_ROOT)}
+
+
+@pytest.mark.parametrize("page", _PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for link in _LINK.findall(_prose(page)):
+        if link.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        if anchor:
+            assert anchor in _anchors(target), f"{page.name}: {link}"
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (_ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in _ROOT.glob("docs/*.md"):
+        assert page.name in navigation
+
+
+def test_every_key_of_the_files_has_a_meaning():
+    for name in ("calibration.md", "configuration.md"):
+        rows = [line for line in (_ROOT / "docs" / name).read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+        assert len(rows) > 8 and all(row.split(" | ")[-1].strip(" |") for row in rows)
+
+
+def test_commands_in_the_documentation_exist():
+    named = {word for page in _PAGES for word in re.findall(r"\bemb-daemon ([a-z]+)\b", page.read_text(encoding="utf-8"))}
+    assert {"monitor", "replay", "diagnose"} <= named <= set(COMMANDS)
+
+
+def test_the_site_builds(tmp_path):
+    pytest.importorskip("mkdocs", reason="NOT RUN: the docs extra is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=_ROOT)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "site" / "calibration.html").is_file()
+
+
+def test_the_changelog_knows_this_version():
+    assert f"## {__version__}" in (_ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -1,0 +1,95 @@
+"""The Python interface gives the daemon's numbers, and the examples run as they are printed in the documentation."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import emb_daemon
+from emb_daemon.replay import Replay
+
+_EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def _run(name: str, *arguments) -> str:
+    command = [sys.executable, str(_EXAMPLES / name), *map(str, arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=_EXAMPLES.parent, env=_environment())
+    assert result.returncode == 0, result.stderr
+    assert "Warning" not in result.stderr
+    return result.stdout
+
+
+def _environment() -> dict[str, str]:
+    import os
+
+    return os.environ | {"PYTHONPATH": str(_EXAMPLES.parent), "MPLBACKEND": "agg"}
+
+
+def test_running_a_log_is_replaying_it(rig):
+    path = rig / "static" / "sine_5Hz.log.gz"
+    log = emb_daemon.load_log(path)
+    estimates = emb_daemon.run(log)
+    replayed = Replay(emb_daemon.shipped_calibration()).run(path)
+    for name in ("force", "sigma", "contact_angle", "mode", "source", "reasons"):
+        assert np.array_equal(estimates[name], replayed.estimates[name], equal_nan=True)
+    assert np.array_equal(log.force_N, replayed.force_N, equal_nan=True)
+
+
+def test_stepping_is_running(rig):
+    """The object for control loops, given a log's samples one by one, answers as the whole log does."""
+    log = emb_daemon.load_log(rig / "static" / "sine_5Hz.log.gz")
+    whole, estimator = emb_daemon.run(log), emb_daemon.Estimator()
+    for row, expected in zip(log.samples[:1500], whole, strict=False):
+        answer = estimator.step(
+            row["angle"],
+            row["speed"],
+            row["current_q"] if row["has_current"] else None,
+            dt_s=row["dt"],
+            backplates_C=(row["inner_backplate"], row["outer_backplate"]) if row["has_thermocouple"] else None,
+            caliper_C=row["caliper"],
+            ambient_C=row["ambient"] if row["has_status"] else 20.0,
+            wheel_speed_rad_per_s=row["wheel_speed"] if row["has_wheel_speed"] else None,
+            wheel_pulse=row["wheel_pulse"] if row["has_wheel_pulse"] else None,
+        )
+        assert answer.force_N == pytest.approx(expected["force"], abs=1e-6)
+        assert answer.sigma_N == pytest.approx(expected["sigma"], rel=1e-9)
+
+
+def test_a_missing_input_is_named():
+    answer = emb_daemon.Estimator().step(0.0, 0.0)
+    assert set(answer.reasons) >= {"current lost", "thermocouple lost"} and answer.sigma_N > 0.0
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    code = "import sys, emb_daemon; print('numba' in sys.modules, 'numpy' in sys.modules, emb_daemon.__version__)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=_environment())
+    assert result.stdout.split()[:2] == ["False", "False"]
+
+
+def test_what_the_package_offers_is_documented():
+    for name in emb_daemon.__all__:
+        assert getattr(emb_daemon, name).__doc__
+    with pytest.raises(AttributeError):
+        _ = emb_daemon.no_such_thing
+
+
+def test_example_replay_and_plot(rig, tmp_path):
+    picture = tmp_path / "picture.png"
+    assert "2500 estimates" in _run("replay_and_plot.py", rig / "static" / "sine_5Hz.log.gz", picture)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_example_control_loop_holds_the_force():
+    said = _run("control_loop.py")
+    estimated, true = (float(value) for value in re.search(r"estimated (\d+) N, the toy's own force (\d+) N", said).groups())
+    assert estimated == pytest.approx(8000.0, abs=20.0) and true == pytest.approx(8000.0, abs=100.0)
+
+
+def test_example_own_effect(rig):
+    """A pad that softens with heat is no caliper that grows: the example says what it found in numbers."""
+    said = _run("own_effect.py", rig / "undeclared" / "case0" / "fit.log.gz")
+    before, after = (float(value) for value in re.search(r"half ([\d.]+) N -> ([\d.]+) N", said).groups())
+    assert 0.0 < before < 2000.0 and 0.0 < after < 2.0 * before

@@ -1,0 +1,224 @@
+"""Logs in and out: every format back and forth on a rig log, other rigs' logs through a mapping file, a truck's MDF4 log."""
+
+import math
+
+import can
+import cantools
+import numpy as np
+import pytest
+
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.read import read_frames
+from emb_daemon.offline import load_log
+
+_THEIR_DBC = """VERSION ""
+BU_: RIG
+BO_ 2566844161 Actuator: 8 RIG
+ SG_ Position : 7|32@0- (0.01,0) [0|0] "deg" RIG
+ SG_ Speed : 39|32@0- (0.01,0) [0|0] "rpm" RIG
+
+BO_ 801 Inverter: 6 RIG
+ SG_ Iq : 0|16@1- (5,0) [0|0] "mA" RIG
+ SG_ Load : 16|32@1- (0.0001,0) [0|0] "kN" RIG
+
+BO_ 802 Climate: 8 RIG
+ SG_ Inner : 0|16@1+ (0.05,0) [0|0] "K" RIG
+ SG_ Outer : 16|16@1+ (0.05,0) [0|0] "K" RIG
+ SG_ Nameless : 32|16@1+ (1,0) [0|0] "" RIG
+"""
+
+_MAPPING = """
+format: 1
+dbc: their.dbc
+signals:
+  EMB_FL_Resolver.MotorAngle: {signal: Actuator.Position}
+  EMB_FL_Resolver.MotorSpeed: {signal: Actuator.Speed}
+  EMB_FL_Current.CurrentQ: {signal: Inverter.Iq, scale: -1.0}
+  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: Climate.Inner}
+  EMB_FL_Thermocouple.OuterBackplateTemp: {signal: Climate.Outer}
+  EMB_FL_Thermocouple.CaliperTemp: {signal: Climate.Inner, offset: -1.5}
+  RIG_FL_Force.ClampForceRef: {signal: Inverter.Load}
+"""
+
+
+@pytest.fixture(scope="module")
+def log(rig):
+    return rig / "static" / "sine_5Hz.log.gz"
+
+
+@pytest.fixture
+def foreign(log, tmp_path):
+    """The rig's log of another rig: extended id, big-endian, other units, a reversed current, dots in its name, no E2E."""
+    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
+    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    theirs = cantools.database.load_file(tmp_path / "their.dbc")
+    ours = load_log(log)
+    frames = []
+
+    def put(time_ns, name, **values):
+        message = theirs.get_message_by_name(name)
+        data = message.encode(values)
+        frames.append(can.Message(1e-9 * time_ns, message.frame_id, message.is_extended_frame, data=data, channel=1))
+
+    for sample, time_ns, force in zip(ours.samples, ours.time_ns, ours.force_N, strict=True):
+        put(time_ns, "Actuator", Position=math.degrees(sample["angle"]), Speed=sample["speed"] * 30.0 / math.pi)
+        put(time_ns, "Inverter", Iq=-1e3 * sample["current_q"], Load=0.0 if math.isnan(force) else 1e-3 * force)
+        if sample["has_thermocouple"]:
+            kelvin = sample["inner_backplate"] + 273.15
+            put(time_ns + 200_000, "Climate", Inner=kelvin, Outer=kelvin, Nameless=0)
+    path = tmp_path / "day.1.of.2.blf"
+    with can.BLFWriter(tmp_path / "x.blf") as writer:
+        for frame in frames:
+            writer(frame)
+    (tmp_path / "x.blf").rename(path)
+    return path
+
+
+def test_another_rigs_log_gives_the_same_samples(foreign, log, tmp_path):
+    ours = load_log(log)
+    theirs = load_log(foreign, read=Mapping(tmp_path / "mapping.yaml").read)
+    assert abs(len(theirs.samples) - len(ours.samples)) <= 1
+    count = min(len(theirs.samples), len(ours.samples))
+    assert np.abs(theirs.samples["angle"] - ours.samples["angle"])[:count].max() < 3e-4
+    assert np.abs(theirs.samples["speed"] - ours.samples["speed"])[:count].max() < 0.03
+    assert np.all(theirs.samples["dt"][1:] == 0.004)
+    assert np.abs(theirs.samples["current_q"] - ours.samples["current_q"])[:count].max() < 0.02
+    # A thermocouple is heard when its frame comes; between frames there is noise of some tenths of a kelvin.
+    warm = theirs.samples["inner_backplate"][100:count] - ours.samples["inner_backplate"][100:count]
+    assert np.abs(np.mean(warm)) < 0.1 and np.abs(warm).max() < 1.5
+    assert np.abs(theirs.samples["inner_backplate"] - theirs.samples["caliper"])[100:].max() == pytest.approx(1.5, abs=0.11)
+    assert np.nanmax(np.abs(theirs.force_N - ours.force_N)[:count]) <= 0.2
+
+
+def test_another_rigs_log_is_judged_like_ours(foreign, log, tmp_path, capsys):
+    import json
+
+    figures = []
+    for arguments in ([str(log)], [str(foreign), "--mapping", str(tmp_path / "mapping.yaml")]):
+        assert main(["replay", *arguments, "--json"]) == 0
+        figures.append(json.loads(capsys.readouterr().out)["logs"][0]["force_N"]["fused"]["rmse"])
+    assert figures[1] == pytest.approx(figures[0], rel=0.05)
+
+
+@pytest.mark.parametrize("period_ms", [1.0, 3.0, 10.0])
+def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
+    """A steady 20 rad/s ramp sampled at another rate is the same ramp at 250 Hz."""
+    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
+    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    message = cantools.database.load_file(tmp_path / "their.dbc").get_message_by_name("Actuator")
+    with can.BLFWriter(tmp_path / "ramp.blf") as writer:
+        for number in range(int(2000 / period_ms)):
+            time_s = 1e-3 * period_ms * number
+            data = message.encode({"Position": math.degrees(20.0 * time_s), "Speed": 20.0 * 30.0 / math.pi})
+            writer(can.Message(1_790_000_000 + time_s, message.frame_id, True, data=data, channel=1))
+    samples = load_log(tmp_path / "ramp.blf", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert 490 <= len(samples) <= 500 and np.all(samples["dt"][1:] == 0.004)
+    assert np.abs(np.diff(samples["angle"]) - 0.08).max() < 6e-4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("{signal: Actuator.Position}", "{signal: Inverter.Iq}", "mA, which cannot become rad"),
+        ("{signal: Actuator.Position}", "{signal: Climate.Nameless}", "no unit, which cannot become rad; state `unit:`"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Place}", "no such message and signal"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "unit 'furlong'"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Position, value: 3.0}", "either signal"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Position, factor: 3.0}", "unknown key"),
+        ("EMB_FL_Resolver.MotorAngle", "EMB_FL_ClampForce.ClampForce", "expected Message.Signal of what the daemon receives"),
+        ("EMB_FL_Resolver.MotorAngle", "EMB_FL_Resolver.Angle", "no such signal to map"),
+        ("  EMB_FL_Resolver.MotorSpeed: {signal: Actuator.Speed}\n", "", "MotorSpeed: missing"),
+        ("dbc: their.dbc", "dbc: none.dbc", "no such file"),
+    ],
+)
+def test_a_faulty_mapping_is_refused_with_its_key(tmp_path, old, new, expected):
+    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
+    assert old in _MAPPING
+    (tmp_path / "mapping.yaml").write_text(_MAPPING.replace(old, new))
+    with pytest.raises((InputError, InputErrors), match=None) as caught:
+        Mapping(tmp_path / "mapping.yaml")
+    assert expected in str(caught.value)
+
+
+def test_a_log_without_the_mapped_frames_is_named(log, tmp_path):
+    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
+    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    with pytest.raises(InputError, match="no frame of Actuator"):
+        Mapping(tmp_path / "mapping.yaml").read(log)
+
+
+def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path):
+    """402 s of a standing truck's J1939 bus (extended ids) as its logger wrote them. Nothing on it is a brake: a 16-bit signal
+    of 10 Hz, whatever it means, is taken for our motor angle to see it arrive."""
+    pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    path = shared / "measured" / "road_can" / "truck_mf4" / "truck_j1939_402s.MF4"
+    frames = read_frames(path)
+    assert len(frames) == 150_411 and 400e9 < frames["time_ns"][-1] - frames["time_ns"][0] < 404e9
+    (tmp_path / "truck.dbc").write_text(
+        'VERSION ""\nBU_: T\nBO_ 2566206452 Battery: 8 T\n SG_ Word : 32|16@1+ (0.01,-5) [0|0] "rad" T\n'
+    )
+    (tmp_path / "mapping.yaml").write_text(
+        "format: 1\ndbc: truck.dbc\nsignals:\n"
+        "  EMB_FL_Resolver.MotorAngle: {signal: Battery.Word}\n"
+        "  EMB_FL_Resolver.MotorSpeed: {value: 0.0}\n"
+    )
+    mine = frames[frames["can_id"] == 0x18F533F4]
+    words = (mine["data"] >> np.uint64(32) & np.uint64(0xFFFF)) * 0.01 - 5.0
+    assert len(mine) == 3992 and np.ptp(words) > 50.0
+    mapping = Mapping(tmp_path / "mapping.yaml")
+    samples = load_log(path, read=lambda _: mapping.translate(frames)).samples
+    expected = np.interp(samples["time_ns"], mine["time_ns"], words)
+    assert len(samples) > 95_000 and np.abs(samples["angle"] - expected).max() < 2e-3
+
+
+@pytest.mark.parametrize("ending", [".log", ".asc", ".blf", ".trc", ".mf4"])
+def test_sent_frames_survive_every_log_format(log, tmp_path, ending):
+    if ending == ".mf4":
+        pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    reference, path = tmp_path / "reference.log", tmp_path / f"6.5mm.new{ending}"
+    assert main(["replay", str(log), "--output", str(reference)]) == 0
+    assert main(["replay", str(log), "--output", str(path)]) == 0
+    expected, found = read_frames(reference), read_frames(path)
+    assert np.array_equal(found["can_id"], expected["can_id"]) and np.array_equal(found["data"], expected["data"])
+    shift = found["time_ns"] - expected["time_ns"]
+    assert shift.max() - shift.min() <= 1_100_000
+    assert sorted(tmp_path.iterdir()) == sorted([reference, path])
+
+
+def test_tables_agree_with_each_other(log, tmp_path):
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    paths = [tmp_path / name for name in ("a.b.csv", "a.b.parquet")]
+    for path in paths:
+        assert main(["replay", str(log), "--output", str(path)]) == 0
+    csv, parquet = pyarrow.csv.read_csv(paths[0]), pyarrow.parquet.read_table(paths[1])
+    assert csv.column_names == parquet.column_names and csv.num_rows == parquet.num_rows == len(load_log(log).samples)
+    for name in parquet.column_names:
+        a, b = csv[name].to_numpy(), parquet[name].to_numpy()
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+
+
+def test_a_measurement_has_units_comments_and_texts(log, tmp_path):
+    asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    import pyarrow.parquet
+
+    path, table = tmp_path / "run.1.signals.mf4", tmp_path / "run.parquet"
+    for output in (path, table):
+        assert main(["replay", str(log), "--output", str(output)]) == 0
+    columns = pyarrow.parquet.read_table(table)
+    with asammdf.MDF(path) as file:
+        assert len(file.groups) == 1
+        for name in set(columns.column_names) - {"time_s"}:
+            signal = file.get(name)
+            assert signal.comment, name
+            assert signal.unit == ("N" if name.endswith("_N") else "degC" if name.endswith("_C") else
+                                   "rad" if name.endswith("_rad") else ""), name  # fmt: skip
+            expected = columns[name].to_numpy()
+            if expected.dtype.kind == "f":
+                np.testing.assert_array_equal(signal.samples, expected)
+            else:
+                assert [text.decode() for text in signal.samples] == list(expected)
+            np.testing.assert_array_equal(signal.timestamps, columns["time_s"].to_numpy())

@@ -1,0 +1,158 @@
+"""The monitor knows a daemon by its broadcasts: what was sent is shown, what is missing is counted."""
+
+import json
+import math
+import threading
+import time
+
+import can
+import numpy as np
+import pytest
+import wirekit
+
+from emb_daemon.cli.main import main
+from emb_daemon.estimator.records import REASONS
+from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener
+from emb_daemon.monitor.view import render, sparkline, summary
+
+S = SECOND_NS
+
+
+def _force(cycle: int, force_kN: float = 5.0, status: int = 0, corner: str = "FL", counter: int | None = None):
+    return wirekit.frame(
+        f"EMB_{corner}_ClampForce", 100 * S + cycle * 4 * wirekit.MS, cycle % 15 if counter is None else counter, status,
+        ClampForce=force_kN, ClampForceSigma=0.12, InputCounter=3, ForceSource=1, InputAge=8,
+    )  # fmt: skip
+
+
+def _hear(*frames) -> Listener:
+    listener = Listener()
+    listener.hear(np.concatenate(frames))
+    return listener
+
+
+def _text(listener, now_ns=101 * S, width=80, height=24) -> list[str]:
+    from rich.console import Console
+
+    console = Console(width=width, height=height, color_system=None, force_terminal=True)
+    with console.capture() as capture:
+        console.print(render(listener, now_ns, "can0", width, height))
+    return capture.get().splitlines()
+
+
+def test_every_signal_reaches_the_state():
+    listener = _hear(
+        _force(0),
+        wirekit.frame("EMB_FL_PadTemp", 100 * S, InnerSurfaceTemp=301.25, InnerMeanTemp=-12.5, OuterSurfaceTemp=290.0,
+                      OuterMeanTemp=150.0),
+        wirekit.frame("EMB_FL_EstimatorStatus", 100 * S, Mode=3, StiffnessFactor=0.912, ContactAngle=-73.1,
+                      DegradedReasons=0b11),
+        wirekit.frame("EMB_FL_AdaptRequest", 100 * S, Request=1, Progress=43, Result=0),
+    )  # fmt: skip
+    state = listener.corners[0].state(100 * S)
+    assert (state["clamp_force_kN"], state["clamp_force_sigma_kN"], state["source"]) == (5.0, 0.12, "stiffness")
+    assert (state["inner_surface_C"], state["inner_mean_C"], state["outer_mean_C"]) == (301.25, -12.5, 150.0)
+    assert (state["mode"], state["stiffness_factor"], state["contact_angle_rad"]) == ("degraded", 0.912, -73.1)
+    assert state["reasons"] == list(REASONS[:2])
+    assert state["adaptation"] == {"request": "run", "progress_percent": 43, "result": "none"}
+    shown = "\n".join(_text(listener, now_ns=100 * S + S // 10))
+    for text in (
+        "5.00 kN",
+        "± 0.12",
+        "stiffness",
+        "degraded",
+        "301/-12 °C",
+        "resolver lost, current lost",
+        "43 %",
+        "8 ms old",
+    ):
+        assert text in shown
+
+
+@pytest.mark.parametrize("status", [2, 15])
+def test_a_value_that_is_not_to_be_used_is_not_shown(status):
+    listener = _hear(_force(0, 7.77, status))
+    assert listener.corners[0].state(100 * S)["clamp_force_kN"] is None
+    assert "7.77" not in "\n".join(_text(listener))
+    assert all(math.isnan(value) for value in listener.corners[0].forces_kN(102 * S))
+
+
+@pytest.mark.parametrize("lost", [1, 7, 14, 15, 20, 100])
+def test_lost_frames_are_counted_across_turns_of_the_counter(lost):
+    corner = _hear(*[_force(c) for c in range(20)], *[_force(c) for c in range(20 + lost, 40 + lost)]).corners[0]
+    assert (corner.missing, corner.damaged) == (lost, 0)
+
+
+def test_a_damaged_or_repeated_frame_changes_nothing():
+    bad = _force(1, 9.0)
+    bad["data"] ^= np.uint64(1 << 20)
+    corner = _hear(_force(0), bad, _force(0, 9.0, counter=0)).corners[0]
+    assert (corner.state(100 * S)["clamp_force_kN"], corner.damaged, corner.missing) == (5.0, 2, 0)
+
+
+def test_the_last_minute_keeps_its_peaks():
+    """4 kN all the time but for one cycle of 18 kN 30 s ago."""
+    listener = Listener()
+    for second in range(70):
+        for cycle in range(3):
+            listener.hear(
+                _force(250 * second + cycle, 18.0 if (second, cycle) == (39, 1) else 4.0, counter=(3 * second + cycle) % 15)
+            )
+    history = listener.corners[0].forces_kN(170 * S)
+    assert len(history) == HISTORY_S and max(history) == 18.0 and history.count(18.0) == 1 and min(history) == 4.0
+    line = sparkline(history, 20, 18.0)
+    assert len(line) == 20 and line.count("█") == 1
+
+
+def test_silence_is_said():
+    shown = "\n".join(_text(_hear(_force(0)), now_ns=107 * S))
+    assert "SILENT for 7 s" in shown
+
+
+@pytest.mark.parametrize("size", [(80, 24), (60, 12), (200, 60)])
+def test_four_corners_at_their_worst_fit_the_screen(size):
+    frames = []
+    for corner in ("FL", "FR", "RL", "RR"):
+        frames += [_force(0, 65.535, corner=corner)]
+        frames += [
+            wirekit.frame(f"EMB_{corner}_EstimatorStatus", 100 * S, Mode=3, ContactAngle=-3276.8, DegradedReasons=0xFFFF)
+        ]
+    lines = _text(_hear(*frames), width=size[0], height=size[1])
+    assert len(lines) <= size[1] and max(map(len, lines)) <= size[0]
+    assert "q quit" in lines[-1] and "space pause" in lines[-1] and "r reset" in lines[-1]
+    if size[1] >= 24:
+        assert all(any(line.startswith(corner) for line in lines) for corner in ("FL", "FR", "RL", "RR"))
+
+
+def test_a_script_gets_json_from_a_bus(capsys):
+    stop = threading.Event()
+
+    def send():
+        with can.Bus(interface="virtual", channel="monitor") as bus:
+            cycle = 0
+            while not stop.is_set():
+                data = int(_force(cycle)[0]["data"]).to_bytes(8, "little")
+                bus.send(can.Message(arbitration_id=0x200, data=data, is_extended_id=False))
+                cycle += 1
+                time.sleep(0.004)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        assert main(["monitor", "-i", "virtual", "-c", "monitor", "--once", "--json"]) == 0
+    finally:
+        stop.set()
+        sender.join()
+    corners = json.loads(capsys.readouterr().out)["corners"]
+    assert list(corners) == ["FL"] and corners["FL"]["clamp_force_kN"] == 5.0 and corners["FL"]["forces_per_s"] > 0
+
+
+def test_nobody_there_is_said_and_the_status_is_1(capsys):
+    assert main(["monitor", "-i", "virtual", "-c", "nobody", "--once"]) == 1
+    error = capsys.readouterr().err
+    assert "no broadcast of a daemon" in error and error.count("\n") == 1
+
+
+def test_a_summary_names_the_reasons():
+    status = wirekit.frame("EMB_FL_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8)
+    assert summary(_hear(_force(0), status), 101 * S)[0].endswith("; signal stuck")

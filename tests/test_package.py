@@ -1,0 +1,54 @@
+"""The wheel and the sdist hold what an installation needs, under the one version."""
+
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from emb_daemon import __version__
+
+_ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Paths of the wheel and the sdist, built in this process: no network, nothing installed."""
+    pytest.importorskip("hatchling", reason="NOT RUN: hatchling is not installed")
+    import os
+
+    from hatchling.build import build_sdist, build_wheel
+
+    folder = tmp_path_factory.mktemp("dist")
+    before = Path.cwd()
+    os.chdir(_ROOT)
+    try:
+        return folder / build_wheel(str(folder)), folder / build_sdist(str(folder))
+    finally:
+        os.chdir(before)
+
+
+def test_the_wheel_is_complete(built):
+    with zipfile.ZipFile(built[0]) as wheel:
+        names = set(wheel.namelist())
+        for name in ("dbc/emb.dbc", "dbc/rig.dbc", "config/emb.yaml", "config/calibration.yaml", "systemd/emb-daemon.service",
+                     "completion/emb-daemon.bash"):  # fmt: skip
+            assert wheel.read(f"emb_daemon/_resources/{name}") == (_ROOT / name).read_bytes()
+        assert "emb_daemon/py.typed" in names
+        sources = {str(path.relative_to(_ROOT)) for path in (_ROOT / "emb_daemon").rglob("*.py")}
+        assert sources <= names
+        assert not any(name.startswith(("tests", "docs", "examples")) for name in names)
+        metadata = wheel.read(f"emb_daemon-{__version__}.dist-info/METADATA").decode()
+        assert f"\nVersion: {__version__}\n" in metadata
+        assert (
+            "emb-daemon = emb_daemon.cli.main:main"
+            in wheel.read(f"emb_daemon-{__version__}.dist-info/entry_points.txt").decode()
+        )
+
+
+def test_the_sdist_can_be_tested_and_documented(built):
+    with tarfile.open(built[1]) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+    for name in ("pyproject.toml", "tests/conftest.py", "docs/index.md", "mkdocs.yml", "examples/control_loop.py",
+                 "CHANGELOG.md", "LICENSE", "Makefile", "systemd/emb-daemon.service", "dbc/emb.dbc"):  # fmt: skip
+        assert name in names
