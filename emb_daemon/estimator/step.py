@@ -418,7 +418,7 @@ def step(s, p, m, out):
         _start(s, p, m)
     moved_zero = _follow_zero(s, p, m)
     if 0.0 < m.dt <= _ONE_CYCLE_S and not moved_zero:
-        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]))
+        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
     _heat(s, p, m)
     force_before = s.force
     stiffness_path(s, p, m, s.factor)

@@ -45,6 +45,8 @@ AGREE, TORQUE_WRONG, TORQUE_FROZEN, STIFFNESS_WRONG, UNDECIDED = range(5)
 #: of twelve standard deviations raise it within five samples, of six within forty, of four never. No log of the simulated
 #: rig, with effects that its calibration does not know, brings the sum above a third of the alarm.
 _TOLERATED, _COUNTED, _RAISE, _CLEAR = 20.0, 144.0, 600.0, 150.0
+#: Times as much before the contact angle is confirmed.
+_UNCONFIRMED = 5.0
 #: Samples that repeat to the bit although torque should change them, or although the speed is not zero.
 _REPEATED, _NEVER_REPEATED = 8, 50
 #: Time constant over which angle and integrated speed are compared (s), and their difference that is a fault (rad) beyond what
@@ -61,7 +63,7 @@ _AVERAGED_S = 0.04
 
 
 @njit
-def watch(c, m, angle_before, speed_before, past_contact, contact_sigma):
+def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
     """Judge one sample that came within a cycle of the last, before it is fused; ``c.doubt`` is that of the samples before.
 
     Args:
@@ -69,6 +71,7 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma):
         m: SAMPLE record.
         angle_before, speed_before: rad and rad/s of the last sample.
         past_contact, contact_sigma: rad past the believed contact angle, and its standard deviation.
+        confirmed: whether the contact angle has been seen to be right. Until then `models.contact` has the first word.
 
     Returns:
         The verdict, also kept in ``c.verdict``.
@@ -93,7 +96,8 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma):
             c.doubt = c.unlike = c.frozen_s = 0.0
             c.verdict = AGREE
         return c.verdict
-    disagree = c.doubt > (_RAISE if was == AGREE else _CLEAR)
+    patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
+    disagree = c.doubt > (patience * _RAISE if was == AGREE else _CLEAR)
     repeated = c.still >= _NEVER_REPEATED and m.speed != 0.0
     if repeated or abs(c.unlike) > _UNLIKE_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
         c.verdict = STIFFNESS_WRONG
@@ -113,8 +117,8 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma):
 
 @njit
 def frozen(c):
-    """Whether a sensor repeats itself, so that the paths' difference tells nothing of the contact angle."""
-    return c.verdict == STIFFNESS_WRONG or c.still >= _REPEATED or c.idle >= _REPEATED
+    """Whether one sensor repeats itself while the other goes on: then their difference tells nothing of the contact angle."""
+    return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
 
 
 @njit
@@ -129,7 +133,7 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 def count_doubt(c, ratio):
     """Add one contradiction, in standard deviations, to the doubt; NaN says nothing."""
     if np.isfinite(ratio):
-        c.doubt = min(max(c.doubt + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 2.0 * _RAISE)
+        c.doubt = min(max(c.doubt + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 1.5 * _UNCONFIRMED * _RAISE)
 
 
 @njit
