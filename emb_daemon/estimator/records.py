@@ -5,6 +5,7 @@ import numpy as np
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
+from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
 
 #: What the estimate rests on (wire: ForceSource).
@@ -165,6 +166,7 @@ STATE = np.dtype(
         ("balance", "f8"),
         ("leverage", "f8"),
         ("contact", CONTACT),
+        ("plausibility", PLAUSIBILITY),
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),

@@ -17,9 +17,11 @@ from emb_daemon.estimator.records import (
     INVALID,
     OUT_OF_RANGE,
     OUTSIDE_RANGE,
+    PATHS_DISAGREE,
     PREDICTED,
     RUNNING,
     STIFFNESS_ONLY,
+    STUCK,
     TEMPERATURE_UNCERTAIN,
     TORQUE_ONLY,
 )
@@ -36,6 +38,17 @@ from emb_daemon.models.contact import (
     watch_closing,
 )
 from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
+from emb_daemon.models.plausibility import (
+    AGREE,
+    STIFFNESS_WRONG,
+    TORQUE_FROZEN,
+    UNDECIDED,
+    beyond_friction,
+    count_doubt,
+    force_of_torque_alone,
+    frozen,
+    watch,
+)
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.thermal import (
     NODES,
@@ -104,7 +117,8 @@ def _follow_zero(s, p, m):
     What the motor may have turned meanwhile is unknown, so the contact angle becomes uncertain by as much.
     """
     jump = m.angle - s.angle
-    reach = p.maximum_speed * m.dt
+    # While the resolver was stuck the motor turned on.
+    reach = p.maximum_speed * (m.dt + s.plausibility.frozen_s)
     if abs(jump) <= _SPEED_MARGIN * reach + _ANGLE_MARGIN:
         return False
     s.angle += jump
@@ -347,9 +361,13 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         for i in range(STATES):
             innovation -= h[i] * x[i]
         out.innovation = innovation / leverage
-        out.innovation_sigma = sqrt(update_errors(x, P, s.gain, innovation, h, white)) / leverage
-        s.torque_age = 0.0
-    else:
+        if s.plausibility.verdict == AGREE:
+            variance = update_errors(x, P, s.gain, innovation, h, white)
+            s.torque_age = 0.0
+        else:
+            variance = white + variance_along(P, h)
+        out.innovation_sigma = sqrt(variance) / leverage
+    if not np.isfinite(torque) or s.plausibility.verdict != AGREE:
         s.torque_age += m.dt
     # What was learned of the contact angle moves the contact angle itself: the curve is not straight.
     s.contact_angle += x[1]
@@ -365,6 +383,32 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 
 
 @njit
+def _take_sides(s, p, m, out):
+    """Where the paths contradict each other, go on with the one that can be right; returns the reasons."""
+    c = s.plausibility
+    motor_torque = p.torque_constant * m.current_q
+    force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, p.load_friction, p.offset_friction)
+    if np.isfinite(out.innovation):
+        torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt
+        doubt = p.gear_gain * sqrt(out.stiffness_sigma * out.stiffness_sigma + out.torque_sigma * out.torque_sigma)
+        beyond = beyond_friction(torque, s.force, doubt, p.gear_gain, p.load_friction, p.offset_friction)
+        count_doubt(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    if s.contact.lost:
+        # The contact angle was found wrong and explains what came before.
+        c.doubt = 0.0
+    if c.verdict == AGREE:
+        return 0
+    out.source = STIFFNESS_ONLY
+    if c.verdict == STIFFNESS_WRONG:
+        out.source = TORQUE_ONLY if m.has_current else INVALID
+        out.force, out.sigma = force, sigma
+        return PATHS_DISAGREE | STUCK
+    if c.verdict == UNDECIDED and np.isfinite(out.innovation):
+        out.sigma = sqrt(out.sigma * out.sigma + out.innovation * out.innovation)
+    return PATHS_DISAGREE | STUCK if c.verdict == TORQUE_FROZEN else PATHS_DISAGREE
+
+
+@njit
 def step(s, p, m, out):
     """Advance one corner by one resolver sample.
 
@@ -377,13 +421,16 @@ def step(s, p, m, out):
     if not s.started:
         _start(s, p, m)
     moved_zero = _follow_zero(s, p, m)
+    if 0.0 < m.dt <= _ONE_CYCLE_S and not moved_zero:
+        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
     _heat(s, p, m)
     force_before = s.force
     stiffness_path(s, p, m, s.factor)
     torque, leverage, friction_variance = torque_path(s, p, m)
     if moved_zero:
         torque = np.nan
-    _watch_contact(s, p, m, force_before, torque, leverage)
+    if not frozen(s.plausibility):
+        _watch_contact(s, p, m, force_before, torque, leverage)
     _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
@@ -393,20 +440,22 @@ def step(s, p, m, out):
         force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
+    out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
+    reasons = _take_sides(s, p, m, out)
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
     s.fused, s.fused_sigma = out.force, out.sigma
     out.contact_angle = s.contact_angle
     out.stiffness_factor = s.factor
     _temperatures(s, out)
     out.mode = RUNNING
-    out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
-    reasons = OUT_OF_RANGE if moved_zero else 0
+    if moved_zero:
+        reasons |= OUT_OF_RANGE
     if not s.temperature_known or s.temperature_doubt > _DOUBTED_K:
         reasons |= TEMPERATURE_UNCERTAIN
     out.engaged = s.contact.engaged
     if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD:
         reasons |= CONTACT_UNCERTAIN
-        if out.stiffness_sigma > out.torque_sigma and s.torque_age < 0.05:
+        if out.stiffness_sigma > out.torque_sigma and out.source == FUSED:
             out.source = TORQUE_ONLY
     if out.force > p.maximum_force or abs(m.speed) > _SPEED_MARGIN * p.maximum_speed:
         reasons |= OUTSIDE_RANGE

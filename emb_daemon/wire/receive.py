@@ -13,12 +13,17 @@ VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", 
 
 #: Counter steps tolerated after a gap: this many, plus those that the time passed accounts for.
 _TOLERATED_LOSS = 2
+#: Share of a cycle by which the schedule that a sender is believed to keep moves on with each of its frames: it finds the
+#: earliest phase of arrival again after the sender was held up, and follows clocks that run apart.
+_CREEP = 0.005
+#: Cycles behind its schedule from which a sender has a new one.
+_NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
 
 #: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame; ``sequence_ns`` and ``sequence`` of the last
-#: frame that stood in sequence; ``candidate`` the counter of the last frame that did not, or -1; ``refused_ns`` when a
-#: frame was last refused for its form or sequence; ``range_ns`` when one was last refused for a value out of range;
-#: ``count[verdict]``.
+#: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``candidate`` the counter of the last frame
+#: that did not stand in sequence, or -1, and ``candidate_ns`` when it came; ``refused_ns`` when a frame was last refused for
+#: its form or sequence; ``range_ns`` when one was last refused for a value out of range; ``count[verdict]``.
 RECEPTION = np.dtype(
     [
         ("values", "f8", (SIGNALS,)),
@@ -26,7 +31,9 @@ RECEPTION = np.dtype(
         ("counter", "i8"),
         ("sequence_ns", "i8"),
         ("sequence", "i8"),
+        ("due_ns", "i8"),
         ("candidate", "i8"),
+        ("candidate_ns", "i8"),
         ("refused_ns", "i8"),
         ("range_ns", "i8"),
         ("count", "i8", (len(VERDICTS),)),
@@ -38,7 +45,7 @@ RECEPTION = np.dtype(
 def new_reception() -> np.ndarray:
     """Receivers of all slots, shape (SLOTS,), that have heard nothing."""
     reception = np.zeros(SLOTS, RECEPTION)
-    for field in ("time_ns", "sequence_ns", "refused_ns", "range_ns"):
+    for field in ("time_ns", "sequence_ns", "due_ns", "candidate_ns", "refused_ns", "range_ns"):
         reception[field] = _NEVER
     reception["counter"] = reception["sequence"] = reception["candidate"] = -1
     reception["values"] = np.nan
@@ -47,21 +54,44 @@ def new_reception() -> np.ndarray:
 
 @njit
 def _in_sequence(counter, time_ns, reception, cycle_ns):
-    """Whether a counter follows the last one. Time passed explains lost frames; a counter that stands still or runs ahead
-    of the clock is a repetition or a stranger, unless two such frames in a row follow each other: then the sender has
-    started anew. After a whole turn of silence the counter may stand where it stood."""
+    """Whether a counter follows the last one, and no sooner than its sender can have sent it.
+
+    Time passed explains lost frames; a counter that stands still or runs ahead of the clock is a repetition or a stranger.
+    So is one that comes half a cycle before its time: a bus holds frames up, and they may then come in a burst, but none
+    comes early. Two frames that follow each other after half a cycle or more, with none in sequence between them, are a
+    sender that has started anew. After a whole turn of silence the counter may stand where it stood.
+    """
+    if reception.sequence < 0:
+        return _start_schedule(counter, time_ns, reception, cycle_ns)
     step = (counter - reception.sequence) % COUNTER_MODULO
     if step == 0 and reception.candidate < 0:
         step = COUNTER_MODULO
     elapsed = (time_ns - reception.sequence_ns) // cycle_ns
-    restarted = reception.candidate >= 0 and 1 <= (counter - reception.candidate) % COUNTER_MODULO <= _TOLERATED_LOSS
-    if reception.sequence < 0 or 1 <= step <= _TOLERATED_LOSS + elapsed or restarted:
+    due = reception.due_ns + step * cycle_ns
+    if 1 <= step <= _TOLERATED_LOSS + elapsed and time_ns >= due - cycle_ns // 2:
+        if time_ns - due > _NEW_SCHEDULE * cycle_ns:
+            return _start_schedule(counter, time_ns, reception, cycle_ns)
         reception.sequence = counter
         reception.sequence_ns = time_ns
+        reception.due_ns = min(due + np.int64(_CREEP * cycle_ns), time_ns)
         reception.candidate = -1
         return True
+    follows = 1 <= (counter - reception.candidate) % COUNTER_MODULO <= _TOLERATED_LOSS
+    if reception.candidate >= 0 and follows and time_ns - reception.candidate_ns >= cycle_ns // 2:
+        return _start_schedule(counter, time_ns, reception, cycle_ns)
     reception.candidate = counter
+    reception.candidate_ns = time_ns
     return False
+
+
+@njit
+def _start_schedule(counter, time_ns, reception, cycle_ns):
+    """Believe a sender of whose schedule one frame tells nothing but that it is not late; always True."""
+    reception.sequence = counter
+    reception.sequence_ns = time_ns
+    reception.due_ns = time_ns - cycle_ns // 2
+    reception.candidate = -1
+    return True
 
 
 @njit

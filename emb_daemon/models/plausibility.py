@@ -1,0 +1,153 @@
+"""Plausibility between the force paths: whether they contradict each other, and which of them is wrong.
+
+The filter's normalised innovation says by how many of its own standard deviations the torque is off what stiffness and
+everything learned let expect. Its squares, less what model errors may make of them, are summed one-sidedly (Page, "Continuous
+inspection schemes", Biometrika 41, 1954): a few samples far off or many less far off raise the alarm, and as many good ones
+end it. Which path is wrong is decided by what only one of them uses:
+
+    resolver   angle and speed repeat to the bit although torque or speed must turn the motor, or the angle does not follow the
+               speed
+    current    repeats to the bit, or asks for force while the pads do not touch
+
+Otherwise it stays open; then stiffness goes on, and its standard deviation covers the difference.
+"""
+
+from math import exp, sqrt
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+#: ``doubt``: summed squares. ``unlike`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
+#: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
+#: ``torque_variance``: motor torque (N m), smoothed.
+PLAUSIBILITY = np.dtype(
+    [
+        ("doubt", "f8"),
+        ("verdict", "i8"),
+        ("unlike", "f8"),
+        ("still", "i8"),
+        ("idle", "i8"),
+        ("alike", "i8"),
+        ("current", "f8"),
+        ("frozen_s", "f8"),
+        ("torque_mean", "f8"),
+        ("torque_variance", "f8"),
+    ],
+    align=True,
+)
+
+#: What `watch` finds: both paths agree, or the one that is wrong, or that it is one of them.
+AGREE, TORQUE_WRONG, TORQUE_FROZEN, STIFFNESS_WRONG, UNDECIDED = range(5)
+
+#: Squared normalised innovation that model errors make, at most counted, and sums that raise and end the alarm. Innovations
+#: of twelve standard deviations raise it within five samples, of six within forty, of four never. No log of the simulated
+#: rig, with effects that its calibration does not know, brings the sum above a third of the alarm.
+_TOLERATED, _COUNTED, _RAISE, _CLEAR = 20.0, 144.0, 600.0, 150.0
+#: Times as much before the contact angle is confirmed.
+_UNCONFIRMED = 5.0
+#: Samples that repeat to the bit although torque should change them, or although the speed is not zero.
+_REPEATED, _NEVER_REPEATED = 8, 50
+#: Time constant over which angle and integrated speed are compared (s), and their difference that is a fault (rad) beyond what
+#: a signal delay of 10 ms makes. A resolver is believed again after this many samples in each of which the angle moved
+#: and went where the speed says within this angle (rad).
+_COMPARED_S, _UNLIKE_RAD, _DELAY_S = 0.1, 0.6, 0.01
+_RETURNED, _ALIKE_RAD = 25, 0.05
+#: Share by which friction at rest may exceed what sliding takes.
+_STICTION = 0.3
+#: Standard deviations of the contact angle by which the motor is clear of it when the pads do not touch.
+_CLEAR_OF_CONTACT = 6.0
+#: Time over which torque is averaged when it must do without the resolver, s.
+_AVERAGED_S = 0.04
+
+
+@njit
+def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
+    """Judge one sample that came within a cycle of the last, before it is fused; ``c.doubt`` is that of the samples before.
+
+    Args:
+        c: PLAUSIBILITY record.
+        m: SAMPLE record.
+        angle_before, speed_before: rad and rad/s of the last sample.
+        past_contact, contact_sigma: rad past the believed contact angle, and its standard deviation.
+        confirmed: whether the contact angle has been seen to be right. Until then `models.contact` has the first word.
+
+    Returns:
+        The verdict, also kept in ``c.verdict``.
+    """
+    travel = m.angle - angle_before
+    step = travel - 0.5 * (m.speed + speed_before) * m.dt
+    delay = _DELAY_S * abs(m.speed)
+    c.unlike = c.unlike * exp(-m.dt / _COMPARED_S) + step
+    if abs(step) > _ALIKE_RAD + delay:
+        c.alike = 0
+    elif travel != 0.0:
+        c.alike += 1
+    c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
+    if m.has_current:
+        c.idle = c.idle + 1 if m.current_q == c.current else 0
+        c.current = m.current_q
+    was = c.verdict
+    if was == STIFFNESS_WRONG:
+        c.frozen_s += m.dt
+        if c.alike >= _RETURNED:
+            # What was summed against the resolver is not held against the current.
+            c.doubt = c.unlike = c.frozen_s = 0.0
+            c.verdict = AGREE
+        return c.verdict
+    patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
+    disagree = c.doubt > (patience * _RAISE if was == AGREE else _CLEAR)
+    repeated = c.still >= _NEVER_REPEATED and m.speed != 0.0
+    if repeated or abs(c.unlike) > _UNLIKE_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
+        c.verdict = STIFFNESS_WRONG
+        c.frozen_s = c.still * m.dt
+        c.alike = 0
+        return c.verdict
+    if not disagree:
+        c.verdict = AGREE
+    elif c.idle >= _REPEATED and c.still < _REPEATED:
+        c.verdict = TORQUE_FROZEN
+    elif was in (TORQUE_WRONG, TORQUE_FROZEN) or past_contact < -_CLEAR_OF_CONTACT * contact_sigma:
+        c.verdict = TORQUE_WRONG
+    else:
+        c.verdict = UNDECIDED
+    return c.verdict
+
+
+@njit
+def frozen(c):
+    """Whether one sensor repeats itself while the other goes on: then their difference tells nothing of the contact angle."""
+    return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
+
+
+@njit
+def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_friction):
+    """Torque (N m) that neither the clamp force ``force`` (N) nor friction at rest can carry, in units of its standard
+    deviation ``sigma``: where it is not zero, the motor turns."""
+    band = (1.0 + _STICTION) * (offset_friction + load_friction * force)
+    return max(abs(torque - gear_gain * force) - band, 0.0) / sigma
+
+
+@njit
+def count_doubt(c, ratio):
+    """Add one contradiction, in standard deviations, to the doubt; NaN says nothing."""
+    if np.isfinite(ratio):
+        c.doubt = min(max(c.doubt + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 1.5 * _UNCONFIRMED * _RAISE)
+
+
+@njit
+def force_of_torque_alone(c, torque, has_current, dt, gear_gain, load_friction, offset_friction):
+    """Clamp force (N) and its standard deviation from motor torque without a resolver.
+
+    Which way friction acts and what accelerates the motor is unknown: friction counts in full, and inertia as the torque's
+    own variation over `_AVERAGED_S`, which is kept up to date here and so must be called with every sample.
+    """
+    if has_current:
+        share = 1.0 - exp(-dt / _AVERAGED_S)
+        off = torque - c.torque_mean
+        c.torque_mean += share * off
+        c.torque_variance = (1.0 - share) * (c.torque_variance + share * off * off)
+    force = max(c.torque_mean / gear_gain, 0.0)
+    friction = offset_friction + load_friction * force
+    return force, sqrt(friction * friction + c.torque_variance) / gear_gain

@@ -1,0 +1,138 @@
+"""Frames that somebody else sends: no sample is lost, nothing foreign is believed, the forces stay the same to the bit."""
+
+import itertools
+
+import numpy as np
+import pytest
+import wirekit
+from test_pipeline import _run, _sliding, car  # noqa: F401
+from wirekit import MS
+
+from emb_daemon.estimator import records as r
+from emb_daemon.logs.read import read_frames
+from emb_daemon.pipeline import CYCLE_NS
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
+
+_CYCLES = 400
+
+
+def _good(cycles=_CYCLES):
+    return np.concatenate(_sliding(cycles))
+
+
+def _merged(*parts):
+    frames = np.concatenate(parts)
+    return frames[np.argsort(frames["time_ns"], kind="stable")]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(car):  # noqa: F811
+    return _run(car, _merged(_good()))[0]
+
+
+def _undisturbed_by(car, strangers, undisturbed, detected=r.E2E_ERROR):  # noqa: F811
+    """Run with ``strangers`` among the frames; every sample's numbers must be the same to the bit. Returns the estimates."""
+    estimates, _ = _run(car, _merged(_good(), *strangers))
+    assert np.all(estimates["is_sample"]) and len(estimates) == len(undisturbed)
+    for name in ("cycle", "counter", "force", "sigma", "stiffness_force", "torque_force", "contact_angle", "disc", "mean"):
+        assert estimates[name].tobytes() == undisturbed[name].tobytes(), name
+    assert bool(np.any(estimates["reasons"] & detected)) == bool(detected), "noticed"
+    return estimates
+
+
+def _spoof(cycle, delay_ns, counter, **signals):
+    """A resolver frame with the right protection and a lie in it."""
+    return wirekit.frame("EMB_FL_Resolver", cycle * CYCLE_NS + delay_ns, counter % 15, MotorAngle=99.0, **signals)
+
+
+#: The schedule of a sender is known after a hundred of its frames.
+_KNOWN = range(120, 380)
+
+
+@pytest.mark.parametrize("delay_ms", [0.3, 1.0, 1.9])
+@pytest.mark.parametrize("ahead", [1, 2])
+def test_spoofed_frames_with_the_next_counter_come_too_early(car, undisturbed, ahead, delay_ms):  # noqa: F811
+    """Valid CRC, the counter that is expected next: refused, and the genuine frame after it is taken."""
+    strangers = [_spoof(cycle, round(delay_ms * MS), cycle + ahead) for cycle in _KNOWN]
+    _undisturbed_by(car, strangers, undisturbed)
+
+
+@pytest.mark.parametrize("jump", range(3, 15))
+def test_counter_jumps(car, undisturbed, jump):  # noqa: F811
+    _undisturbed_by(car, [_spoof(cycle, 3 * MS, cycle + jump) for cycle in _KNOWN], undisturbed)
+
+
+@pytest.mark.parametrize("delay_ms", [0.2, 2.0, 3.7])
+def test_second_sender_of_an_input(car, undisturbed, delay_ms):  # noqa: F811
+    """Somebody who sends the same message in the same cycle with a counter of his own is never believed while the first is
+    there, and is reported."""
+    estimates = _undisturbed_by(car, [_spoof(c, round(delay_ms * MS), c + 7) for c in range(20, 380)], undisturbed)
+    assert estimates["reasons"][30] & r.E2E_ERROR
+
+
+def test_replayed_stretch(car, undisturbed):  # noqa: F811
+    """Half a second of all fast messages, recorded and sent again a second later between the genuine ones."""
+    frames = _merged(_good())
+    fast = frames[np.isin(frames["can_id"], [0x100, 0x110])]
+    old = fast[(fast["time_ns"] >= 100 * CYCLE_NS) & (fast["time_ns"] < 220 * CYCLE_NS)].copy()
+    for shift in (7, 11):
+        again = old.copy()
+        again["time_ns"] += (120 + shift) * CYCLE_NS + MS // 2
+        _undisturbed_by(car, [again], undisturbed)
+
+
+def test_flood_of_ten_thousand_frames_a_second(car, undisturbed):  # noqa: F811
+    """Random payloads on our ids, right protection with every counter, and highest-priority nonsense."""
+    rng = np.random.default_rng(3)
+    times = np.arange(120 * CYCLE_NS, 380 * CYCLE_NS, 100_000)
+    noise = np.zeros(len(times), FRAME)
+    noise["time_ns"], noise["length"] = times + 50_000, 8
+    noise["can_id"] = rng.choice([0x0, 0x100, 0x110, 0x120, 0x180, 0x181, 0x182, 0x7FF], len(times))
+    noise["data"] = rng.integers(0, 2**64, len(times), dtype=np.uint64)
+    _undisturbed_by(car, [noise], undisturbed)
+
+
+def test_flood_with_valid_protection(car, undisturbed):  # noqa: F811
+    """Every counter in turn, four within each cycle's first half: none comes when it may."""
+    counters = itertools.count()
+    strangers = [_spoof(c, delay, next(counters)) for c in _KNOWN for delay in (300_000, 700_000, 1_100_000, 1_500_000)]
+    _undisturbed_by(car, strangers, undisturbed)
+
+
+def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811
+    strangers = [wirekit.frame("EMB_FL_ClampForce", cycle * CYCLE_NS + MS, cycle % 15) for cycle in _KNOWN]
+    _undisturbed_by(car, strangers, undisturbed, r.SECOND_SENDER)
+
+
+def test_a_sender_that_was_held_up_may_catch_up(car, undisturbed):  # noqa: F811
+    """A bus that was busy for 60 ms delivers in a burst what waited: late is not early, all are taken."""
+    receptions, frames = new_reception(), _merged(_good())
+    from emb_daemon.wire.layout import default_layout
+
+    frames = frames[frames["can_id"] == 0x100]
+    held = (frames["time_ns"] >= 200 * CYCLE_NS) & (frames["time_ns"] < 215 * CYCLE_NS)
+    frames["time_ns"][held] = 215 * CYCLE_NS - MS
+    verdicts = [receive(frame, receptions, default_layout()[0])[1] for frame in frames]
+    assert np.all(np.array(verdicts) == ACCEPTED)
+
+
+def test_in_the_traffic_of_a_real_car(car, undisturbed, shared):  # noqa: F811
+    """A minute's excerpt of a road car's bus, some of whose ids are ours, at its full rate around our frames: those on ids
+    that we send are a second sender; none on ids that we receive passes the check."""
+    road = read_frames(shared / "measured" / "road_can" / "rav4" / "rav4_60s.log.gz")
+    road = road[(road["flags"] == 0)].copy()
+    road["time_ns"] += -road["time_ns"][0] + 10 * MS
+    span = road[road["time_ns"] < (_CYCLES - 5) * CYCLE_NS]
+    assert len(span) > 2000
+    _undisturbed_by(car, [span], undisturbed, r.SECOND_SENDER)
+
+
+def test_road_traffic_moved_onto_our_ids(car, undisturbed, shared):  # noqa: F811
+    """Real payloads under the ids of our inputs."""
+    road = read_frames(shared / "measured" / "road_can" / "rav4" / "rav4_60s.log.gz")
+    road = road[(road["flags"] == 0) & (road["length"] == 8)].copy()
+    road["time_ns"] += -road["time_ns"][0] + 10 * MS
+    span = road[road["time_ns"] < (_CYCLES - 5) * CYCLE_NS].copy()
+    span["can_id"] = np.array([0x100, 0x110, 0x120, 0x180, 0x181, 0x182])[np.arange(len(span)) % 6]
+    _undisturbed_by(car, [span], undisturbed)

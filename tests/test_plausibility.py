@@ -1,0 +1,161 @@
+"""Sensors that lie: which path is named, how soon, what sigma says meanwhile, and that good brakes raise no alarm.
+
+The brake is the simulated one, not the estimator's own model.
+"""
+
+import functools
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator import records as r
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import city_drive, simulate_log
+from emb_daemon.resources import resource
+
+#: Rows of the simulated city drive: standing released, clamping, holding 7 kN, holding until it is released at 2150.
+_RELEASED, _CLAMPING, _HOLDING, _BEFORE_RELEASE = 400, 1300, 1500, 2000
+_LASTING = 500
+
+
+@functools.cache
+def _drive(seed=0):
+    """Samples of fifteen seconds of a simulated unit, and the true clamp force."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), 15.0, seed=seed)
+    log = log_of(frames)
+    return log.samples, log.force_N
+
+
+def _with(begin, change):
+    """Estimates and true force of the drive whose samples from ``begin`` for two seconds went through ``change``."""
+    samples, force = _drive()
+    samples = samples.copy()
+    change(samples[begin : begin + _LASTING])
+    return estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml")))), force
+
+
+def _freeze(*names):
+    def change(rows):
+        for name in names:
+            rows[name] = rows[name][0]
+
+    return change
+
+
+def _current(offset_A):
+    def change(rows):
+        rows["current_q"] += offset_A
+
+    return change
+
+
+def _no_current(rows):
+    rows["current_q"] = 0.0
+
+
+def _alarm(estimates):
+    return np.flatnonzero(estimates["reasons"] & r.PATHS_DISAGREE)
+
+
+def _honest(estimates, force, rows, sigmas=4.0):
+    error = np.abs(estimates["force"] - force)[rows]
+    return np.all(error < sigmas * estimates["sigma"][rows])
+
+
+def _recovered(estimates, force):
+    """Everything fused again, nothing raised, the force right in the end."""
+    last = slice(-100, None)
+    return (
+        np.all(estimates["source"][last] == r.FUSED)
+        and not estimates["reasons"][last].any()
+        and _honest(estimates, force, last)
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_alarm_on_a_good_brake(seed):
+    """Units that scatter about their calibration."""
+    samples, _ = _drive(seed)
+    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    assert not len(_alarm(estimates)) and not np.any(estimates["reasons"] & r.STUCK)
+
+
+@pytest.mark.parametrize(("begin", "within"), [(_CLAMPING, 100), (_HOLDING, 100), (_BEFORE_RELEASE, 250)])
+def test_dead_current_is_named_and_stiffness_goes_on(begin, within):
+    """No current while the brake is clamped, or once it moves: Stuck, StiffnessOnly, and the force is as good as ever."""
+    estimates, force = _with(begin, _no_current)
+    alarm = _alarm(estimates)
+    assert begin < alarm[0] < begin + within
+    dead = alarm[alarm < begin + _LASTING]
+    assert np.all(estimates["source"][alarm] == r.STIFFNESS_ONLY) and np.all(estimates["reasons"][dead] & r.STUCK)
+    assert np.all(estimates["mode"][alarm] == r.DEGRADED)
+    assert _honest(estimates, force, slice(begin, None)) and _recovered(estimates, force)
+    assert np.sqrt(np.mean((estimates["force"] - force)[alarm] ** 2)) < 100.0
+
+
+@pytest.mark.parametrize("offset_A", [-4.0, 4.0])
+@pytest.mark.parametrize("begin", [_HOLDING, _BEFORE_RELEASE])
+def test_current_with_an_offset_is_detected(begin, offset_A):
+    """4 A too much or too little, 5 kN of the torque path: StiffnessOnly, the force stays honest."""
+    estimates, force = _with(begin, _current(offset_A))
+    alarm = _alarm(estimates)
+    assert begin < alarm[0] < begin + 250
+    assert np.all(estimates["source"][alarm] == r.STIFFNESS_ONLY) and not np.any(estimates["reasons"] & r.STUCK)
+    assert _honest(estimates, force, slice(begin, None)) and _recovered(estimates, force)
+
+
+def test_offset_is_the_torque_paths_fault_once_the_pads_are_clear():
+    """Then the difference no longer counts as doubt of the stiffness."""
+    estimates, _ = _with(_BEFORE_RELEASE, _current(4.0))
+    alarm = _alarm(estimates)
+    clear = alarm[(estimates["contact_angle"][alarm] - _drive()[0]["angle"][alarm]) > 1.0]
+    assert len(clear) > 100 and np.all(estimates["sigma"][clear] < 100.0)
+
+
+@pytest.mark.parametrize("names", [("angle", "speed"), ("angle",)])
+@pytest.mark.parametrize("begin", [_CLAMPING, _BEFORE_RELEASE])
+def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
+    """Frozen while the motor turns: TorqueOnly within 60 ms of motion, with the sigma of torque that knows no direction."""
+    samples, force = _drive()
+    estimates, _ = _with(begin, _freeze(*names))
+    turned = np.abs(samples["angle"] - samples["angle"][begin]) > 0.6
+    moved = begin + np.argmax(turned[begin:])
+    alarm = _alarm(estimates)
+    assert begin < alarm[0] < moved + 15
+    during = slice(alarm[0], begin + _LASTING)
+    assert np.all(estimates["source"][during] == r.TORQUE_ONLY) and np.all(estimates["reasons"][during] & r.STUCK)
+    assert _honest(estimates, force, during) and np.median(estimates["sigma"][during]) > 500.0
+    assert _recovered(estimates, force)
+
+
+def test_resolver_that_stands_still_with_noise_is_no_fault():
+    """A motor at rest may read the same angle for ever, as long as its speed reads zero."""
+    samples, _ = _drive()
+    rows = np.repeat(samples[_RELEASED : _RELEASED + 1], 600)
+    rows["dt"], rows["speed"] = 0.004, 0.0
+    rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
+    estimates = estimate(rows, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    assert not np.any(estimates["reasons"] & (r.STUCK | r.PATHS_DISAGREE))
+
+
+def test_resolver_that_repeats_a_speed_is_stuck():
+    """Also while no torque tells."""
+    estimates, force = _with(_RELEASED, _freeze("angle", "speed"))
+    stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
+    assert _RELEASED + 40 < stuck[0] < _RELEASED + 60 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
+    assert _honest(estimates, force, slice(_RELEASED, None)) and _recovered(estimates, force)
+
+
+def test_stuck_resolver_and_no_current_leaves_nothing():
+    def both(rows):
+        _freeze("angle", "speed")(rows)
+        rows["has_current"] = False
+
+    estimates, force = _with(_CLAMPING, both)
+    dead = slice(_CLAMPING + 60, _CLAMPING + _LASTING)
+    assert np.all(estimates["source"][dead] == r.INVALID) and np.all(estimates["mode"][dead] == r.FAULT)
+    assert _recovered(estimates, force)
