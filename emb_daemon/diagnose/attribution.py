@@ -7,7 +7,7 @@ accepted if it passes all of
    shapes tried; false discovery rate over the whole catalogue at most 1 % (Benjamini and Hochberg),
 2. a gain on episodes left out of the fit that matters: a tenth of the residual and two thousandths of the force,
 3. values inside the physical bounds,
-4. placebos: a disturbed wheel phase, foreign orders, a shifted temperature must do much worse,
+4. placebos: a disturbed wheel phase, foreign orders, another episode's temperature must do much worse,
 5. comparison with what no model at all can say: if a smooth function of a single signal explains much more, the candidate
    is a shadow of something else.
 
@@ -402,10 +402,12 @@ class Search:
             shifted = angle + random.uniform(0.0, 2.0 * np.pi, self.bench.episodes)[episode]
             trials.append([lever * part(order * shifted) for order in (1, 2) for part in (np.cos, np.sin)])
         else:
+            # Temperatures mostly rise through a log, so a shifted one is much the same: each episode gets another's.
             signal = self.signals["disc_temperature" if effect.placebo == "disc" else "energy"]
-            signal = signal - signal[0]
-            trials += [[lever * np.roll(signal, round(share * len(signal)))] for share in (0.25, 0.5, 0.75)]
-            trials.append([lever * signal[::-1]])
+            count = np.maximum(np.bincount(episode, minlength=self.bench.episodes), 1)
+            mean = np.bincount(episode, signal - signal[0], minlength=self.bench.episodes) / count
+            random = np.random.default_rng(0)
+            trials += [[lever * random.permutation(mean)[episode]] for _ in range(5)]
         return max(self.verdict(channel, own).gain for own in trials)
 
     # -- the search ---------------------------------------------------------------------------------------------------
@@ -516,7 +518,8 @@ class Search:
             dropped: list[Knob] = []
             for group in groups:
                 tested = [own.index(knob) for knob in group]
-                rest = [i for i in range(len(own)) if i not in tested]
+                # Its own shape would explain away what the amplitude does: it stands as fitted.
+                rest = [i for i, k in enumerate(own) if i not in tested and (k not in knobs or k in amplitudes)]
                 verdict = judge(moments, rest, tested, self.penalty(own, channel))
                 if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
                     dropped += group
