@@ -44,6 +44,8 @@ _OF_PLACEBO = 0.5
 _INFLATION = 5.0
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
 _CONFOUNDED = 0.8
+#: ... and are as good as each other from here.
+_EQUAL = 0.97
 _GAUSS_NEWTON = 4
 _FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
 
@@ -484,14 +486,14 @@ class Search:
                 history[other[0].effect.name] = other[0]
             else:
                 rivals.append(other)
-        equal = sorted([best, *rivals], key=lambda t: REGISTRY.index(t[0].effect))
-        winner = equal[0]
-        for loser in equal[1:]:
+        equal = [best] + [rival for rival in rivals if rival[1][3].gain >= _EQUAL * best[1][3].gain]
+        winner = min(equal, key=lambda t: REGISTRY.index(t[0].effect))
+        for loser in [t for t in [best, *rivals] if t is not winner]:
             for one, other in ((winner, loser), (loser, winner)):
                 one[0].confounded_with = other[0].effect.name
                 one[0].manoeuvre = other[0].effect.manoeuvre if one is winner else one[0].effect.manoeuvre
             loser[0].reason = (
-                f"confounded with {winner[0].effect.name} on these logs, which is simpler; to separate them: "
+                f"confounded with {winner[0].effect.name} on these logs, which is simpler or explains more; to separate them: "
                 f"{loser[0].effect.manoeuvre}"
             )
             history[loser[0].effect.name] = loser[0]
