@@ -7,7 +7,7 @@ accepted if it passes all of
    shapes tried; false discovery rate over the whole catalogue at most 1 % (Benjamini and Hochberg),
 2. a gain on episodes left out of the fit that matters: a tenth of the residual and two thousandths of the force,
 3. values inside the physical bounds,
-4. placebos: a disturbed wheel phase, foreign orders, a shifted temperature must do much worse,
+4. placebos: a disturbed wheel phase, foreign orders, another episode's temperature must do much worse,
 5. comparison with what no model at all can say: if a smooth function of a single signal explains much more, the candidate
    is a shadow of something else.
 
@@ -44,6 +44,8 @@ _OF_PLACEBO = 0.5
 _INFLATION = 5.0
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
 _CONFOUNDED = 0.8
+#: ... and are as good as each other from here.
+_EQUAL = 0.97
 _GAUSS_NEWTON = 4
 _FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
 
@@ -402,10 +404,12 @@ class Search:
             shifted = angle + random.uniform(0.0, 2.0 * np.pi, self.bench.episodes)[episode]
             trials.append([lever * part(order * shifted) for order in (1, 2) for part in (np.cos, np.sin)])
         else:
+            # Temperatures mostly rise through a log, so a shifted one is much the same: each episode gets another's.
             signal = self.signals["disc_temperature" if effect.placebo == "disc" else "energy"]
-            signal = signal - signal[0]
-            trials += [[lever * np.roll(signal, round(share * len(signal)))] for share in (0.25, 0.5, 0.75)]
-            trials.append([lever * signal[::-1]])
+            count = np.maximum(np.bincount(episode, minlength=self.bench.episodes), 1)
+            mean = np.bincount(episode, signal - signal[0], minlength=self.bench.episodes) / count
+            random = np.random.default_rng(0)
+            trials += [[lever * random.permutation(mean)[episode]] for _ in range(5)]
         return max(self.verdict(channel, own).gain for own in trials)
 
     # -- the search ---------------------------------------------------------------------------------------------------
@@ -482,14 +486,14 @@ class Search:
                 history[other[0].effect.name] = other[0]
             else:
                 rivals.append(other)
-        equal = sorted([best, *rivals], key=lambda t: REGISTRY.index(t[0].effect))
-        winner = equal[0]
-        for loser in equal[1:]:
+        equal = [best] + [rival for rival in rivals if rival[1][3].gain >= _EQUAL * best[1][3].gain]
+        winner = min(equal, key=lambda t: REGISTRY.index(t[0].effect))
+        for loser in [t for t in [best, *rivals] if t is not winner]:
             for one, other in ((winner, loser), (loser, winner)):
                 one[0].confounded_with = other[0].effect.name
                 one[0].manoeuvre = other[0].effect.manoeuvre if one is winner else one[0].effect.manoeuvre
             loser[0].reason = (
-                f"confounded with {winner[0].effect.name} on these logs, which is simpler; to separate them: "
+                f"confounded with {winner[0].effect.name} on these logs, which is simpler or explains more; to separate them: "
                 f"{loser[0].effect.manoeuvre}"
             )
             history[loser[0].effect.name] = loser[0]
@@ -516,7 +520,8 @@ class Search:
             dropped: list[Knob] = []
             for group in groups:
                 tested = [own.index(knob) for knob in group]
-                rest = [i for i in range(len(own)) if i not in tested]
+                # Its own shape would explain away what the amplitude does: it stands as fitted.
+                rest = [i for i, k in enumerate(own) if i not in tested and (k not in knobs or k in amplitudes)]
                 verdict = judge(moments, rest, tested, self.penalty(own, channel))
                 if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
                     dropped += group

@@ -110,7 +110,8 @@ def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
         elif "order_3" in parameter.name or "order_4" in parameter.name:
             values[parameter.name] = 0.0
         else:
-            sign = 1.0 if parameter.low >= 0.0 else rng.choice([-1.0, 1.0])
+            # Only the future would make a delay negative.
+            sign = 1.0 if parameter.low >= 0.0 or name == "signal_delay" else rng.choice([-1.0, 1.0])
             values[parameter.name] = float(parameter.prior * sign * rng.uniform(0.5, 1.5))
     return values
 

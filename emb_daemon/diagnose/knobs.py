@@ -89,6 +89,13 @@ def _friction(kind: str) -> Callable[[np.void, float], None]:
     return apply
 
 
+def _softening(key: str, column: str, value: float) -> Knob:
+    """Pads soften with heat, never stiffen; what was calibrated holds within a third."""
+    prior = max(0.3 * abs(value), 1e-4)
+    change = _shift("thermal", column)
+    return Knob(f"thermal.softening.{key}", "stiffness", 1e-5, prior, "1/K", change, low=-max(value, 0.0), high=2e-3)
+
+
 def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     """Knobs of the base calibration; the contact angle has one for each log, because each power-on finds its own."""
     knobs = [
@@ -102,8 +109,8 @@ def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     thermal = parameters["thermal"]
     knobs += [
         Knob("stiffness.relaxation_time_s", "stiffness", 0.02, 0.5, "1", _scale("relaxation_time")),
-        Knob("thermal.softening.per_K", "stiffness", 1e-5, 3e-4, "1/K", _shift("thermal", "softening")),
-        Knob("thermal.softening.history_per_K", "stiffness", 1e-5, 5e-4, "1/K", _shift("thermal", "softening_history")),
+        _softening("per_K", "softening", float(thermal["softening"])),
+        _softening("history_per_K", "softening_history", float(thermal["softening_history"])),
         Knob("motor.torque_constant_Nm_per_A", "torque", 1e-3, 0.03, "1", _scale("torque_constant"), low=-0.5),
         Knob("motor.inertia_kg_m2", "torque", 0.01, 0.5, "1", _scale("inertia"), low=-0.9),
         Knob("friction.load_m_per_rad", "torque", 0.01, 0.5, "1", _scale("load_friction"), low=-0.99),

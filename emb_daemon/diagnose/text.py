@@ -3,6 +3,11 @@
 from emb_daemon.diagnose.attribution import Finding
 from emb_daemon.diagnose.diagnosis import Diagnosis, amplitudes
 
+#: Units at the end of parameters' keys, longest first.
+_UNIT_ENDINGS = (
+    "_um_per_MJ", "_um_per_K", "_Nms_per_rad", "_rad_per_s", "_per_turn", "_per_K", "_rad", "_um", "_Nm", "_m2", "_A", "_C",
+    "_s",
+)  # fmt: skip
 _NAMES = {"stiffness": "stiffness path", "torque": "torque path", "fused": "fused", "maximum_likelihood": "maximum likelihood"}
 
 
@@ -18,13 +23,13 @@ def title(finding: Finding) -> str:
 def size(finding: Finding) -> str:
     """The parameters that say how large an effect is, with units."""
     found = amplitudes(finding)
-    parts = [f"{name.replace('_', ' ')} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
+    parts = [f"{_spoken(name)} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
     for parameter in finding.effect.parameters:
         name = parameter.name
         if "cosine" in name or "sine" in name or name not in finding.values:
             continue
         value = number(finding.values[name], finding.sigmas.get(name, 0.0))
-        parts.append(f"{_spoken(name, parameter.unit)} {value} {_unit(parameter.unit)}")
+        parts.append(f"{_spoken(name)} {value} {_unit(parameter.unit)}")
     return ", ".join(part.strip() for part in parts)
 
 
@@ -32,21 +37,9 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _spoken(name: str, unit: str) -> str:
+def _spoken(name: str) -> str:
     """A parameter's key without the unit at its end."""
-    for ending in (
-        "_um_per_MJ",
-        "_um_per_K",
-        "_Nms_per_rad",
-        "_rad_per_s",
-        "_per_K",
-        "_per_turn",
-        "_rad",
-        "_um",
-        "_Nm",
-        "_A",
-        "_s",
-    ):
+    for ending in _UNIT_ENDINGS:
         if name.endswith(ending):
             return name.removesuffix(ending).replace("_", " ")
     return name.replace("_", " ")

@@ -287,6 +287,10 @@ def torque_path(s, p, m):
 def _watch_contact(s, p, m, force_before, torque, leverage):
     """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
     c, x, doubt = s.contact, s.past_contact, sqrt(s.covariance[1, 1])
+    if p.clearance_sigma == 0.0:
+        # Held as exactly known, as diagnose does; no calibration file can say so.
+        engaged(c, x, 0.0)
+        return
     sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / _CYCLE_S)
     limit = threshold(current_share, p.current_correlation_time, _CYCLE_S)
     predicted = leverage * 0.5 * (force_before + s.force)
