@@ -27,7 +27,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra mf4 --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra mf4 --extra docs --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 
 clean:
