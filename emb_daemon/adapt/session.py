@@ -183,7 +183,8 @@ def observe(a, s, p, limits, scratch, rows, m, estimate):
     estimate.adapt_progress = 100 if a.result == r.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
         estimate.adapt_progress = _progress(a, limits)
-        if estimate.mode == e.RUNNING:
+        # Reasons say what is degraded meanwhile, and Status with them.
+        if estimate.mode == e.RUNNING or estimate.mode == e.DEGRADED:
             estimate.mode = e.ADAPTING
     estimate.adapt_result = a.result if a.phase == r.IDLE else r.NO_RESULT
 
