@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test lint format lock clean fuzz soak
+.PHONY: demo test lint format lock clean fuzz soak mutation
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -30,6 +30,11 @@ fuzz: $(READY)
 SOAK_SECONDS ?= 1800
 soak: $(READY)
 	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
+
+# Mutants of E2E check, reception, plausibility and fusion; each costs a compilation.
+MUTANTS ?= 24
+mutation: $(READY)
+	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .
