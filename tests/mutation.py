@@ -1,7 +1,7 @@
 """Mutation testing: does a test fail when one operator, comparison or constant of a kernel is changed?
 
-Run as ``python tests/mutation.py [COUNT] [SEED]``. COUNT mutants (24) are drawn from the E2E check, reception, the plausibility
-of the paths and the fusion; each is built into a copy of the package, on which the tests that hold these run until the first
+Run as ``python tests/mutation.py [COUNT] [SEED]``. COUNT mutants (24) are drawn from E2E check, reception, plausibility and
+fusion; each is built into a copy of the package, on which the tests that hold these run until the first
 fails. Survivors are printed with their line.
 """
 
