@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test lint format lock clean
+.PHONY: demo test lint format lock clean fuzz soak mutation
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -16,6 +16,25 @@ $(READY): requirements.lock pyproject.toml
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
+
+# Needs the extra fuzz. Findings are left in tests/fuzz/findings and become tests.
+FUZZ_SECONDS ?= 60
+fuzz: $(READY)
+	mkdir -p tests/fuzz/findings
+	for target in frames yaml candump; do \
+		$(VENV)/bin/python tests/fuzz/fuzz.py $$target -max_total_time=$(FUZZ_SECONDS) -max_len=4096 \
+			-artifact_prefix=tests/fuzz/findings/$$target- || exit; \
+	done
+
+# Half an hour of four corners; fails if the daemon loses a budget or its memory grows. SOAK_SECONDS=120 in CI.
+SOAK_SECONDS ?= 1800
+soak: $(READY)
+	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
+
+# Mutants of E2E check, reception, plausibility and fusion; each costs a compilation.
+MUTANTS ?= 24
+mutation: $(READY)
+	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

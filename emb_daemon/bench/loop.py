@@ -33,9 +33,9 @@ class _Stopwatch:
         self._taken = np.zeros(room, np.int64)
         self._count = 0
 
-    def __call__(self, *arguments):
+    def __call__(self, *arguments, **options):
         begin = time.perf_counter_ns()
-        result = self._method(*arguments)
+        result = self._method(*arguments, **options)
         if self._count < len(self._taken):
             self._taken[self._count] = time.perf_counter_ns() - begin
             self._count += 1

@@ -1,0 +1,96 @@
+"""Mutation testing: does a test fail when one operator, comparison or constant of a kernel is changed?
+
+Run as ``python tests/mutation.py [COUNT] [SEED]``. COUNT mutants (24) are drawn from E2E check, reception, plausibility and
+fusion; each is built into a copy of the package, on which the tests that hold these run until the first
+fails. Survivors are printed with their line.
+"""
+
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Module, and the tests that must notice.
+SCOPE = {
+    "emb_daemon/wire/e2e.py": ["tests/test_wire.py"],
+    "emb_daemon/wire/receive.py": ["tests/test_wire.py", "tests/test_hostile.py"],
+    "emb_daemon/models/plausibility.py": ["tests/test_plausibility.py"],
+    "emb_daemon/models/fusion.py": ["tests/test_kernels.py", "tests/test_filter.py"],
+}
+_SWAPPED = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+    ast.BitXor: ast.BitOr, ast.BitAnd: ast.BitOr, ast.LShift: ast.RShift, ast.RShift: ast.LShift,
+    ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+
+
+def _sites(tree: ast.Module) -> list[tuple[ast.AST, int]]:
+    """Nodes inside functions that can be changed, with the index of the comparison."""
+    sites = []
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for node in ast.walk(function):
+            if isinstance(node, ast.BinOp | ast.AugAssign | ast.BoolOp) and type(node.op) in _SWAPPED:
+                sites.append((node, -1))
+            elif isinstance(node, ast.Compare):
+                sites += [(node, index) for index, op in enumerate(node.ops) if type(op) in _SWAPPED]
+            elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                sites.append((node, -1))
+    return sites
+
+
+def _change(node: ast.AST, index: int) -> None:
+    if isinstance(node, ast.Compare):
+        node.ops[index] = _SWAPPED[type(node.ops[index])]()
+    elif isinstance(node, ast.Constant):
+        node.value += 1
+    else:
+        node.op = _SWAPPED[type(node.op)]()
+
+
+def _noticed(copy: Path, tests: list[str]) -> bool:
+    environment = os.environ | {"PYTHONPATH": str(copy)}
+    environment.setdefault("EMB_SHARED", str(ROOT.parent / "shared"))
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    try:
+        done = subprocess.run(
+            command, cwd=copy, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=300
+        )
+    except subprocess.TimeoutExpired:
+        return True
+    return done.returncode != 0
+
+
+def main() -> None:
+    count, seed = (int(word) for word in (*sys.argv[1:], *("24", "0")[len(sys.argv) - 1 :]))
+    mutants = [(module, place) for module in SCOPE for place in range(len(_sites(ast.parse((ROOT / module).read_text()))))]
+    drawn = sorted(random.Random(seed).sample(mutants, min(count, len(mutants))))
+    killed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "package"
+        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(folder) / "cache")
+        for tests in SCOPE.values():
+            assert not _noticed(copy, tests), f"{' '.join(tests)} fail without a mutant"
+        for module, place in drawn:
+            source = (ROOT / module).read_text()
+            tree = ast.parse(source)
+            node, index = _sites(tree)[place]
+            _change(node, index)
+            (copy / module).write_text(ast.unparse(tree))
+            if _noticed(copy, SCOPE[module]):
+                killed += 1
+            else:
+                line = source.splitlines()[node.lineno - 1].strip()
+                print(f"survived: {module}:{node.lineno}: {line}: {ast.unparse(node)}")
+            (copy / module).write_text(source)
+    print(f"{killed} of {len(drawn)} mutants killed, drawn from {len(mutants)}")
+
+
+if __name__ == "__main__":
+    main()
