@@ -15,6 +15,8 @@ from typing import NamedTuple, Self
 import pytest
 
 CHANNEL = "vcan0"
+PROJECT = Path(__file__).resolve().parents[2]
+RIG = PROJECT.parent / "shared" / "rig"
 
 
 def wait_for(what: str, condition: Callable[[], object], timeout_s: float, poll_s: float = 0.05) -> float:

@@ -14,10 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, Recording
-
-PROJECT = Path(__file__).resolve().parents[2]
-RIG = PROJECT.parent / "shared" / "rig"
+from bus_tools import CHANNEL, RIG, Recording
 
 # What .ci/target promises. A test that finds a promise broken fails; it is never skipped for that.
 PROMISED = {"native": {"can"}, "uml": {"can"}, "systemd": {"can", "systemd"}}

@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, Recording, playing, wait_for
-from conftest import PROJECT
+from bus_tools import CHANNEL, PROJECT, Recording, playing, wait_for
 
 pytestmark = pytest.mark.target("can")
 

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bus_tools import Frame, Recording, playing, read_log, wait_for
-from conftest import RIG
+from bus_tools import RIG, Frame, Recording, playing, read_log, wait_for
 
 pytestmark = pytest.mark.target("systemd")
 
