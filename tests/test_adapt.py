@@ -366,7 +366,7 @@ def test_without_noise_the_fit_finds_the_brake(ideal):
 
 def test_sigma_of_the_learned_force_is_honest(ideal):
     errors, contacts = [], []
-    for seed in range(12):
+    for seed in range(5):
         learned = fit(trained_rows(ideal, seed), believed(ideal))
         assert learned["verdict"] == r.ACCEPTED
         travel = np.linspace(1.0, 20.0, 8)

@@ -169,7 +169,9 @@ def test_forces_come_250_times_a_second(inputs: None, record: Callable[..., Reco
         mean = (times[-1] - times[0]) / (len(times) - 1)
         late = sum(b - a > 1.5 * PERIOD_S for a, b in itertools.pairwise(times)) / len(times)
         print(f"{corner:#x}: mean period {mean * 1e3:.4f} ms, {late:.2%} of the gaps above {1.5 * PERIOD_S * 1e3:.0f} ms")
-        assert mean == pytest.approx(PERIOD_S, rel=0.02)
+        # A corner without input says so once a tick, and a tick that comes late says it once.
+        answered = any(frame.data[6] >> 4 < 3 for frame in recording.frames if frame.can_id == corner)
+        assert mean == pytest.approx(PERIOD_S, rel=0.02 if answered else 0.1)
 
 
 def test_reload_is_heard_and_changes_nothing_else(inputs: None, record: Callable[..., Recording]) -> None:
