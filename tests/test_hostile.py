@@ -12,6 +12,7 @@ from emb_daemon.estimator import records as r
 from emb_daemon.logs.read import read_frames
 from emb_daemon.pipeline import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import default_layout
 from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
 
 _CYCLES = 400
@@ -46,8 +47,8 @@ def _spoof(cycle, delay_ns, counter, **signals):
     return wirekit.frame("EMB_FL_Resolver", cycle * CYCLE_NS + delay_ns, counter % 15, MotorAngle=99.0, **signals)
 
 
-#: The schedule of a sender is known after a hundred of its frames.
-_KNOWN = range(120, 380)
+#: The schedule of a sender is known after half a second of its frames.
+_KNOWN = range(135, 380)
 
 
 @pytest.mark.parametrize("delay_ms", [0.3, 1.0, 1.9])
@@ -85,7 +86,7 @@ def test_replayed_stretch(car, undisturbed):  # noqa: F811
 def test_flood_of_ten_thousand_frames_a_second(car, undisturbed):  # noqa: F811
     """Random payloads on our ids, right protection with every counter, and highest-priority nonsense."""
     rng = np.random.default_rng(3)
-    times = np.arange(120 * CYCLE_NS, 380 * CYCLE_NS, 100_000)
+    times = np.arange(_KNOWN.start * CYCLE_NS, 380 * CYCLE_NS, 100_000)
     noise = np.zeros(len(times), FRAME)
     noise["time_ns"], noise["length"] = times + 50_000, 8
     noise["can_id"] = rng.choice([0x0, 0x100, 0x110, 0x120, 0x180, 0x181, 0x182, 0x7FF], len(times))
@@ -108,13 +109,24 @@ def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811
 def test_a_sender_that_was_held_up_may_catch_up(car, undisturbed):  # noqa: F811
     """A bus that was busy for 60 ms delivers in a burst what waited: late is not early, all are taken."""
     receptions, frames = new_reception(), _merged(_good())
-    from emb_daemon.wire.layout import default_layout
-
     frames = frames[frames["can_id"] == 0x100]
     held = (frames["time_ns"] >= 200 * CYCLE_NS) & (frames["time_ns"] < 215 * CYCLE_NS)
     frames["time_ns"][held] = 215 * CYCLE_NS - MS
     verdicts = [receive(frame, receptions, default_layout()[0])[1] for frame in frames]
     assert np.all(np.array(verdicts) == ACCEPTED)
+
+
+@pytest.mark.parametrize(("start", "late_ms", "frames"), [(30, 3.9, 120), (3000, 2.5, 900), (3000, 9.0, 900)])
+def test_a_sender_that_was_late_for_long_may_be_on_time_again(start, late_ms, frames):
+    """However the machine that plays or sends was held up: who comes back to his schedule is not early."""
+    rng = np.random.default_rng(1)
+    cycles = np.arange(5000)
+    held_up = (cycles >= start) & (cycles < start + frames)
+    delay_ms = rng.uniform(0.0, 0.3, 5000) + held_up * late_ms * rng.uniform(1.0, 1.5, 5000)
+    times = np.maximum.accumulate(cycles * CYCLE_NS + (delay_ms * MS).astype(int))
+    receptions, layout = new_reception(), default_layout()[0]
+    sent = (wirekit.frame("EMB_FL_Resolver", int(time), cycle % 15) for cycle, time in enumerate(times))
+    assert all(receive(frame[0], receptions, layout)[1] == ACCEPTED for frame in sent)
 
 
 def test_in_the_traffic_of_a_real_car(car, undisturbed, shared):  # noqa: F811

@@ -13,15 +13,17 @@ VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", 
 
 #: Counter steps tolerated after a gap: this many, plus those that the time passed accounts for.
 _TOLERATED_LOSS = 2
-#: Share of a cycle by which the schedule that a sender is believed to keep moves on with each of its frames: it finds the
-#: earliest phase of arrival again after the sender was held up, and follows clocks that run apart.
-_CREEP = 0.005
+#: Frames over which a sender must have been late throughout before its schedule is believed to be later: at first, and once
+#: it is known. A bus or sender that was held up for less catches up and is not early; clocks that run apart are followed.
+_FIRST_WINDOW, _WINDOW = 128, 1024
 #: Cycles behind its schedule from which a sender has a new one.
 _NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
+_LONG = np.iinfo(np.int64).max
 
 #: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame; ``sequence_ns`` and ``sequence`` of the last
-#: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``candidate`` the counter of the last frame
+#: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``later_ns`` the least lateness among the
+#: ``seen`` frames of the present ``window``; ``candidate`` the counter of the last frame
 #: that did not stand in sequence, or -1, and ``candidate_ns`` when it came; ``refused_ns`` when a frame was last refused for
 #: its form or sequence; ``range_ns`` when one was last refused for a value out of range; ``count[verdict]``.
 RECEPTION = np.dtype(
@@ -32,6 +34,9 @@ RECEPTION = np.dtype(
         ("sequence_ns", "i8"),
         ("sequence", "i8"),
         ("due_ns", "i8"),
+        ("later_ns", "i8"),
+        ("seen", "i8"),
+        ("window", "i8"),
         ("candidate", "i8"),
         ("candidate_ns", "i8"),
         ("refused_ns", "i8"),
@@ -73,8 +78,8 @@ def _in_sequence(counter, time_ns, reception, cycle_ns):
             return _start_schedule(counter, time_ns, reception, cycle_ns)
         reception.sequence = counter
         reception.sequence_ns = time_ns
-        reception.due_ns = min(due + np.int64(_CREEP * cycle_ns), time_ns)
         reception.candidate = -1
+        _follow_schedule(due, time_ns, reception)
         return True
     follows = 1 <= (counter - reception.candidate) % COUNTER_MODULO <= _TOLERATED_LOSS
     if reception.candidate >= 0 and follows and time_ns - reception.candidate_ns >= cycle_ns // 2:
@@ -90,8 +95,21 @@ def _start_schedule(counter, time_ns, reception, cycle_ns):
     reception.sequence = counter
     reception.sequence_ns = time_ns
     reception.due_ns = time_ns - cycle_ns // 2
+    reception.later_ns, reception.seen, reception.window = _LONG, 0, _FIRST_WINDOW
     reception.candidate = -1
     return True
+
+
+@njit
+def _follow_schedule(due, time_ns, reception):
+    """A frame that comes sooner than the schedule moves it at once, one that comes later only with a whole window of them."""
+    reception.due_ns = min(due, time_ns)
+    reception.later_ns = min(reception.later_ns, time_ns - reception.due_ns)
+    reception.seen += 1
+    if reception.seen == reception.window:
+        reception.due_ns += reception.later_ns
+        reception.later_ns, reception.seen = _LONG, 0
+        reception.window = min(2 * reception.window, _WINDOW)
 
 
 @njit
