@@ -13,12 +13,12 @@ from collections.abc import Callable
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.fit import fit_training
+from emb_daemon.adapt.fit import compile_fit, fit_training
 from emb_daemon.adapt.limits import to_limits
 from emb_daemon.adapt.memory import Entry, Memory, Store, apply_entry, entry_of, with_entry
 from emb_daemon.adapt.session import answer_adapting, end
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.estimator.records import PARAMETERS, STATE
+from emb_daemon.estimator.records import STATE
 from emb_daemon.runtime.journal import log
 from emb_daemon.wire.layout import CORNERS
 
@@ -99,7 +99,7 @@ class Adaptation:
         """Compile, or load from the cache, what answers and evaluations call, on a pipeline that may be spoilt; start the
         helper thread."""
         self._answer(pipeline.samples, 0, 0, pipeline.states, pipeline.parameters, pipeline.estimates)
-        _evaluate(self.rows[0, :0], pipeline.parameters[0], pipeline.states[0], self.limits[0])
+        compile_fit(pipeline.parameters[0], pipeline.states[0])
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)
             self._thread.start()
@@ -162,7 +162,7 @@ class Adaptation:
     def _fit(
         self, corner: int, generation: int, rows: np.ndarray, parameters: np.void, state: np.void, power_on_angle: float
     ) -> None:
-        learned = _evaluate(rows, parameters, state, self.limits[corner])
+        learned = fit_training(rows, parameters, state, self.limits[corner])
         clearance = learned["contact_angle"] - power_on_angle
         believable = abs(clearance - parameters["clearance"]) <= self.limits[corner]["clearance_change"]
         learned["clearance"] = clearance if believable else np.nan
@@ -189,12 +189,3 @@ class Adaptation:
             self._memory.save(store)
         except OSError as error:
             log.error("corner %s: learned values could not be written: %s", store.corner, error)
-
-
-def _evaluate(rows: np.ndarray, parameters: np.void, state: np.void, limits: np.void) -> np.void:
-    """LEARNED record of TRAINING rows."""
-    both, states = np.zeros(2, PARAMETERS), np.zeros(2, STATE)
-    both[0], states[0] = parameters, state
-    learned = np.zeros(1, r.LEARNED)
-    fit_training(rows, both, states, limits, learned[0])
-    return learned[0]

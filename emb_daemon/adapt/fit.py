@@ -4,23 +4,25 @@ The estimator's own stiffness and torque paths are run over the training with tr
 unexplained is made small (Levenberg-Marquardt with Huber weights). Dynamics, effects, torque constant and inertia stay those
 of the calibration. Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
+
+Only the paths are compiled. The fit is done once in a park brake's life of minutes, beside the loop, and what little it
+computes itself would take far longer to compile than to run.
 """
 
-from math import exp, log, sqrt
+from math import exp, inf, log, sqrt
 
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.algebra import back_substitute, cholesky, inverse
 from emb_daemon.adapt.pairs import ANGLE, CYCLE_S, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
-from emb_daemon.estimator.records import CURVE_TERMS
+from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.step import position, rest, stiffness_path, torque_path
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 
 #: Order of the fitted values: contact angle, load friction, offset friction, logarithm of the presliding angle, curve.
-CONTACT, LOAD, OFFSET, PRESLIDING, CURVE = range(5)
+_CONTACT, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(5)
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
@@ -63,294 +65,246 @@ def unexplained(s, p, rows, residual, force):
 
 
 @njit
-def _put(p, s, x, scale, terms):
-    """Trial values into a PARAMETERS record and the contact angle of a STATE."""
-    s.contact_angle = x[CONTACT]
-    p.load_friction = x[LOAD] * p.gear_gain
-    p.offset_friction = x[OFFSET]
-    p.presliding_angle = exp(min(max(x[PRESLIDING], -12.0), 2.0))
-    for i in range(terms):
-        p.curve[i] = x[CURVE + i] * scale[i]
+def _run(states, parameters, rows, residual, force):
+    settle(states[0], parameters[0], rows[0])
+    unexplained(states[0], parameters[0], rows, residual, force)
 
 
-@njit
-def _simulate(states, parameters, rows, x, scale, terms, residual, force):
-    s, p = states[1], parameters[1]
-    states[1] = states[0]
-    parameters[1] = parameters[0]
-    _put(p, s, x, scale, terms)
-    settle(s, p, rows[0])
-    unexplained(s, p, rows, residual, force)
+class _Training:
+    """One training as a function of the fitted values.
+
+    Args:
+        rows: TRAINING array, the samples in order.
+        now, state: PARAMETERS and STATE records of the estimator at its end.
+        scale: what one unit of each curve term is, N/rad^(n+1).
+    """
+
+    def __init__(self, rows, now, state, scale):
+        self._rows, self._now, self._state, self._scale = rows, now, state, scale
+        self._parameters, self._states = np.zeros(1, PARAMETERS), np.zeros(1, STATE)
+
+    def parameters(self, x):
+        """PARAMETERS record with the trial values ``x``."""
+        self._parameters[0] = self._now
+        p = self._parameters[0]
+        p["load_friction"] = x[_LOAD] * p["gear_gain"]
+        p["offset_friction"] = x[_OFFSET]
+        p["presliding_angle"] = exp(min(max(x[_PRESLIDING], -12.0), 2.0))
+        p["curve"][: len(self._scale)] = x[_CURVE:] * self._scale
+        return p
+
+    def simulate(self, x):
+        """Unexplained motor torque (N m; NaN where unknown) and stiffness force (N) at each row."""
+        self.parameters(x)
+        self._states[0] = self._state
+        self._states["contact_angle"] = x[_CONTACT]
+        residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
+        _run(self._states, self._parameters, self._rows, residual, force)
+        return residual, force
 
 
-@njit
+def compile_fit(now, state):
+    """Compile, or load from the cache, all that a fit calls; PARAMETERS and STATE records as `fit_training` gets them."""
+    rows = np.zeros(2, r.TRAINING)
+    _Training(rows, now, state, np.ones(1)).simulate(np.zeros(_CURVE + 1))
+    pairs_of_passes(rows, now)
+    travel_at(0.0, now["curve"])
+    characteristic_curve(0.0, now["curve"])
+
+
 def _huber(residual, sigma):
     """Mean Huber cost of the finite residuals, in units of ``sigma`` squared."""
-    cost, count = 0.0, 0
-    for value in residual:
-        if np.isfinite(value):
-            size = abs(value) / sigma
-            cost += size * size if size < _HUBER else _HUBER * (2.0 * size - _HUBER)
-            count += 1
-    return cost / max(count, 1)
+    size = np.abs(residual[np.isfinite(residual)]) / sigma
+    return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() / max(len(size), 1)
 
 
-@njit
-def _normal_equations(residual, jacobian, sigma, normal, gradient):
-    """Weighted normal matrix and gradient; returns the number of samples in them."""
-    size = len(gradient)
-    normal[:, :] = 0.0
-    gradient[:] = 0.0
-    count = 0
-    for i in range(len(residual)):
-        value = residual[i]
-        if not np.isfinite(value):
-            continue
-        count += 1
-        weight = min(1.0, _HUBER * sigma / max(abs(value), 1e-300)) / (sigma * sigma)
-        for j in range(size):
-            gradient[j] += weight * jacobian[j, i] * value
-            for k in range(j + 1):
-                normal[j, k] += weight * jacobian[j, i] * jacobian[k, i]
-    for j in range(size):
-        for k in range(j):
-            normal[k, j] = normal[j, k]
-    return count
+def _normal_equations(residual, jacobian, sigma):
+    """Weighted normal matrix (n, n) and gradient (n,); ``jacobian`` has shape (n, samples)."""
+    known = np.isfinite(residual)
+    value, derivative = residual[known], jacobian[:, known]
+    weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(value), 1e-300)) / sigma**2
+    return (derivative * weight) @ derivative.T, derivative @ (weight * value)
 
 
-@njit
-def _improve(states, parameters, rows, x, scale, terms, sigma, residual, force, normal):
-    """Levenberg-Marquardt from ``x``, in place; leaves residual, force and normal matrix of the end.
+def _improve(training, x, steps, sigma):
+    """Levenberg-Marquardt from ``x`` with difference quotients over ``steps``.
 
-    Returns the iterations taken, or -1 if it did not converge."""
-    size = CURVE + terms
-    jacobian, trial_residual = np.zeros((size, len(rows))), np.zeros(len(rows))
-    gradient, damped, trial = np.zeros(size), np.zeros((size, size)), np.zeros(size)
-    move = np.zeros(size)
-    steps = np.full(size, 1e-4)
-    steps[CONTACT], steps[PRESLIDING] = 1e-3, 1e-2
-    steps[OFFSET] = 1e-3 * max(parameters[0].offset_friction, 1e-4)
-    _simulate(states, parameters, rows, x, scale, terms, residual, force)
+    Returns ``(x, residual, force, normal matrix, iterations)`` at the end; -1 iterations if it did not converge."""
+    residual, force = training.simulate(x)
     cost, damping = _huber(residual, sigma), 1e-3
+    normal = np.zeros((len(x), len(x)))
     for iteration in range(_ITERATIONS):
-        for j in range(size):
-            trial[:] = x
-            trial[j] += steps[j]
-            _simulate(states, parameters, rows, trial, scale, terms, trial_residual, force)
-            for i in range(len(rows)):
-                jacobian[j, i] = (trial_residual[i] - residual[i]) / steps[j]
-        _normal_equations(residual, jacobian, sigma, normal, gradient)
+        moved = [training.simulate(x + step)[0] for step in np.diag(steps)]
+        normal, gradient = _normal_equations(residual, (moved - residual) / steps[:, np.newaxis], sigma)
         before = cost
         while damping < 1e10:
-            for j in range(size):
-                for k in range(size):
-                    damped[j, k] = normal[j, k]
-                damped[j, j] += damping * normal[j, j] + 1e-12
-                move[j] = -gradient[j]
-            solved = cholesky(damped)
-            if solved:
-                back_substitute(damped, move)
-                for j in range(size):
-                    trial[j] = x[j] + move[j]
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+            try:
+                trial = x - np.linalg.solve(damped, gradient)
+            except np.linalg.LinAlgError:
+                trial = np.full(len(x), np.nan)
             # Force rises from contact: a curve that falls there belongs to a contact angle that lies too early.
-            if solved and trial[CURVE] > 0.0:
-                _simulate(states, parameters, rows, trial, scale, terms, trial_residual, force)
-                attempt = _huber(trial_residual, sigma)
-                if attempt <= cost:
-                    x[:] = trial
-                    residual[:] = trial_residual
-                    cost, damping = attempt, max(0.1 * damping, 1e-9)
+            if trial[_CURVE] > 0.0:
+                attempt = training.simulate(trial)
+                attempt_cost = _huber(attempt[0], sigma)
+                if attempt_cost <= cost:
+                    x, (residual, force), cost, damping = trial, attempt, attempt_cost, max(0.1 * damping, 1e-9)
                     break
             damping *= 10.0
         if before - cost <= _CONVERGED * before:
-            _simulate(states, parameters, rows, x, scale, terms, residual, force)
-            return iteration + 1
-    return -1
+            return x, residual, force, normal, iteration + 1
+    return x, residual, force, normal, -1
 
 
-@njit
+def _inverse(normal):
+    """Inverse of a positive definite matrix, scaled by its diagonal first; zeros if it is none."""
+    diagonal = np.diag(normal)
+    if not np.all(diagonal > 0.0):
+        return np.zeros_like(normal)
+    scale = 1.0 / np.sqrt(diagonal)
+    both = np.outer(scale, scale)
+    try:
+        factor = np.linalg.inv(np.linalg.cholesky(normal * both))
+    except np.linalg.LinAlgError:
+        return np.zeros_like(normal)
+    return factor.T @ factor * both
+
+
 def _inflation(residual):
     """Factor by which autocorrelated residuals widen a covariance: 1 + 2 sum of their autocorrelation."""
-    total, square = 1.0, 0.0
-    for value in residual:
-        if np.isfinite(value):
-            square += value * value
-    for lag in range(1, _LAGS + 1):
-        product = 0.0
-        for i in range(lag, len(residual)):
-            if np.isfinite(residual[i]) and np.isfinite(residual[i - lag]):
-                product += residual[i] * residual[i - lag]
-        total += 2.0 * max(product / square, 0.0)
-    return total
+    value = np.nan_to_num(residual)
+    products = (value[lag:] @ value[:-lag] for lag in range(1, _LAGS + 1))
+    return 1.0 + 2.0 * sum(max(product, 0.0) for product in products) / (value @ value)
 
 
-@njit
-def _median_size(residual):
-    """Standard deviation of normal residuals from the median of their size."""
-    sizes, count = np.zeros(len(residual)), 0
-    for value in residual:
-        if np.isfinite(value):
-            sizes[count] = abs(value)
-            count += 1
-    return 1.4826 * np.median(sizes[:count])
+def _force_sigma(curve, scale, covariance, top):
+    """Standard deviation of the clamp force from the covariance of contact angle and curve together.
+
+    Returns ``(s0, s1, largest)``: the straight line s0^2 + (s1 F)^2 through its square over the travel (least squares,
+    neither part negative), and its largest value."""
+    travel = top * np.arange(1, _TRAVELS + 1) / _TRAVELS
+    force, slope = np.array([characteristic_curve(x, curve) for x in travel]).T
+    direction = np.zeros((_TRAVELS, len(covariance)))
+    direction[:, _CONTACT] = -slope
+    direction[:, _CURVE:] = scale * travel[:, np.newaxis] ** np.arange(1, len(scale) + 1)
+    variance = np.einsum("ti,ij,tj->t", direction, covariance, direction)
+    square = force * force
+    spread = _TRAVELS * (square @ square) - square.sum() ** 2
+    share = max((_TRAVELS * (square @ variance) - square.sum() * variance.sum()) / spread, 0.0)
+    constant = max(variance.mean() - share * square.mean(), 0.25 * variance.mean())
+    return sqrt(constant), sqrt(share), sqrt(variance.max())
 
 
-@njit
-def _force_sigma(p, x, scale, terms, covariance, top, out):
-    """Standard deviation of the clamp force from the covariance of contact angle and curve together, as the straight
-    line s0^2 + (s1 F)^2 through its square over the travel (least squares, neither part negative)."""
-    direction = np.zeros(CURVE + terms)
-    sums = np.zeros(5)
-    largest = 0.0
-    for step in range(1, _TRAVELS + 1):
-        travel = top * step / _TRAVELS
-        force, slope = characteristic_curve(travel, p.curve)
-        direction[:] = 0.0
-        direction[CONTACT] = -slope
-        for i in range(terms):
-            direction[CURVE + i] = scale[i] * travel ** (i + 1)
-        variance = 0.0
-        for j in range(CURVE + terms):
-            for k in range(CURVE + terms):
-                variance += direction[j] * covariance[j, k] * direction[k]
-        largest = max(largest, variance)
-        square = force * force
-        sums += np.array([1.0, square, variance, square * square, square * variance])
-    spread = sums[0] * sums[3] - sums[1] * sums[1]
-    share = max((sums[0] * sums[4] - sums[1] * sums[2]) / spread, 0.0)
-    constant = max((sums[2] - share * sums[1]) / sums[0], 0.25 * sums[2] / sums[0])
-    out.stiffness_sigma, out.stiffness_relative_sigma = sqrt(constant), sqrt(share)
-    out.force_sigma = sqrt(largest)
-
-
-@njit
-def _excited(rows, force, residual, low, high, needed):
+def _excited(angle, force, residual, low, high, needed):
     """Whether each of equal force ranges, and the clearance, was passed in both directions by enough samples."""
-    count = np.zeros((2, _RANGES + 1))
-    for i in range(1, len(rows)):
-        if not np.isfinite(residual[i]):
-            continue
-        side = 0 if rows[i].angle > rows[i - 1].angle else 1
-        if force[i] <= low:
-            count[side, _RANGES] += 1
-        elif force[i] <= high:
-            count[side, min(int(_RANGES * (force[i] - low) / (high - low)), _RANGES - 1)] += 1
-    return count.min() >= needed
+    known = np.isfinite(residual)
+    known[0] = False
+    clamping = np.diff(angle, prepend=angle[0]) > 0.0
+    place = np.minimum(_RANGES * (force - low) / (high - low), _RANGES - 1).astype(int)
+    place[force <= low] = _RANGES
+    known &= force <= high
+    counts = [np.bincount(place[known & side], minlength=_RANGES + 1) for side in (clamping, ~clamping)]
+    return np.min(counts) >= needed
 
 
-@njit
-def fit_training(rows, parameters, states, limits, out):
+def fit_training(rows, now, state, limits):
     """What one training teaches.
 
     Args:
         rows: TRAINING array, the samples in order.
-        parameters: PARAMETERS array, shape (2,): now in use, and scratch.
-        states: STATE array, shape (2,): the estimator's at the end of the training, and scratch.
+        now: PARAMETERS record in use.
+        state: STATE record, the estimator's at the end of the training.
         limits: LIMITS record.
-        out: LEARNED record, filled; ``out.verdict`` says whether it may be used.
+
+    Returns:
+        LEARNED record; its ``verdict`` says whether it may be used.
     """
-    now = parameters[0]
-    out.samples = len(rows)
+    out = np.zeros(1, r.LEARNED)[0]
+    out["samples"] = len(rows)
     if len(rows) < _LEAST_SAMPLES:
-        out.verdict = r.TOO_FEW
-        return
-    terms = 1
-    for i in range(CURVE_TERMS):
-        if now.curve[i] != 0.0:
-            terms = i + 1
+        out["verdict"] = r.TOO_FEW
+        return out
+    terms = max(np.flatnonzero(now["curve"]), default=0) + 1
     pairs = pairs_of_passes(rows, now)
-    start_curve = np.zeros(CURVE_TERMS)
-    contact = curve_from_pairs(pairs, terms, start_curve)
+    contact, start = curve_from_pairs(pairs, terms)
     offset, load = friction_from_pairs(pairs)
     if not (np.isfinite(contact) and np.isfinite(load)):
-        out.verdict = r.NOT_EXCITED
-        return
-    top = 0.0
-    for i in range(len(rows)):
-        top = max(top, rows[i].angle - contact)
-    x, scale = np.zeros(CURVE + terms), np.zeros(terms)
-    total = 0.0
-    for i in range(terms):
-        total += start_curve[i] * top ** (i + 1)
-    for i in range(terms):
-        scale[i] = max(total, 1.0) / top ** (i + 1)
-        x[CURVE + i] = start_curve[i] / scale[i]
-    x[CONTACT], x[LOAD], x[OFFSET] = contact, max(load, 0.0) / now.gear_gain, max(offset, 1e-5)
-    x[PRESLIDING] = log(now.presliding_angle)
+        out["verdict"] = r.NOT_EXCITED
+        return out
+    powers = np.arange(1, terms + 1)
+    highest = rows["angle"].max()
+    top = highest - contact
+    scale = max(start @ top**powers, 1.0) / top**powers
+    x = np.array([contact, max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"]), *start / scale])
+    steps = np.full(len(x), 1e-4)
+    steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(now["offset_friction"], 1e-4)
 
-    expected, _ = torque_sigma(now.torque_constant * now.current_sigma, now.inertia * now.speed_sigma / CYCLE_S)
-    residual, force = np.zeros(len(rows)), np.zeros(len(rows))
-    normal = np.zeros((CURVE + terms, CURVE + terms))
-    out.iterations = _improve(states, parameters, rows, x, scale, terms, expected, residual, force, normal)
-    p = parameters[1]
+    expected, _ = torque_sigma(now["torque_constant"] * now["current_sigma"], now["inertia"] * now["speed_sigma"] / CYCLE_S)
+    training = _Training(rows, now, state, scale)
+    x, residual, force, normal, out["iterations"] = _improve(training, x, steps, expected)
+    p = training.parameters(x)
 
-    sigma = _median_size(residual)
-    out.correlation = _inflation(residual)
-    covariance = inverse(normal) * (out.correlation * (sigma / expected) ** 2)
-    out.residual = sigma / now.torque_constant
-    out.residual_ratio = sigma / expected
-    out.contact_angle = x[CONTACT]
-    out.contact_sigma = sqrt(covariance[CONTACT, CONTACT])
-    out.contact_given_curve_sigma = sqrt(out.correlation / max(normal[CONTACT, CONTACT], 1e-300)) * sigma / expected
-    out.curve[:] = p.curve
-    out.load_friction, out.offset_friction = p.load_friction, p.offset_friction
-    out.presliding_angle = p.presliding_angle
-    top = 0.0
-    for i in range(len(rows)):
-        top = max(top, rows[i].angle - out.contact_angle)
-    out.top_force, _ = characteristic_curve(top, p.curve)
-    _force_sigma(p, x, scale, terms, covariance, top, out)
+    sigma = 1.4826 * np.median(np.abs(residual[np.isfinite(residual)]))
+    out["correlation"] = _inflation(residual)
+    spread = out["correlation"] * (sigma / expected) ** 2
+    covariance = _inverse(normal) * spread
+    out["residual"] = sigma / now["torque_constant"]
+    out["residual_ratio"] = sigma / expected
+    out["contact_angle"] = x[_CONTACT]
+    out["contact_sigma"] = sqrt(covariance[_CONTACT, _CONTACT])
+    out["contact_given_curve_sigma"] = sqrt(spread / max(normal[_CONTACT, _CONTACT], 1e-300))
+    for name in ("curve", "load_friction", "offset_friction", "presliding_angle"):
+        out[name] = p[name]
+    top = highest - x[_CONTACT]
+    out["top_force"] = characteristic_curve(top, p["curve"])[0]
+    constant, relative, out["force_sigma"] = _force_sigma(p["curve"], scale, covariance, top)
     # What the fit cannot see: the dynamics' own error, and the torque constant's, which the curve inherits.
-    out.stiffness_sigma = sqrt(out.stiffness_sigma**2 + limits.dynamics_sigma**2)
-    out.stiffness_relative_sigma = sqrt(out.stiffness_relative_sigma**2 + limits.torque_constant_sigma**2)
-    out.pairs_difference = _pairs_difference(pairs, out.contact_angle, p.curve, out.top_force)
-    out.curve_change = _curve_change(out.curve, now.curve, limits.high_force)
-    out.verdict = _judge(rows, force, residual, top, now, limits, out)
+    out["stiffness_sigma"] = sqrt(constant**2 + limits["dynamics_sigma"] ** 2)
+    out["stiffness_relative_sigma"] = sqrt(relative**2 + limits["torque_constant_sigma"] ** 2)
+    out["pairs_difference"] = _pairs_difference(pairs, x[_CONTACT], p["curve"], out["top_force"])
+    out["curve_change"] = _curve_change(p["curve"], now["curve"], limits["high_force"])
+    out["verdict"] = _judge(rows, force, residual, top, now, limits, out)
+    return out
 
 
-@njit
 def _pairs_difference(pairs, contact, curve, top_force):
     """RMS difference of the pairs' forces from the curve, as a share of the largest force."""
-    total = weights = 0.0
-    for k in range(len(pairs)):
-        force, _ = characteristic_curve(pairs[k, ANGLE] - contact, curve)
-        total += pairs[k, WEIGHT] * (pairs[k, FORCE] - force) ** 2
-        weights += pairs[k, WEIGHT]
-    return sqrt(total / weights) / max(top_force, 1.0)
+    force = np.array([characteristic_curve(angle - contact, curve)[0] for angle in pairs[:, ANGLE]])
+    return sqrt(np.average((pairs[:, FORCE] - force) ** 2, weights=pairs[:, WEIGHT])) / max(top_force, 1.0)
 
 
-@njit
 def _curve_change(curve, before, force):
     """Relative change of the travel that it takes to reach ``force``."""
     travel, past = travel_at(force, curve), travel_at(force, before)
-    return abs(travel - past) / past if past > 0.0 else np.inf
+    return abs(travel - past) / past if past > 0.0 else inf
 
 
-@njit
 def _judge(rows, force, residual, top, now, limits, out):
     """ACCEPTED, or the first reason against it."""
-    if out.iterations < 0 or not np.isfinite(out.contact_sigma + out.force_sigma + out.residual) or out.contact_sigma == 0.0:
+    high = limits["high_force"]
+    covered = limits["coverage"] * high
+    uncertain = out["contact_sigma"] + out["force_sigma"] + out["residual"]
+    if out["iterations"] < 0 or not np.isfinite(uncertain) or out["contact_sigma"] == 0.0:
         return r.NOT_CONVERGED
-    if out.top_force < limits.coverage * limits.high_force:
+    if out["top_force"] < covered:
         return r.NOT_COVERED
-    if not _excited(rows, force, residual, 0.01 * limits.high_force, limits.coverage * limits.high_force,
-                    limits.samples_per_range):  # fmt: skip
+    if not _excited(rows["angle"], force, residual, 0.01 * high, covered, limits["samples_per_range"]):
         return r.NOT_EXCITED
-    if out.residual_ratio > limits.residual_ratio:
+    if out["residual_ratio"] > limits["residual_ratio"]:
         return r.RESIDUAL
-    for step in range(_TRAVELS + 1):
-        if characteristic_curve(max(top * step / _TRAVELS, 1e-6), out.curve)[1] <= 0.0:
-            return r.NOT_PHYSICAL
-    if not 0.0 <= out.load_friction <= limits.maximum_friction_share * now.gear_gain or not out.offset_friction >= 0.0:
+    travels = np.maximum(top * np.arange(_TRAVELS + 1) / _TRAVELS, 1e-6)
+    if any(characteristic_curve(travel, out["curve"])[1] <= 0.0 for travel in travels):
         return r.NOT_PHYSICAL
-    if out.curve_change > limits.curve_change:
+    load, offset = out["load_friction"], out["offset_friction"]
+    if not 0.0 <= load <= limits["maximum_friction_share"] * now["gear_gain"] or not offset >= 0.0:
+        return r.NOT_PHYSICAL
+    if out["curve_change"] > limits["curve_change"]:
         return r.CHANGED_TOO_MUCH
-    high = limits.high_force
-    friction, past = out.offset_friction + out.load_friction * high, now.offset_friction + now.load_friction * high
-    if abs(friction - past) > limits.friction_change * past:
+    friction, past = offset + load * high, now["offset_friction"] + now["load_friction"] * high
+    if abs(friction - past) > limits["friction_change"] * past:
         return r.CHANGED_TOO_MUCH
-    if out.force_sigma > limits.maximum_sigma:
+    if out["force_sigma"] > limits["maximum_sigma"]:
         return r.TOO_UNCERTAIN
-    if out.pairs_difference > limits.pairs_difference:
+    if out["pairs_difference"] > limits["pairs_difference"]:
         return r.PAIRS_DISAGREE
     return r.ACCEPTED

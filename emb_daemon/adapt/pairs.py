@@ -7,7 +7,6 @@ does not share the model of the fit that follows.
 
 import numpy as np
 
-from emb_daemon.adapt.algebra import back_substitute, cholesky
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.torque import friction_state, unexplained_torque
@@ -30,127 +29,91 @@ ANGLE, FORCE, FRICTION, WEIGHT = range(4)
 
 
 @njit
+def _sliding(rows, p, direction, torque):
+    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque without it and inertia (N m)."""
+    state, variance = 0.0, 1.0
+    direction[0] = 0.0
+    for i in range(1, len(rows)):
+        row, last = rows[i], rows[i - 1]
+        state, mean, variance = friction_state(state, variance, row.angle - last.angle, p.presliding_angle, 0.0, row.dt)
+        usable = row.has_current and abs(mean) >= _TURNED_OVER
+        direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
+        torque[i] = unexplained_torque(p.torque_constant * row.current_q, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
+
+
 def pairs_of_passes(rows, p):
     """Pairs of one training (TRAINING rows, PARAMETERS record); returns (pairs, 4): rad, N, N m, samples."""
-    low, high = rows[0].angle, rows[0].angle
-    for i in range(len(rows)):
-        low, high = min(low, rows[i].angle), max(high, rows[i].angle)
-    width = max(high - low, 1e-9) / _BINS
-    sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
-    count, angle, torque = np.zeros((2, _BINS)), np.zeros((2, _BINS)), np.zeros((2, _BINS))
-    before = np.zeros((2, _BINS))
-    for sweep in range(2):
-        # The second time without what lies far from the first's mean.
-        before[:, :] = torque / np.maximum(count, 1.0)
-        count[:, :], angle[:, :], torque[:, :] = 0.0, 0.0, 0.0
-        state, variance = 0.0, 1.0
-        for i in range(1, len(rows)):
-            row, last = rows[i], rows[i - 1]
-            state, mean, variance = friction_state(state, variance, row.angle - last.angle, p.presliding_angle, 0.0, row.dt)
-            if not row.has_current or abs(mean) < _TURNED_OVER:
-                continue
-            side = 0 if mean > 0.0 else 1
-            middle = 0.5 * (row.angle + last.angle)
-            place = min(int((middle - low) / width), _BINS - 1)
-            motor = p.torque_constant * row.current_q
-            value = unexplained_torque(motor, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
-            if sweep == 1 and abs(value - before[side, place]) > _FAR * sigma:
-                continue
-            count[side, place] += 1.0
-            angle[side, place] += middle
-            torque[side, place] += value
-    pairs, found = np.zeros((_BINS, 4)), 0
-    for place in range(_BINS):
-        up, down = count[0, place], count[1, place]
-        if up < _SAMPLES or down < _SAMPLES:
-            continue
-        clamping, releasing = torque[0, place] / up, torque[1, place] / down
-        pairs[found, ANGLE] = 0.5 * (angle[0, place] / up + angle[1, place] / down)
-        pairs[found, FORCE] = 0.5 * (clamping + releasing) / p.gear_gain
-        pairs[found, FRICTION] = 0.5 * (clamping - releasing)
-        pairs[found, WEIGHT] = 2.0 * up * down / (up + down)
-        found += 1
-    return pairs[:found]
+    angle = rows["angle"]
+    low = angle.min()
+    width = max(angle.max() - low, 1e-9) / _BINS
+    sigma, _ = torque_sigma(p["torque_constant"] * p["current_sigma"], p["inertia"] * p["speed_sigma"] / CYCLE_S)
+    direction, torque = np.zeros(len(rows)), np.zeros(len(rows))
+    _sliding(rows, p, direction, torque)
+    middle = 0.5 * (angle + np.concatenate([angle[:1], angle[:-1]]))
+    # Clamping passes in the first half of the bins, releasing ones in the second.
+    bins = np.minimum((middle - low) / width, _BINS - 1).astype(int) + np.where(direction > 0.0, 0, _BINS)
+
+    def mean(used, values):
+        return np.bincount(bins[used], values[used], 2 * _BINS) / np.maximum(np.bincount(bins[used], minlength=2 * _BINS), 1)
+
+    used = direction != 0.0
+    used &= np.abs(torque - mean(used, torque)[bins]) <= _FAR * sigma
+    count = np.bincount(bins[used], minlength=2 * _BINS).reshape(2, _BINS)
+    up, down = count[:, np.min(count, axis=0) >= _SAMPLES]
+    angles, torques = (
+        mean(used, values).reshape(2, _BINS)[:, np.min(count, axis=0) >= _SAMPLES] for values in (middle, torque)
+    )
+    pairs = np.zeros((len(up), 4))
+    pairs[:, ANGLE] = angles.mean(axis=0)
+    pairs[:, FORCE] = torques.mean(axis=0) / p["gear_gain"]
+    pairs[:, FRICTION] = 0.5 * (torques[0] - torques[1])
+    pairs[:, WEIGHT] = 2.0 * up * down / (up + down)
+    return pairs
 
 
-@njit
-def _fit_curve(pairs, robust, contact, terms, curve):
-    """Weighted least squares of the curve's ``terms`` coefficients for a given contact angle; returns the cost."""
-    normal, right = np.zeros((terms, terms)), np.zeros(terms)
+def _fit_curve(pairs, weight, contact, terms):
+    """Weighted least squares of the curve's ``terms`` coefficients for a given contact angle: ``(cost, coefficients)``."""
     travel = max(pairs[-1, ANGLE] - contact, 1e-9)
-    for k in range(len(pairs)):
-        x = max(pairs[k, ANGLE] - contact, 0.0) / travel
-        weight = pairs[k, WEIGHT] * robust[k]
-        for i in range(terms):
-            right[i] += weight * x ** (i + 1) * pairs[k, FORCE]
-            for j in range(terms):
-                normal[i, j] += weight * x ** (i + j + 2)
-    if not cholesky(normal):
-        return np.inf
-    back_substitute(normal, right)
-    cost = 0.0
-    for k in range(len(pairs)):
-        x = max(pairs[k, ANGLE] - contact, 0.0) / travel
-        force = 0.0
-        for i in range(terms):
-            force += right[i] * x ** (i + 1)
-        cost += pairs[k, WEIGHT] * robust[k] * (pairs[k, FORCE] - force) ** 2
-    for i in range(terms):
-        curve[i] = right[i] / travel ** (i + 1)
-    return cost
+    powers = np.arange(1, terms + 1)
+    shapes = (np.maximum(pairs[:, ANGLE] - contact, 0.0) / travel)[:, np.newaxis] ** powers
+    root = np.sqrt(weight)
+    solution = np.linalg.lstsq(shapes * root[:, np.newaxis], pairs[:, FORCE] * root)[0]
+    return weight @ (pairs[:, FORCE] - shapes @ solution) ** 2, solution / travel**powers
 
 
-@njit
-def curve_from_pairs(pairs, terms, curve):
-    """Contact angle (rad) of the best curve through the pairs, whose coefficients go into ``curve``; NaN if there is none.
+def curve_from_pairs(pairs, terms):
+    """Contact angle (rad) and ``terms`` coefficients of the best curve through the pairs; NaN if there is none.
 
     Robust: pairs that lie far from a first fit lose weight in the second (Cauchy weights on the median residual).
     """
+    best, curve = np.nan, np.zeros(terms)
     if len(pairs) < 2 * terms + 2:
-        return np.nan
-    top = pairs[:, FORCE].max()
-    low, high = pairs[0, ANGLE], pairs[0, ANGLE]
-    for k in range(len(pairs)):
-        if pairs[k, FORCE] > _SEARCHED_SHARE * top:
-            break
-        high = pairs[k, ANGLE]
-    robust, trial = np.ones(len(pairs)), np.zeros(len(curve))
-    best = np.nan
+        return best, curve
+    angle, force = pairs[:, ANGLE], pairs[:, FORCE]
+    above = np.argmax(force > _SEARCHED_SHARE * force.max())
+    candidates = np.linspace(angle[0], angle[max(above - 1, 0)], _CANDIDATES + 1)
+    robust = np.ones(len(pairs))
     for _ in range(2):
         least = np.inf
-        for candidate in range(_CANDIDATES + 1):
-            contact = low + (high - low) * candidate / _CANDIDATES
-            cost = _fit_curve(pairs, robust, contact, terms, trial)
+        for contact in candidates:
+            cost, trial = _fit_curve(pairs, pairs[:, WEIGHT] * robust, contact, terms)
             if cost < least and trial[0] > 0.0:
-                least, best = cost, contact
-                curve[:] = trial
+                least, best, curve = cost, contact, trial
         if not np.isfinite(least):
-            return np.nan
-        residual = np.zeros(len(pairs))
-        for k in range(len(pairs)):
-            x, force = max(pairs[k, ANGLE] - best, 0.0), 0.0
-            for i in range(terms):
-                force += curve[i] * x ** (i + 1)
-            residual[k] = pairs[k, FORCE] - force
+            return np.nan, curve
+        travel = np.maximum(angle - best, 0.0)
+        residual = force - travel[:, np.newaxis] ** np.arange(1, terms + 1) @ curve
         scale = 1.5 * np.median(np.abs(residual)) + 1e-9
-        for k in range(len(pairs)):
-            robust[k] = 1.0 / (1.0 + (residual[k] / (3.0 * scale)) ** 2)
-    return best
+        robust = 1.0 / (1.0 + (residual / (3.0 * scale)) ** 2)
+    return best, curve
 
 
-@njit
 def friction_from_pairs(pairs):
     """(offset N m, load m/rad) of the straight line of friction torque over clamp force; thesis 4.1."""
-    n = force = friction = square = product = 0.0
-    for k in range(len(pairs)):
-        weight, f = pairs[k, WEIGHT], max(pairs[k, FORCE], 0.0)
-        n += weight
-        force += weight * f
-        friction += weight * pairs[k, FRICTION]
-        square += weight * f * f
-        product += weight * f * pairs[k, FRICTION]
-    spread = n * square - force * force
+    weight, force, friction = pairs[:, WEIGHT], np.maximum(pairs[:, FORCE], 0.0), pairs[:, FRICTION]
+    total = weight.sum()
+    spread = total * (weight @ force**2) - (weight @ force) ** 2
     if not spread > 0.0:
         return np.nan, np.nan
-    load = (n * product - force * friction) / spread
-    return (friction - load * force) / n, load
+    load = (total * (weight @ (force * friction)) - (weight @ force) * (weight @ friction)) / spread
+    return (weight @ friction - load * (weight @ force)) / total, load
