@@ -88,4 +88,4 @@ if config.DISABLE_JIT:
     njit = _plain
 else:
     config.CACHE_DIR = str(_cache_folder())
-    njit = numba.njit(cache=True, nogil=True, error_model="numpy")
+    njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)

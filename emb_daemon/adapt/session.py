@@ -105,7 +105,8 @@ def _progress(a, limits):
 @njit
 def take_over(s, p, scratch, rows, learned):
     """Put learned values into a corner's parameters and bring its path models to the last of ``rows`` with them."""
-    p.curve[:] = learned.curve
+    for i in range(len(p.curve)):
+        p.curve[i] = learned.curve[i]
     p.load_friction, p.offset_friction = learned.load_friction, learned.offset_friction
     p.presliding_angle = learned.presliding_angle
     p.stiffness_sigma, p.stiffness_relative_sigma = learned.stiffness_sigma, learned.stiffness_relative_sigma
