@@ -83,9 +83,22 @@ def _plain(function):
     return call
 
 
+def _kept() -> int:
+    """Number of compiled functions in the cache folder, 0 where they cannot be kept."""
+    return 0 if config.DISABLE_JIT or _private else sum(path.suffix == ".nbc" for path in Path(config.CACHE_DIR).rglob("*"))
+
+
+def compiled_for_the_next_start() -> bool:
+    """Whether code was compiled since this process began that another start would find in the cache."""
+    return _kept() > _kept_at_start
+
+
+_private: tempfile.TemporaryDirectory | None = None
+
 #: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
 if config.DISABLE_JIT:
     njit = _plain
 else:
     config.CACHE_DIR = str(_cache_folder())
     njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+_kept_at_start = _kept()

@@ -126,7 +126,7 @@ class Pipeline:
         """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the buffer of samples is nearly full.
 
         Returns (index of the next frame, number of rows in ``self.samples``)."""
-        return _collect(self._buffers, frames, start, _ALL if predictions else _NONE)
+        return _collect(self._buffers, frames, start, _ALL if predictions else _NONE, 0)
 
     def overdue(self, time_ns: int, count: int = 0) -> int:
         """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then.
@@ -153,8 +153,7 @@ class Pipeline:
 
 
 @njit
-def _collect(b, frames, start, predictions):
-    count = 0
+def _collect(b, frames, start, predictions, count):
     while start < len(frames) and count + _ROWS_A_FRAME < len(b.samples):
         frame = frames[start]
         count = _overdue(b, frame.time_ns, predictions, count)
@@ -171,18 +170,23 @@ def _collect(b, frames, start, predictions):
         if not corner.active:
             continue
         resolver = b.receptions[wire.CORNER_MESSAGES * index + wire.RESOLVER]
-        current = b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
         if slot % wire.CORNER_MESSAGES == wire.RESOLVER:
             if corner.pending >= 0:
-                count = _complete(b, index, False, count)
+                count = _complete(b, index, count)
             corner.pending = resolver.counter
             corner.pending_ns = resolver.time_ns
             corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
             corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
-        paired = current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
-        if corner.pending >= 0 and paired:
-            count = _complete(b, index, True, count)
+        if corner.pending >= 0 and _paired(b, index):
+            count = _complete(b, index, count)
     return start, count
+
+
+@njit
+def _paired(b, index):
+    """Whether the current that belongs to the pending resolver sample has come."""
+    corner, current = b.corners[index], b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
+    return current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
 
 
 @njit
@@ -200,7 +204,7 @@ def _overdue(b, time_ns, predictions, count):
         if not corner.active:
             continue
         if corner.pending >= 0 and time_ns - corner.pending_ns > _PAIRING_NS:
-            count = _complete(b, index, False, count)
+            count = _complete(b, index, count)
         if predictions == _NEWEST:
             corner.predicted = max(corner.predicted, (time_ns - corner.sample_ns) // CYCLE_NS - LATE_CYCLES)
         while (
@@ -251,7 +255,7 @@ def _cycles(corner, counter, time_ns):
 
 
 @njit
-def _complete(b, index, with_current, count):
+def _complete(b, index, count):
     """Make the pending resolver sample a row; returns the new count."""
     corner = b.corners[index]
     row = b.samples[count]
@@ -262,7 +266,7 @@ def _complete(b, index, with_current, count):
     row.dt = cycles * CYCLE_S
     row.angle = corner.pending_angle
     row.speed = corner.pending_speed
-    row.has_current = with_current
+    row.has_current = _paired(b, index)
     row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
     thermocouple = b.receptions[base + wire.THERMOCOUPLE]
     row.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
@@ -291,7 +295,7 @@ def _complete(b, index, with_current, count):
     corner.sample_ns = now
     corner.predicted = 0
     corner.pending = -1
-    _head(b, row, index, 0)
+    _head(b, row, index, corner.predicted)
     return count + 1
 
 

@@ -1,6 +1,7 @@
 """emb-daemon run."""
 
 import argparse
+import os
 import signal
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.adapt.memory import state_directory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.cli.busoptions import bus_options
+    from emb_daemon.jit import compiled_for_the_next_start
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.runtime.daemon import Daemon
     from emb_daemon.runtime.journal import log, set_up_logging
@@ -35,10 +37,14 @@ def run(arguments: argparse.Namespace) -> int:
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
     state = state_directory(configuration.state_directory, arguments.config.parent)
     daemon = Daemon(setup, bus, ServiceManager(), state)
-    signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
-    signal.signal(signal.SIGINT, lambda *_: daemon.stop())
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()
+    if compiled_for_the_next_start():
+        log.info("kernels compiled, starting again with them: the compiler would keep twice the daemon's memory")
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    # Not before: a signal that comes while kernels are compiled ends the process at once.
+    signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
+    signal.signal(signal.SIGINT, lambda *_: daemon.stop())
     realtime = configuration.realtime
     for line in set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu):
         log.info("%s", line)
