@@ -15,6 +15,8 @@ from emb_daemon.pipeline import answer_row
 _NONE, _RUN = 0, 1
 _PARK_APPLIED = 1.0
 _STANDING_RAD_S = 0.1
+#: Time between two samples from which some are missing.
+_GAP_S = 0.006
 #: Motor travel that counts as motion, and the time without any after which unasked motion is over.
 _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
@@ -30,8 +32,10 @@ _BAD = (
 
 @njit
 def _obstacle(a, m, estimate, limits):
-    """ACCEPTED if training may go on, or what forbids it."""
-    if not estimate.is_sample or estimate.reasons & _BAD or not m.has_status:
+    """ACCEPTED if training may go on, or what forbids it. A gap is bridged for as long as the estimate is."""
+    if not estimate.is_sample:
+        return r.BAD_INPUT if estimate.source == e.INVALID else r.ACCEPTED
+    if estimate.reasons & _BAD or not m.has_status:
         return r.BAD_INPUT
     if m.park_brake != _PARK_APPLIED:
         return r.PARK_BRAKE_LEFT
@@ -70,7 +74,8 @@ def _begin(a, phase):
 def _collect(a, rows, m, estimate):
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
-    row.current_q, row.has_current = m.current_q, m.has_current
+    # The current is a cycle's mean: it does not tell of the acceleration over a gap.
+    row.current_q, row.has_current = m.current_q, m.has_current and m.dt < _GAP_S
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
@@ -171,6 +176,8 @@ def observe(a, s, p, limits, scratch, rows, m, estimate):
         if a.phase != r.IDLE:
             end(a, obstacle, r.RESULT_ABORTED)
         a.parked_time = 0.0
+    elif not estimate.is_sample:
+        pass
     elif a.phase == r.IDLE:
         a.parked_time = 0.0 if m.brake_request != 0.0 else a.parked_time + m.dt
         if not a.tried:

@@ -1,0 +1,66 @@
+"""The daemon and the simulated car on a real bus: a parked car is asked for training motion, gives it, and it is accepted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from bus_tools import CHANNEL
+
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.records import RESULT_ACCEPTED
+from emb_daemon.resources import resource
+from emb_daemon.runtime.bus import open_bus
+
+pytestmark = pytest.mark.target("can")
+
+_REQUEST_ID, _FORCE_ID = 0x230, 0x200
+_RUN, _INVALID = 1, 15
+_PATIENCE_S = 180.0
+
+
+def test_a_parked_car_is_asked_and_its_answer_accepted(tmp_path: Path) -> None:
+    """`emb-daemon run` and `emb-daemon simulate`, processes of their own; the forces stay valid throughout."""
+    config, state = tmp_path / "emb.yaml", tmp_path / "state"
+    corner = f"{{FL: {{calibration: {resource('config/calibration.yaml')}}}}}"
+    config.write_text(f"format: 1\ncorners: {corner}\nrealtime: {{fifo_priority: null, lock_memory: false}}\n")
+    command = [sys.executable, "-m", "emb_daemon.cli.main"]
+    on_bus = ["-i", "socketcan", "-c", CHANNEL]
+    environment = os.environ | {"STATE_DIRECTORY": str(state)}
+    bus = open_bus("socketcan", CHANNEL, [_REQUEST_ID, _FORCE_ID])
+    daemon = subprocess.Popen([*command, "run", "--config", str(config), *on_bus], env=environment)
+    car = subprocess.Popen([*command, "simulate", "--scenario", "park", "--corners", "1", *on_bus])
+    try:
+        seen = _listen(bus, time.monotonic() + _PATIENCE_S)
+    finally:
+        for process in (car, daemon):
+            process.send_signal(signal.SIGTERM)
+        statuses = [process.wait(20) for process in (car, daemon)]
+        bus.close()
+    print(seen)
+    assert seen["requests"] and seen["accepted"]
+    assert not seen["invalid"], "the estimate goes on during training"
+    assert statuses == [0, 0]
+    store = Memory(state).read("FL")
+    assert store is not None and store.current is not None, "what was accepted is kept"
+
+
+def _listen(bus, end: float) -> dict[str, int]:
+    """Messages seen until one says Accepted: requests to run, accepted results, invalid forces after the first request."""
+    seen = {"requests": 0, "accepted": 0, "invalid": 0}
+    while not seen["accepted"] and time.monotonic() < end:
+        # In batches: the two processes that are watched share the machine, perhaps its only CPU, with this one.
+        time.sleep(0.2)
+        for frame in bus.drain():
+            can_id, payload = int(frame["can_id"]), int(frame["data"])
+            if can_id == _REQUEST_ID:
+                seen["requests"] += payload >> 16 & 3 == _RUN
+                seen["accepted"] += payload >> 25 & 15 == RESULT_ACCEPTED
+            elif can_id == _FORCE_ID and seen["requests"]:
+                seen["invalid"] += payload >> 52 & 15 == _INVALID
+    return seen
