@@ -91,10 +91,11 @@ def _in_sequence(counter, time_ns, reception, cycle_ns):
 
 @njit
 def _start_schedule(counter, time_ns, reception, cycle_ns):
-    """Believe a sender of whose schedule one frame tells nothing but that it is not late; always True."""
+    """Believe a sender; always True. One frame tells little of its schedule: it may itself be the first of a burst that was
+    held up, so how early others may come is left open for a turn of the counter, until a first window has shown it."""
     reception.sequence = counter
     reception.sequence_ns = time_ns
-    reception.due_ns = time_ns - cycle_ns // 2
+    reception.due_ns = time_ns - COUNTER_MODULO * cycle_ns
     reception.later_ns, reception.seen, reception.window = _LONG, 0, _FIRST_WINDOW
     reception.candidate = -1
     return True
