@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
-from numba.core import config
+from numba.core import config, event
 
 #: A source that mentions one of these takes part in compiled code.
 _MARKS = (b"emb_daemon.jit", b"np.dtype(")
@@ -83,16 +83,25 @@ def _plain(function):
     return call
 
 
-def _kept() -> int:
-    """Number of compiled functions in the cache folder, 0 where they cannot be kept."""
-    return 0 if config.DISABLE_JIT or _private else sum(path.suffix == ".nbc" for path in Path(config.CACHE_DIR).rglob("*"))
+class _Compilations(event.Listener):
+    """Counts what is compiled in this process, not what comes from the cache."""
+
+    count = 0
+
+    def on_start(self, _event):
+        self.count += 1
+
+    def on_end(self, _event):
+        pass
 
 
 def compiled_for_the_next_start() -> bool:
-    """Whether code was compiled since this process began that another start would find in the cache."""
-    return _kept() > _kept_at_start
+    """Whether this process has compiled what another start would find in the cache."""
+    return _compilations.count > 0 and _private is None
 
 
+_compilations = _Compilations()
+event.register("numba:compile", _compilations)
 _private: tempfile.TemporaryDirectory | None = None
 
 #: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
@@ -101,4 +110,3 @@ if config.DISABLE_JIT:
 else:
     config.CACHE_DIR = str(_cache_folder())
     njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
-_kept_at_start = _kept()
