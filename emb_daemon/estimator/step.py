@@ -29,6 +29,7 @@ from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
     NOTHING,
     TOO_EARLY,
+    clearance_level,
     clearly_above,
     engaged,
     start_anew,
@@ -37,7 +38,7 @@ from emb_daemon.models.contact import (
     torque_sigma,
     watch_closing,
 )
-from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
+from emb_daemon.models.fusion import OFFSET, STATES, maximum_likelihood, predict_errors, update_errors, variance_along
 from emb_daemon.models.plausibility import (
     AGREE,
     STIFFNESS_WRONG,
@@ -91,6 +92,11 @@ _CLAMPED = 0.1
 _LONG_S = 1e6
 #: Variance that the torque path's relative error gains, 1/s: friction changes over months.
 _TORQUE_GAIN_WALK = 1e-9
+#: Offset that the motor torque may have, as a standard deviation: share of the torque that the largest force needs; and time
+#: in which it drifts as far again, s. An offset that turns out larger is a fault of the current sensor.
+_OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
+#: Standard deviations of the innovation beyond which a sample teaches the filter nothing: sensors jump, what it learns walks.
+_GATE = 5.0
 
 
 @njit
@@ -107,7 +113,14 @@ def _start(s, p, m):
     s.covariance[1, 1] = s.contact.prior = p.clearance_sigma * p.clearance_sigma
     s.covariance[2, 2] = p.torque_relative_sigma * p.torque_relative_sigma
     s.covariance[3, 3] = (p.torque_constant * p.current_sigma) ** 2
+    s.covariance[OFFSET, OFFSET] = _torque_offset(p) ** 2
     s.balance = np.nan
+
+
+@njit
+def _torque_offset(p):
+    """Standard deviation of the motor torque's offset at power-on, N m."""
+    return _OFFSET * p.gear_gain * p.maximum_force
 
 
 @njit
@@ -294,19 +307,29 @@ def _watch_contact(s, p, m, force_before, torque, leverage):
     sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / _CYCLE_S)
     limit = threshold(current_share, p.current_correlation_time, _CYCLE_S)
     predicted = leverage * 0.5 * (force_before + s.force)
-    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt)
+    offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, offset_sigma)
+    offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
     seen = predicted + c.excess
+    if found != NOTHING:
+        # Under a wrong belief the filter took for an offset what it was not.
+        s.error[OFFSET] = offset
+        for i in range(STATES):
+            s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
+        s.covariance[OFFSET, OFFSET] = offset_sigma * offset_sigma
+    noticeable = max(leverage * _CLAMPED * p.maximum_force, clearly_above(c, sigma))
     if found == TOO_EARLY:
-        _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD)
+        _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD, leverage)
     elif found != NOTHING:
-        _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage)
-    elif not c.confirmed and c.excess > max(predicted, leverage * _CLAMPED * p.maximum_force, clearly_above(c, sigma)):
-        # Power came while the brake was clamped: no angle from which to count the clearance.
-        force = (seen + c.level) / leverage
+        _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage, leverage)
+    elif not c.confirmed and c.excess > max(predicted, noticeable):
+        # Power came while the brake was clamped: no angle from which to count the clearance. Or the torque has an offset.
+        s.covariance[OFFSET, OFFSET] += seen * seen
+        force = seen / leverage
         friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
         c.level = c.samples = 0.0
         c.engaged = True
-        _start_contact(s, p, m, force, (sigma + friction) / leverage)
+        _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
     doubt = sqrt(s.covariance[1, 1])
     if doubt < _KNOWN_RAD:
         c.lost = False
@@ -314,8 +337,12 @@ def _watch_contact(s, p, m, force_before, torque, leverage):
 
 
 @njit
-def _start_contact(s, p, m, force, sigma):
-    """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more."""
+def _start_contact(s, p, m, force, sigma, leverage):
+    """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more.
+
+    The force was read from a torque of ``leverage`` m/rad whose offset it takes over: contact angle and offset err together,
+    until the clearance shows the offset.
+    """
     travel = travel_at(min(force, p.maximum_force) / s.factor, p.curve) if force > 0.0 else 0.0
     if not np.isfinite(travel):
         return
@@ -323,9 +350,11 @@ def _start_contact(s, p, m, force, sigma):
     rest(s, p, travel, s.factor)
     slope = s.factor * max(characteristic_curve(max(travel, 1.0), p.curve)[1], p.curve[0])
     lag = p.relaxation_time * m.speed
+    misread = 1.0 / (leverage * slope)
     for i in range(STATES):
-        s.covariance[1, i] = s.covariance[i, 1] = 0.0
-    s.covariance[1, 1] = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
+        s.covariance[1, i] = s.covariance[i, 1] = misread * s.covariance[OFFSET, i]
+    own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
+    s.covariance[1, 1] = own + misread * misread * s.covariance[OFFSET, OFFSET]
     start_anew(s.contact, s.covariance[1, 1])
 
 
@@ -339,7 +368,8 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = p.contact_walk * p.contact_walk * m.dt
-    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque)
+    drifted = _torque_offset(p) ** 2 * m.dt / _OFFSET_DRIFTS_S
+    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque, drifted)
     if m.dt > _ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         P[0, 0] += (lag_error / spread) ** 2
@@ -347,7 +377,7 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     # What friction's offset may be wrong by, the torque reads as contact angle, and no number of samples averages it out.
     misread = p.torque_relative_sigma * p.offset_friction / (p.gear_gain * p.curve[0])
     offset = torque_bias(s.contact, P[1, 1], misread)
-    h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
+    h[0], h[1], h[2], h[3], h[4] = spread, -s.slope, 0.0, 0.0, 0.0
     out.stiffness_sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
     out.innovation = out.innovation_sigma = np.nan
     mean_force = 0.5 * (force_before + s.force)
@@ -356,28 +386,31 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     speed_torque = p.inertia * unknown_speed / _CYCLE_S
     white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance
     gain_error = p.torque_relative_sigma * mean_force
-    out.torque_sigma = sqrt((white + current_torque * current_torque) / (leverage * leverage) + gain_error * gain_error)
+    offset_error = x[OFFSET] * x[OFFSET] + P[OFFSET, OFFSET]
+    noise = white + current_torque * current_torque
+    out.torque_sigma = sqrt((noise + offset_error) / (leverage * leverage) + gain_error * gain_error)
     if np.isfinite(torque):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (_DISSOLVING_PER_S * m.dt)
-        h[0], h[1], h[2], h[3] = leverage * spread, -leverage * s.slope, leverage * mean_force, 1.0
+        h[0], h[1], h[2], h[3], h[4] = leverage * spread, -leverage * s.slope, leverage * mean_force, 1.0, 1.0
         innovation = torque - leverage * mean_force
         for i in range(STATES):
             innovation -= h[i] * x[i]
         out.innovation = innovation / leverage
-        if s.plausibility.verdict == AGREE:
-            variance = update_errors(x, P, s.gain, innovation, h, white)
+        variance = white + variance_along(P, h)
+        if s.plausibility.verdict == AGREE and innovation * innovation < _GATE * _GATE * variance:
+            update_errors(x, P, s.gain, innovation, h, white)
             s.torque_age = 0.0
         else:
-            variance = white + variance_along(P, h)
+            s.torque_age += m.dt
         out.innovation_sigma = sqrt(variance) / leverage
-    if not np.isfinite(torque) or s.plausibility.verdict != AGREE:
+    else:
         s.torque_age += m.dt
     # What was learned of the contact angle moves the contact angle itself: the curve is not straight.
     s.contact_angle += x[1]
     s.force -= s.slope * x[1]
     x[1] = 0.0
-    h[0], h[1], h[2], h[3] = spread, -s.slope, 0.0, 0.0
+    h[0], h[1], h[2], h[3], h[4] = spread, -s.slope, 0.0, 0.0, 0.0
     out.force = s.force + spread * x[0]
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
@@ -390,7 +423,7 @@ def _fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 def _take_sides(s, p, m, out):
     """Where the paths contradict each other, go on with the one that can be right; returns the reasons."""
     c = s.plausibility
-    motor_torque = p.torque_constant * m.current_q
+    motor_torque = p.torque_constant * m.current_q - s.error[OFFSET]
     force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, p.load_friction, p.offset_friction)
     if np.isfinite(out.innovation):
         torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt
@@ -401,11 +434,11 @@ def _take_sides(s, p, m, out):
         # The contact angle was found wrong and explains what came before.
         c.doubt = 0.0
     if c.verdict == AGREE:
-        return 0
+        return PATHS_DISAGREE if abs(s.error[OFFSET]) > _torque_offset(p) else 0
     out.source = STIFFNESS_ONLY
     if c.verdict == STIFFNESS_WRONG:
         out.source = TORQUE_ONLY if m.has_current else INVALID
-        out.force, out.sigma = force, sigma
+        out.force, out.sigma = force, sqrt(sigma * sigma + s.covariance[OFFSET, OFFSET] / (p.gear_gain * p.gear_gain))
         return PATHS_DISAGREE | STUCK
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = sqrt(out.sigma * out.sigma + out.innovation * out.innovation)
@@ -433,7 +466,8 @@ def step(s, p, m, out):
     torque, leverage, friction_variance = torque_path(s, p, m)
     if moved_zero:
         torque = np.nan
-    if not frozen(s.plausibility):
+    # Over a gap the current of its last cycle and the mean acceleration say nothing of each other.
+    if m.dt <= _ONE_CYCLE_S and not frozen(s.plausibility):
         _watch_contact(s, p, m, force_before, torque, leverage)
     _fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
