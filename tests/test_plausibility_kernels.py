@@ -55,7 +55,7 @@ def test_doubt_gives_away_twenty_a_sample_and_counts_at_most_twelve_sigma():
 
 def test_torque_beyond_friction():
     """4 N m on 100 kN at 4e-5 m/rad carry nothing; friction of 0.05 N m and 1e-6 m/rad takes 0.15 N m, at rest 0.195."""
-    arguments = dict(force=100_000.0, sigma=0.5, gear_gain=4e-5, load_friction=1e-6, offset_friction=0.05)
+    arguments = {"force": 100_000.0, "sigma": 0.5, "gear_gain": 4e-5, "load_friction": 1e-6, "offset_friction": 0.05}
     for torque, beyond in ((4.0, 0.0), (4.19, 0.0), (4.2, 0.01), (3.81, 0.0), (3.0, 1.61), (5.0, 1.61)):
         assert beyond_friction(torque, **arguments) == pytest.approx(beyond, abs=1e-12)
 
