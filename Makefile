@@ -31,8 +31,8 @@ SOAK_SECONDS ?= 1800
 soak: $(READY)
 	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
 
-# Mutants of E2E check, reception, plausibility and fusion; each costs a compilation.
-MUTANTS ?= 24
+# Mutants of E2E check, reception, plausibility and fusion, drawn with a fixed seed.
+MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
 

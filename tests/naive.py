@@ -29,9 +29,10 @@ def friction_state(state, travel, presliding_angle):
     return along(abs(travel)), mean
 
 
-def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance):
-    transition = np.diag([decay, 1.0, 1.0, noise_decay])
-    noise = np.diag([1.0 - decay**2, contact_variance, gain_variance, (1.0 - noise_decay**2) * noise_variance])
+def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance, offset_variance):
+    transition = np.diag([decay, 1.0, 1.0, noise_decay, 1.0])
+    coloured = (1.0 - noise_decay**2) * noise_variance
+    noise = np.diag([1.0 - decay**2, contact_variance, gain_variance, coloured, offset_variance])
     return transition @ x, transition @ P @ transition.T + noise
 
 

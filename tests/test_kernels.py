@@ -50,7 +50,7 @@ def test_filter_time_update():
     rng = np.random.default_rng(1)
     for _ in range(20):
         x, P, _ = _random_filter(rng)
-        arguments = rng.uniform(0.1, 1.0, 5)
+        arguments = rng.uniform(0.1, 1.0, 6)
         expected = naive.predict_errors(x, P, *arguments)
         predict_errors(x, P, *arguments)
         np.testing.assert_allclose(x, expected[0], rtol=1e-12)

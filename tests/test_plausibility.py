@@ -108,6 +108,35 @@ def test_current_with_an_offset_is_detected(begin, offset_A):
     assert _honest(estimates, force, slice(begin, None)) and _recovered(estimates, force)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("begin", [0, _HOLDING, 2300])
+@pytest.mark.parametrize("offset_A", [-6.0, -4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 6.0])
+def test_a_lasting_offset_of_the_current_is_covered_or_said(offset_A, begin, seed):
+    """From power-on, under load, or from the second clearance on: at every tick the force is within three sigma, a model's
+    rare outlier aside, or the status says that it is degraded."""
+    samples, force = _drive(seed)
+    samples = samples.copy()
+    samples["current_q"][begin:] += offset_A
+    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    beyond = np.abs(estimates["force"] - force) / estimates["sigma"] * (estimates["reasons"] == 0)
+    assert np.all(beyond < 4.0) and np.mean(beyond > 3.0) < 0.002
+
+
+@pytest.mark.parametrize("offset_A", [-6.0, -2.0, 1.0, 2.0])
+def test_an_offset_from_power_on_is_learned_in_the_clearance(offset_A):
+    """The first stroke shows it before the pads touch: the force is as good as without, and a large one is reported."""
+    samples, force = _drive()
+    parameters = to_parameters(load_calibration(resource("config/calibration.yaml")))
+    good = estimate(samples, parameters)
+    samples = samples.copy()
+    samples["current_q"] += offset_A
+    estimates = estimate(samples, parameters)
+    clamped = force > 2000.0
+    assert np.abs(estimates["force"] - good["force"])[clamped].max() < 0.5 * good["sigma"][clamped].min()
+    assert np.all(np.abs(estimates["sigma"] / good["sigma"] - 1.0)[clamped] < 0.1)
+    assert bool(np.all(estimates["reasons"][clamped] & r.PATHS_DISAGREE)) == (abs(offset_A) > 3.0)
+
+
 def test_offset_is_the_torque_paths_fault_once_the_pads_are_clear():
     """Then the difference no longer counts as doubt of the stiffness."""
     estimates, _ = _with(_BEFORE_RELEASE, _current(4.0))

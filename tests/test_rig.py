@@ -12,6 +12,7 @@ import pytest
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator import records as r
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.resources import resource
 
@@ -75,3 +76,27 @@ def test_every_log_goes_through(rig, name):
     for name in ("surface", "mean", "disc"):
         assert np.all((known[name] > 0.0) & (known[name] < 800.0)), name
     assert np.all((estimates["stiffness_factor"] > 0.5) & (estimates["stiffness_factor"] < 1.2))
+
+
+#: Logs and the thickness of their pads: healthy sensors, and a gear whose friction the calibration misses by a third.
+_HEALTHY = {
+    **{f"static/random_{name}mm": thickness for name, thickness in _THICKNESSES.items()},
+    "static/training_5mm": 5.0,
+    "static/gear_new_training": 10.0,
+    "static/gear_new_random": 10.0,
+    "static/gear_worn_in_training": 10.0,
+    "static/gear_worn_in_random": 10.0,
+    "integrated/val": 10.0,
+    "integrated/fit": 10.0,
+}
+
+
+@pytest.mark.parametrize("name", _HEALTHY)
+def test_no_false_alarm_on_healthy_sensors(rig, name):
+    """The first minute of each log: after the start no path is doubted, no signal stuck, no contact angle given up, and the
+    force is fused in every sample."""
+    samples = load_log(rig / f"{name}.log.gz").samples[:15_000]
+    estimates = estimate(samples, _parameters(_HEALTHY[name]))
+    assert np.all(estimates["reasons"][500:] == 0)
+    assert not np.any(estimates["reasons"] & (r.PATHS_DISAGREE | r.STUCK | r.CONTACT_UNCERTAIN))
+    assert np.all(estimates["source"][500:] == r.FUSED)

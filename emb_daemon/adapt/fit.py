@@ -15,8 +15,8 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.pairs import ANGLE, CYCLE_S, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
+from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
-from emb_daemon.estimator.step import position, rest, stiffness_path, torque_path
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.stiffness import characteristic_curve, travel_at

@@ -10,6 +10,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import settle, unexplained_step
 from emb_daemon.estimator import records as e
 from emb_daemon.jit import njit
+from emb_daemon.models.fusion import OFFSET
 from emb_daemon.pipeline import answer_row
 
 _NONE, _RUN = 0, 1
@@ -131,7 +132,9 @@ def take_over(s, p, scratch, rows, learned):
     # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
     # what may still differ for this very curve.
     for i in range(len(s.error)):
-        s.error[i] = 0.0
+        # An offset of the current sensor is no part of what was learned.
+        if i != OFFSET:
+            s.error[i] = 0.0
         for j in range(len(s.error)):
             if i != j:
                 s.covariance[i, j] = 0.0

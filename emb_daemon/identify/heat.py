@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.heat import TOUCHING_N, TURNING_RAD_PER_S
 from emb_daemon.estimator.records import DEPTHS_M, THERMAL
-from emb_daemon.estimator.step import TOUCHING_N, TURNING_RAD_PER_S
 from emb_daemon.identify.fitting import Block, least_squares
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import Decoder

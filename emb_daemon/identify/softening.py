@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import Softening
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.step import TURNING_RAD_PER_S
+from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.identify.heat import Recording, simulate
 from emb_daemon.identify.stiffness import simulate as stiffness_force
 from emb_daemon.offline import Log

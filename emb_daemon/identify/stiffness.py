@@ -10,8 +10,8 @@ import numpy as np
 
 from emb_daemon.calibration.types import Curve
 from emb_daemon.effects import REGISTRY
+from emb_daemon.estimator.paths import stiffness_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
-from emb_daemon.estimator.step import stiffness_path
 from emb_daemon.identify.fitting import Block, Solution, least_squares
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.estimator.step import FLICKER_RAD
+from emb_daemon.estimator.paths import FLICKER_RAD
 from emb_daemon.identify.fitting import CLUSTER, clustered_covariance
 from emb_daemon.jit import njit
 from emb_daemon.models.torque import friction_state, slid_angle

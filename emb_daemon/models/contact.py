@@ -42,13 +42,15 @@ NOTHING, TOO_LATE, TOO_EARLY = range(3)
 _DRIFT, _LOG_RUN = 0.45, 17.0
 #: Friction must have turned over by this much for the torque to count.
 _TURNED_OVER = 0.9
-#: Samples from which the clearance level may raise an alarm, from which it counts half, and over which it averages at most.
-_LEAST, _HALF_KNOWN, _MOST = 100.0, 30.0, 500.0
+#: Samples from which the clearance level may raise an alarm, and over which it averages at most.
+_LEAST, _MOST = 100.0, 500.0
 #: Samples over which torque is smoothed, and closing samples in agreement that confirm the contact angle.
 _SMOOTHED, _CONFIRMING = 15.0, 100
 #: Share of the force by which curve and friction may be wrong without the contact angle being blamed, and torque (standard
 #: deviations of one sample) from which agreement means something.
 _TOLERANCE, _TELLING = 0.07, 3.0
+#: Clearance samples that show an offset of torque, and factor by which correlated noise makes their mean less certain.
+_SHOWN, _CORRELATED = 20.0, 1.5
 #: Standard deviations of the contact angle beyond which it counts as passed.
 _CERTAIN = 4.0
 
@@ -74,7 +76,7 @@ def engaged(state, x, contact_sigma):
 
 
 @njit
-def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, contact_sigma):
+def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, contact_sigma, offset=0.0, offset_sigma=0.0):
     """Compare torque with belief for one sample.
 
     Args:
@@ -85,6 +87,7 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
         sigma: standard deviation of ``torque``, N m.
         limit: `threshold`.
         x, contact_sigma: rad past the believed contact angle, and its standard deviation.
+        offset, offset_sigma: what is believed of an offset of ``torque``, N m; counts until the clearance has shown it.
 
     Returns:
         NOTHING, TOO_LATE or TOO_EARLY: how the believed contact angle is wrong.
@@ -92,16 +95,15 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
     if not np.isfinite(torque):
         return NOTHING
     state.watched = min(state.watched + 1.0, _SMOOTHED)
-    state.excess += (torque - predicted - state.level - state.excess) / state.watched
+    level, level_sigma = clearance_level(state, sigma, offset, offset_sigma)
+    state.excess += (torque - predicted - level - state.excess) / state.watched
     if friction_mean < _TURNED_OVER:
         return NOTHING
     clear = x < -_CERTAIN * contact_sigma
     if clear:
         state.samples = min(state.samples + 1.0, _MOST)
         state.level += (torque - state.level) / state.samples
-    # A level of few samples is mostly noise.
-    level = state.level * state.samples / (state.samples + _HALF_KNOWN)
-    above, tolerated = torque - predicted - level, _TOLERANCE * predicted
+    above, tolerated = torque - predicted - level, _TOLERANCE * predicted + level_sigma
     if state.samples >= _LEAST or not clear:
         state.rise = max(0.0, state.rise + (above - tolerated) / sigma - _DRIFT)
     state.shortfall = max(0.0, state.shortfall - (above + tolerated) / sigma - _DRIFT)
@@ -119,6 +121,15 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
         state.agreed += 1
         state.confirmed = state.confirmed or state.agreed >= _CONFIRMING
     return NOTHING
+
+
+@njit
+def clearance_level(state, sigma, offset, offset_sigma):
+    """Torque in the clearance and its standard deviation, N m: as the clearance showed it to samples of standard deviation
+    ``sigma``, or else as the filter believes."""
+    if state.samples < _SHOWN:
+        return offset, offset_sigma
+    return state.level, _CORRELATED * sigma / sqrt(state.samples)
 
 
 @njit

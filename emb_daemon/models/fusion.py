@@ -7,9 +7,10 @@ for noise, which takes slow model error for white noise. Here the filter estimat
     x1  error of the contact angle (rad), random walk: acts through the local stiffness G
     x2  relative error of the torque path (torque constant, friction), nearly constant
     x3  coloured noise of the current as motor torque (N m), first-order Gauss-Markov
+    x4  offset of the motor torque (N m), random walk: a current sensor's zero, seen alone wherever the pads do not touch
 
     F = F_stiffness + sigma_stiffness x0 - G x1
-    torque not explained by F_stiffness = D (F - F_stiffness) + D F x2 + x3 + white noise,  D = gamma + mu s
+    torque not explained by F_stiffness = D (F - F_stiffness) + D F x2 + x3 + x4 + white noise,  D = gamma + mu s
 
 so that what is slow stays correlated and the standard deviation means what it says.
 """
@@ -18,7 +19,9 @@ from math import sqrt
 
 from emb_daemon.jit import njit
 
-STATES = 4
+STATES = 5
+#: Index of the torque's offset.
+OFFSET = 4
 
 
 @njit
@@ -29,11 +32,11 @@ def maximum_likelihood(stiffness, stiffness_sigma, torque, torque_sigma):
 
 
 @njit
-def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance):
+def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance, offset_variance):
     """Time update of the error state and its covariance.
 
     ``decay`` and ``noise_decay`` of x0 and x3 over the step, ``noise_variance`` the stationary variance of x3; the random
-    walks of x1 and x2 gain the other two variances.
+    walks of x1, x2 and x4 gain the other variances.
     """
     for i, factor in ((0, decay), (3, noise_decay)):
         x[i] *= factor
@@ -44,6 +47,7 @@ def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, no
     P[1, 1] += contact_variance
     P[2, 2] += gain_variance
     P[3, 3] += (1.0 - noise_decay * noise_decay) * noise_variance
+    P[4, 4] += offset_variance
 
 
 @njit

@@ -63,13 +63,17 @@ class _Batch:
 
 @njit
 def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, now_ns, frames):
-    """Frames with times on the monotonic clock; returns the socket's drop counter, or -1 if none was attached.
+    """Frames with times on the monotonic clock; returns how many there are, and the socket's drop counter or -1.
+
+    A peer that closed its end of a socket pair leaves empty messages without end: those are no frames.
 
     The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock and the result is held
     between the last drain and now, where the truth must lie.
     """
     drops = np.int64(-1)
     for index in range(count):
+        if headers[index].length == 0:
+            return index, drops
         frame, source = frames[index], raw[index]
         can_id = np.int64(source.can_id)
         frame.flags = (EXTENDED if can_id & _EFF else 0) | (REMOTE if can_id & _RTR else 0) | (ERROR if can_id & _ERR else 0)
@@ -101,7 +105,7 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
         frame.time_ns = min(max(stamp, earliest_ns), now_ns)
         earliest_ns = frame.time_ns
         headers[index].control_length = _CONTROL_BYTES
-    return drops
+    return count, drops
 
 
 @njit
@@ -159,13 +163,13 @@ class RawCanSocket:
                 raise OSError(code, os.strerror(code))
             return self._frames[:0]
         self.down = False
-        drops = self._take(count, now)
+        count, drops = self._take(count, now)
         self._last_drain_ns = now
         if drops >= 0:
             self.dropped = drops
         return self._frames[:count]
 
-    def _take(self, count: int, now: int) -> int:
+    def _take(self, count: int, now: int) -> tuple[int, int]:
         batch, offset = self._received, time.time_ns() - now
         return _from_kernel(
             batch.raw, batch.headers, batch.control, count, self._stamped, offset, self._last_drain_ns, now, self._frames

@@ -1,0 +1,111 @@
+"""The contact angle of one corner: a resolver that lost its zero, and what torque says against what is believed."""
+
+from math import sqrt
+
+import numpy as np
+
+from emb_daemon.estimator.paths import CYCLE_S, rest
+from emb_daemon.jit import njit
+from emb_daemon.models.contact import (
+    NOTHING,
+    TOO_EARLY,
+    clearance_level,
+    clearly_above,
+    engaged,
+    start_anew,
+    threshold,
+    torque_sigma,
+    watch_closing,
+)
+from emb_daemon.models.fusion import OFFSET, STATES
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
+
+#: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
+SPEED_MARGIN = 1.2
+_ANGLE_MARGIN = 0.5
+#: Standard deviations of the contact angle, rad: known again below, and unknown.
+_KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
+#: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
+_CLAMPED = 0.1
+
+
+@njit
+def follow_zero(s, p, m):
+    """Whether the angle jumped as no motor can: then the resolver has a new zero, and the contact angle goes with it.
+
+    What the motor may have turned meanwhile is unknown, so the contact angle becomes uncertain by as much.
+    """
+    jump = m.angle - s.angle
+    # While the resolver was stuck the motor turned on.
+    reach = p.maximum_speed * (m.dt + s.plausibility.frozen_s)
+    if abs(jump) <= SPEED_MARGIN * reach + _ANGLE_MARGIN:
+        return False
+    s.angle += jump
+    s.slid_angle += jump
+    s.contact_angle += jump
+    s.covariance[1, 1] += reach * reach
+    s.contact.prior += reach * reach
+    s.contact.confirmed = False
+    return True
+
+
+@njit
+def watch_contact(s, p, m, force_before, torque, leverage):
+    """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
+    c, x, doubt = s.contact, s.past_contact, sqrt(s.covariance[1, 1])
+    if p.clearance_sigma == 0.0:
+        # Held as exactly known, as diagnose does; no calibration file can say so.
+        engaged(c, x, 0.0)
+        return
+    sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
+    limit = threshold(current_share, p.current_correlation_time, CYCLE_S)
+    predicted = leverage * 0.5 * (force_before + s.force)
+    offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, offset_sigma)
+    offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
+    seen = predicted + c.excess
+    if found != NOTHING:
+        # Under a wrong belief the filter took for an offset what it was not.
+        s.error[OFFSET] = offset
+        for i in range(STATES):
+            s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
+        s.covariance[OFFSET, OFFSET] = offset_sigma * offset_sigma
+    noticeable = max(leverage * _CLAMPED * p.maximum_force, clearly_above(c, sigma))
+    if found == TOO_EARLY:
+        _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD, leverage)
+    elif found != NOTHING:
+        _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage, leverage)
+    elif not c.confirmed and c.excess > max(predicted, noticeable):
+        # Power came while the brake was clamped: no angle from which to count the clearance. Or the torque has an offset.
+        s.covariance[OFFSET, OFFSET] += seen * seen
+        force = seen / leverage
+        friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
+        c.level = c.samples = 0.0
+        c.engaged = True
+        _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
+    doubt = sqrt(s.covariance[1, 1])
+    if doubt < _KNOWN_RAD:
+        c.lost = False
+    engaged(c, s.past_contact, doubt)
+
+
+@njit
+def _start_contact(s, p, m, force, sigma, leverage):
+    """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more.
+
+    The force was read from a torque of ``leverage`` m/rad whose offset it takes over: contact angle and offset err together,
+    until the clearance shows the offset.
+    """
+    travel = travel_at(min(force, p.maximum_force) / s.factor, p.curve) if force > 0.0 else 0.0
+    if not np.isfinite(travel):
+        return
+    s.contact_angle += s.past_contact - travel
+    rest(s, p, travel, s.factor)
+    slope = s.factor * max(characteristic_curve(max(travel, 1.0), p.curve)[1], p.curve[0])
+    lag = p.relaxation_time * m.speed
+    misread = 1.0 / (leverage * slope)
+    for i in range(STATES):
+        s.covariance[1, i] = s.covariance[i, 1] = misread * s.covariance[OFFSET, i]
+    own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
+    s.covariance[1, 1] = own + misread * misread * s.covariance[OFFSET, OFFSET]
+    start_anew(s.contact, s.covariance[1, 1])

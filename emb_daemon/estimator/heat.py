@@ -1,0 +1,112 @@
+"""Heat of one corner's pads and disc from sample to sample: what heats them, and what the estimate tells of them."""
+
+from math import exp
+
+import numpy as np
+
+from emb_daemon.effects import paths as effects
+from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.jit import njit
+from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
+
+#: Clamp force from which pads and disc exchange heat by contact, N.
+TOUCHING_N = 200.0
+#: Wheel speed from which pads heat: the sensor's noise at standstill does not.
+TURNING_RAD_PER_S = 0.5
+#: Time between conduction steps, s: twelve samples, less half a sample against rounding.
+_HEAT_STEP_S = 0.046
+
+
+@njit
+def _start_heat(s, t, m):
+    """Profiles out of the backing plates alone: right for pads at rest, and doubted by how far the plates are off the caliper.
+
+    The disc takes the plates' mean and the pads lie between.
+    """
+    s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
+    for node in range(NODES):
+        share = t.node_position[node] / t.thickness
+        s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
+        s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
+    s.ambient = s.disc
+    s.temperature_doubt = s.history_doubt = abs(s.disc - m.caliper)
+    _tell_temperatures(s, t)
+    s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    s.factor = stiffness_factor(t, s.history, s.history)
+    s.temperature_known = True
+
+
+@njit
+def _tell_temperatures(s, t):
+    for side in range(2):
+        s.mean[side] = mean_temperature(s.pads[side], t.node_position)
+        for index in range(len(DEPTHS_M)):
+            s.depth[side, index] = at_depth(s.pads[side], t.node_position, DEPTHS_M[index])
+
+
+@njit
+def _flow(s, t, e, m):
+    """Let the heat of the time since the last heat step flow, and find the stiffness factor anew."""
+    dt = s.heat_time
+    wheel_speed = s.heat_travel / dt
+    # Without vehicle status the last ambient temperature stands: it changes slowly, and a jump would cool the disc.
+    if m.has_status:
+        s.ambient = m.ambient
+    ambient = s.ambient
+    # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
+    inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
+    outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
+    inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
+    s.disc += effects.disc_cooling(e, t.disc_heat_capacity, s.disc, ambient, dt)
+    _tell_temperatures(s, t)
+    rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    forgotten = exp(-dt / t.history_time)
+    s.history = forgotten * s.history + (1.0 - forgotten) * rise
+    s.factor = stiffness_factor(t, rise, s.history)
+    # A wrong start dies out as the disc, which stores most of it, cools.
+    s.temperature_doubt *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed) / t.disc_heat_capacity)
+    s.history_doubt *= forgotten
+    s.heat_time = s.heat_energy = s.heat_travel = 0.0
+
+
+@njit
+def heat(s, p, m):
+    """Pads and disc up to this sample, heated by what the last estimate says.
+
+    A conduction step costs more than all the rest: one serves several samples, as long as the pads' contact stays the same.
+    """
+    t = p.thermal
+    if not s.temperature_known:
+        s.factor = 1.0
+        if m.has_thermocouple:
+            _start_heat(s, t, m)
+        return
+    touching = s.fused > TOUCHING_N
+    if touching != s.touching and s.heat_time > 0.0:
+        _flow(s, t, p.effects, m)
+    s.touching = touching
+    wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
+    s.heat_time += m.dt
+    s.heat_travel += wheel_speed * m.dt
+    s.power = 0.0
+    if touching and wheel_speed > TURNING_RAD_PER_S:
+        if np.isnan(m.brake_torque):
+            surface = 0.5 * (s.pads[0, 0] + s.pads[1, 0])
+            s.power = friction_power(t, s.fused, wheel_speed, surface) * effects.friction_factor(p.effects, surface)
+        else:
+            s.power = max(m.brake_torque, 0.0) * wheel_speed
+        s.heat_energy += s.power * m.dt
+    if s.heat_time >= _HEAT_STEP_S:
+        _flow(s, t, p.effects, m)
+
+
+@njit
+def tell(s, out):
+    known = s.temperature_known
+    for side in range(2):
+        out.surface[side] = s.pads[side, 0] if known else np.nan
+        out.mean[side] = s.mean[side] if known else np.nan
+        for index in range(len(DEPTHS_M)):
+            out.depth[side, index] = s.depth[side, index] if known else np.nan
+    out.disc = s.disc if known else np.nan

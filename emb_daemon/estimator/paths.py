@@ -1,0 +1,93 @@
+"""Both force paths of one corner, and what acts on them: motor angle to force, motor torque to force."""
+
+from math import sqrt
+
+import numpy as np
+
+from emb_daemon.effects import paths as effects
+from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
+from emb_daemon.models.torque import friction_state, slid_angle, unexplained_torque
+
+#: The current is averaged over this time before its sample (wire contract), s.
+CYCLE_S = 0.004
+ONE_CYCLE_S = 1.5 * CYCLE_S
+#: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
+DISSOLVING_PER_S = 0.05
+#: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
+_SELF_LOCKING = 0.2
+#: Half a count of a 4096-count resolver.
+FLICKER_RAD = 0.0008
+#: A time after which everything has settled, s.
+_LONG_S = 1e6
+#: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
+_DOUBTFUL_RAD = 0.05
+
+
+@njit
+def position(s, p, m):
+    """Motor angle past contact at this sample, rad; advances the effects that act on it."""
+    e, state = p.effects, s.effects
+    gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
+    return m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
+
+
+@njit
+def stiffness_path(s, p, m, factor):
+    """Stiffness path: advances the dynamic force and its slope."""
+    x = position(s, p, m)
+    dt = m.dt
+    if dt > ONE_CYCLE_S:
+        # Over a gap the way is unknown but for its end, which the speed tells and the lag remembers best.
+        dt = min(0.5 * m.dt, 2.0 * p.relaxation_time)
+        _deform(s, p, x - dt * m.speed, m.dt - dt, factor)
+    _deform(s, p, x, dt, factor)
+
+
+@njit
+def _deform(s, p, x, dt, factor):
+    """The motor turns steadily to ``x`` rad past contact within ``dt`` s."""
+    static, slope = characteristic_curve(x, p.curve)
+    travel = max(x, 0.0) - max(s.past_contact, 0.0)
+    s.past_contact = x
+    doubt = s.covariance[1, 1]
+    if doubt > _DOUBTFUL_RAD * _DOUBTFUL_RAD:
+        slope = mean_slope(x, sqrt(doubt), p.curve)
+    drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
+    s.force = first_order_lag(s.force, s.drive, drive, dt, p.relaxation_time)
+    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, p.relaxation_time)
+    s.drive = drive
+    s.drive_slope = factor * slope
+
+
+@njit
+def rest(s, p, x, factor):
+    """Bring the stiffness path to where it settles ``x`` rad past contact."""
+    s.past_contact = x
+    _deform(s, p, x, _LONG_S, factor)
+
+
+@njit
+def torque_path(s, p, m):
+    """Torque path over the cycle that ends at this sample.
+
+    Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
+    the torque is NaN where it says nothing.
+    """
+    travel = m.angle - s.angle
+    slid = slid_angle(s.slid_angle, m.angle, FLICKER_RAD) - s.slid_angle
+    s.slid_angle += slid
+    s.friction_state, mean, s.friction_variance = friction_state(
+        s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
+    )
+    s.friction_mean = mean
+    e, mean_speed = p.effects, 0.5 * (m.speed + s.speed)
+    gear, friction = effects.gear(e, m.angle, travel, mean_speed, mean)
+    leverage = p.gear_gain * gear + p.load_friction * friction * mean
+    if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain:
+        return np.nan, leverage, 1.0
+    motor_torque = effects.motor_torque(e, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
+    offset_friction = p.offset_friction * friction
+    torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
+    turning = p.presliding_sigma * (1.0 - mean * mean)
+    return torque, leverage, s.friction_variance + turning * turning

@@ -1,0 +1,240 @@
+"""Faults of bus, machine and clock around a daemon whose ticks the test makes: which flag rises, for how long, and what the
+estimate does meanwhile."""
+
+import errno
+import logging
+import os
+import time
+from pathlib import Path
+
+import adaptkit
+import numpy as np
+import pytest
+from test_pipeline import _run, _sliding, car  # noqa: F401
+
+from emb_daemon.adapt import memory
+from emb_daemon.adapt.memory import Memory, Store
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.estimator import records as r
+from emb_daemon.pipeline import CYCLE_NS
+from emb_daemon.runtime.daemon import Daemon, Pacer
+from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.wire.frames import ERROR, FRAME
+
+CONFIG = Path(__file__).parent.parent / "config" / "emb.yaml"
+_SHOWN_CYCLES = 250
+
+
+class Bus:
+    """A bus whose state the test sets; it delivers what was put on it."""
+
+    def __init__(self):
+        self.waiting: list[np.ndarray] = []
+        self.dropped = self.unsent = 0
+        self.down = False
+
+    def drain(self):
+        frames = np.concatenate(self.waiting) if self.waiting and not self.down else np.zeros(0, FRAME)
+        self.waiting = []
+        return frames
+
+    def send(self, frames):
+        if self.down:
+            self.unsent += len(frames)
+
+
+class Driven:
+    """One corner of a daemon, ticked once a cycle by the test's clock, with a drive on its bus."""
+
+    def __init__(self):
+        self.bus = Bus()
+        self.daemon = Daemon(Setup(CONFIG), self.bus)
+        self.daemon.pipeline.corners["active"] = [True, False, False, False]
+        self.daemon.pipeline.begin(0)
+        self.pacer = Pacer(0)
+        self.cycle = 0
+        self.estimates: list[np.void] = []
+        self._drive: dict[int, list[np.ndarray]] = {}
+        for frame in _sliding(900):
+            self._drive.setdefault(round(frame["time_ns"][0] / CYCLE_NS), []).append(frame)
+        follow = self.daemon._follow
+        self.daemon._follow = lambda count, pacer: (self._keep(count), follow(count, pacer))
+
+    def _keep(self, count):
+        self.estimates += [row.copy() for row in self.daemon.pipeline.estimates[:count]]
+
+    def run(self, cycles, ticks=None, lose=False):
+        """``cycles`` of the drive, with a tick after each, or with the last ``ticks`` alone: a stall."""
+        first = len(self.estimates)
+        for number in range(cycles):
+            if not lose:
+                self.bus.waiting += self._drive[self.cycle]
+            self.cycle += 1
+            if ticks is None or number >= cycles - ticks:
+                now = self.cycle * CYCLE_NS - CYCLE_NS // 2
+                self.daemon._count(now, self.pacer)
+                self.daemon.tick(now, self.pacer)
+        return np.array(self.estimates[first:])
+
+
+@pytest.fixture
+def driven():
+    made = Driven()
+    made.run(150)
+    return made
+
+
+def _reasons(estimates):
+    return np.unique(estimates["reasons"]).tolist()
+
+
+def test_bus_off_and_recovery(driven):
+    """An error frame of the controller: Bus disturbed for a second, the force goes on."""
+    off = np.zeros(1, FRAME)
+    off["time_ns"], off["can_id"], off["flags"], off["length"] = driven.cycle * CYCLE_NS, 0x40, ERROR, 8
+    driven.bus.waiting.append(off)
+    during = driven.run(_SHOWN_CYCLES)
+    assert np.all(during["reasons"][1:] == r.BUS_DISTURBED) and np.all(during["mode"][1:] == r.DEGRADED)
+    assert np.all(during["source"] == r.FUSED)
+    assert _reasons(driven.run(50)[2:]) == [0]
+
+
+def test_interface_down_and_up(driven):
+    """Predictions with growing sigma, a fault after a tenth of a second, Bus disturbed as long and for a second more; the
+    first sample back is an estimate, without a restart."""
+    before = driven.estimates[-1]
+    driven.bus.down = True
+    down = driven.run(60)
+    assert np.all(down["reasons"][1:] & r.BUS_DISTURBED) and np.all(down["reasons"][3:] & r.RESOLVER_LOST)
+    assert down["source"][5] == r.PREDICTED and down["source"][-1] == r.INVALID and down["mode"][-1] == r.FAULT
+    assert np.all(np.diff(down["sigma"]) >= 0.0) and down["sigma"][-1] > 3.0 * before["sigma"]
+    driven.bus.down = False
+    up = driven.run(_SHOWN_CYCLES + 30)
+    assert up["is_sample"][0] and up["source"][0] != r.INVALID and up["reasons"][0] & r.BUS_DISTURBED
+    assert up["reasons"][-1] == 0 and up["source"][-1] == r.FUSED
+    assert driven.bus.unsent > 0
+
+
+def test_receive_overflow(driven):
+    """Frames that the kernel dropped: Bus disturbed for a second, the lost samples are no news and no fault."""
+    driven.run(2, lose=True)
+    driven.bus.dropped += 12
+    after = driven.run(_SHOWN_CYCLES + 30)
+    assert after["reasons"][1] & r.BUS_DISTURBED and after["reasons"][-1] == 0
+    assert np.all(after["is_sample"]) and after["source"][-1] == r.FUSED
+    assert after["cycle"][-1] == driven.cycle - 1
+
+
+@pytest.mark.parametrize("stall_ms", [12, 100, 500])
+def test_process_stall(driven, stall_ms):
+    """All samples that waited are answered, with the forces of a loop that never stood still; Deadline missed for a second."""
+    smooth = Driven()
+    smooth.run(150)
+    cycles = stall_ms // 4
+    stalled, expected = driven.run(cycles, ticks=1), smooth.run(cycles)
+    assert len(stalled[stalled["is_sample"]]) == cycles
+    np.testing.assert_array_equal(stalled[stalled["is_sample"]]["force"], expected["force"])
+    assert driven.daemon.missed >= cycles - 1 and smooth.daemon.missed == 0
+    after = driven.run(_SHOWN_CYCLES + 20)
+    assert after["reasons"][5] == r.DEADLINE_MISSED and after["reasons"][-1] == 0 and np.all(after["source"] == r.FUSED)
+
+
+def test_step_of_the_real_time_clock(monkeypatch):
+    """Kernel stamps are of CLOCK_REALTIME. Stepped by an hour either way while frames wait, none comes from the past or the
+    future, and order is kept."""
+    near, far = socket_pair()
+    far._stamped = False
+    real = time.time_ns
+    for step_ns in (3_600_000_000_000, -3_600_000_000_000, 0):
+        frames = np.zeros(3, FRAME)
+        frames["can_id"], frames["length"], frames["data"] = 0x100, 8, np.arange(3)
+        last = time.monotonic_ns()
+        near.send(frames)
+        monkeypatch.setattr(time, "time_ns", lambda step=step_ns: real() + step)
+        heard = far.drain()
+        assert np.array_equal(heard["data"], np.arange(3))
+        assert np.all(np.diff(heard["time_ns"]) >= 0) and heard["time_ns"][0] >= last - 1_000_000_000
+        assert heard["time_ns"][-1] <= time.monotonic_ns()
+    near.close()
+    far.close()
+
+
+def test_a_stamp_before_the_last_drain_or_after_now_is_held_between_them():
+    near, far = socket_pair()
+    far.drain()
+    earliest = far._last_drain_ns
+    for wrong in (-(10**12), 10**12):
+        batch = far._received
+        batch.raw["time_ns"][:1] = earliest + wrong
+        batch.headers["length"][:1] = 24
+        batch.headers["control_length"][:1] = 0
+        now = time.monotonic_ns()
+        assert far._take(1, now)[0] == 1
+        assert earliest <= far._frames["time_ns"][0] <= now
+    near.close()
+    far.close()
+
+
+def test_a_peer_that_is_gone_sends_nothing():
+    """The end of a socket pair reads as empty messages for ever."""
+    near, far = socket_pair()
+    frames = np.zeros(2, FRAME)
+    frames["can_id"], frames["length"] = 0x123, 8
+    near.send(frames)
+    near.close()
+    assert len(far.drain()) == 2
+    assert len(far.drain()) == 0 and not far.down
+    far.close()
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+def test_full_disk_under_the_state_directory(tmp_path, monkeypatch, caplog, code):
+    """The old file stays whole, the journal says so, and nothing else notices."""
+    memory_ = Memory(tmp_path)
+    calibration = adaptkit.shipped()
+    old, _ = memory_.load("FL", calibration)
+    memory_.save(old)
+    content = memory_.path("FL").read_bytes()
+
+    def full(*_):
+        raise OSError(code, os.strerror(code))
+
+    loop = adaptkit.ClosedLoop(tmp_path)
+    monkeypatch.setattr(os, "fsync", full)
+    learned = np.zeros(1, memory.LEARNED)[0]
+    learned["curve"][0] = 100.0
+    with caplog.at_level(logging.ERROR):
+        loop.adaptation._settle(loop.adaptation._stores[0], memory.VERDICTS.index("accepted"), learned, 0, 20.0, 0.0)
+    assert "could not be written" in caplog.text and os.strerror(code) in caplog.text
+    assert memory_.path("FL").read_bytes() == content
+    assert [path.name for path in tmp_path.iterdir()] == ["adaptation-FL.json"], "nothing half written is left"
+    assert isinstance(memory_.read("FL"), Store)
+    assert loop.adaptation.current("FL") is not None, "what was learned is in use all the same"
+
+
+def test_calibration_replaced_while_clamped(driven):
+    """Other parameters from one tick to the next: every estimate stays a number, the force follows the new curve."""
+    setup = Setup(CONFIG)
+    setup.parameters["curve"] *= 1.1
+    driven.daemon._reloaded = setup, []
+    driven.daemon._take_calibration()
+    after, old = driven.run(100), Driven()
+    old.run(150)
+    ratio = after["stiffness_force"] / old.run(100)["stiffness_force"]
+    assert np.all(after["source"] == r.FUSED) and np.all(after["sigma"] > 0.0) and np.all(np.isfinite(after["force"]))
+    assert 1.0 < ratio[0] < 1.1 and ratio[-1] == pytest.approx(1.1, abs=0.03)
+
+
+def test_swapped_messages_of_a_pair_are_one_sample(car):  # noqa: F811
+    """Current before resolver, each cycle: nothing is lost and no force differs."""
+    swapped = []
+    for cycle in range(300):
+        frames = _sliding(1, first=cycle)
+        pair = {int(f["can_id"][0]): f for f in frames}
+        pair[0x100]["time_ns"], pair[0x110]["time_ns"] = int(pair[0x110]["time_ns"][0]), int(pair[0x100]["time_ns"][0])
+        swapped += frames
+    frames = np.concatenate(swapped)
+    estimates, _ = _run(car, frames[np.argsort(frames["time_ns"], kind="stable")])
+    straight, _ = _run(car, np.concatenate(_sliding(300)))
+    assert len(estimates) == 300 and not estimates["reasons"].any()
+    np.testing.assert_allclose(estimates["force"], straight["force"], atol=1.0)

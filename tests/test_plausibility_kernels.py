@@ -1,0 +1,152 @@
+"""Plausibility by hand: sums, bands and verdicts of single samples. `test_plausibility.py` has whole drives."""
+
+import numpy as np
+import pytest
+
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.models.plausibility import (
+    AGREE,
+    PLAUSIBILITY,
+    STIFFNESS_WRONG,
+    TORQUE_FROZEN,
+    TORQUE_WRONG,
+    UNDECIDED,
+    beyond_friction,
+    count_doubt,
+    force_of_torque_alone,
+    frozen,
+    watch,
+)
+
+_DT = 0.004
+
+
+class Watched:
+    """A resolver and a current that pass by, sample after sample."""
+
+    def __init__(self, doubt=0.0):
+        self.c = np.zeros(1, PLAUSIBILITY)
+        self.c["doubt"] = doubt
+        self.m = np.zeros(1, SAMPLE)
+        self.m["dt"], self.m["has_current"] = _DT, True
+        self._noise = np.random.default_rng(1)
+
+    def pass_by(self, count, speed=0.0, follows=1.0, current=None, past_contact=1.0, confirmed=True, angle_noise=0.0):
+        """``count`` samples at ``speed``; the angle follows it by that share. Returns the last verdict."""
+        m = self.m[0]
+        for _ in range(count):
+            angle, before = float(m["angle"]), float(m["speed"])
+            m["angle"] += follows * speed * _DT + angle_noise * self._noise.standard_normal()
+            m["speed"] = speed
+            m["current_q"] = self._noise.standard_normal() if current is None else current
+            verdict = watch(self.c[0], m, angle, before, past_contact, 0.1, confirmed)
+        return verdict
+
+
+def test_doubt_gives_away_twenty_a_sample_and_counts_at_most_twelve_sigma():
+    c = np.zeros(1, PLAUSIBILITY)
+    for ratio, expected in ((5.0, 5.0), (2.0, 0.0), (-5.0, 5.0), (100.0, 129.0), (np.nan, 129.0), (0.0, 109.0)):
+        count_doubt(c[0], ratio)
+        assert c["doubt"][0] == expected
+    for _ in range(100):
+        count_doubt(c[0], 12.0)
+    assert c["doubt"][0] == 1.5 * 5.0 * 600.0
+
+
+def test_torque_beyond_friction():
+    """4 N m on 100 kN at 4e-5 m/rad carry nothing; friction of 0.05 N m and 1e-6 m/rad takes 0.15 N m, at rest 0.195."""
+    arguments = {"force": 100_000.0, "sigma": 0.5, "gear_gain": 4e-5, "load_friction": 1e-6, "offset_friction": 0.05}
+    for torque, beyond in ((4.0, 0.0), (4.19, 0.0), (4.2, 0.01), (3.81, 0.0), (3.0, 1.61), (5.0, 1.61)):
+        assert beyond_friction(torque, **arguments) == pytest.approx(beyond, abs=1e-12)
+
+
+def test_force_of_torque_alone_settles_on_the_torque_with_friction_for_sigma():
+    c = np.zeros(1, PLAUSIBILITY)[0]
+    for _ in range(200):
+        force, sigma = force_of_torque_alone(c, 0.4, True, _DT, 4e-5, 8e-6, 0.03)
+    assert force == pytest.approx(10_000.0, rel=1e-6)
+    assert sigma == pytest.approx((0.03 + 8e-6 * 10_000.0) / 4e-5, rel=1e-4)
+    after, wider = force_of_torque_alone(c, 0.8, True, _DT, 4e-5, 8e-6, 0.03)
+    share = 1.0 - np.exp(-0.1)
+    assert after == pytest.approx(10_000.0 * (1.0 + share))
+    variance = (1.0 - share) * share * 0.4**2
+    assert wider == pytest.approx(np.hypot(0.03 + 8e-6 * after, np.sqrt(variance)) / 4e-5)
+    assert force_of_torque_alone(c, 99.0, False, _DT, 4e-5, 8e-6, 0.03) == (after, wider), "no current, no news"
+    for _ in range(200):
+        force, sigma = force_of_torque_alone(c, -0.4, True, _DT, 4e-5, 8e-6, 0.03)
+    assert force == 0.0 and sigma == pytest.approx(0.03 / 4e-5, rel=1e-3)
+
+
+def test_a_motion_that_fits_raises_nothing():
+    for speed in (0.0, 50.0, -200.0):
+        assert Watched().pass_by(500, speed=speed) == AGREE
+
+
+def test_doubt_raises_at_600_and_ends_at_150():
+    watched = Watched(600.0)
+    assert watched.pass_by(1, speed=10.0) == AGREE
+    watched.c["doubt"] = 600.1
+    assert watched.pass_by(1, speed=10.0) == UNDECIDED
+    watched.c["doubt"] = 150.1
+    assert watched.pass_by(1, speed=10.0) == UNDECIDED
+    watched.c["doubt"] = 150.0
+    assert watched.pass_by(1, speed=10.0) == AGREE
+
+
+def test_doubt_raises_five_times_later_before_the_contact_is_confirmed():
+    assert Watched(2999.0).pass_by(1, speed=10.0, confirmed=False) == AGREE
+    assert Watched(3001.0).pass_by(1, speed=10.0, confirmed=False) == UNDECIDED
+    frozen_current = Watched(0.0)
+    frozen_current.pass_by(9, speed=10.0, current=1.0, confirmed=False)
+    frozen_current.c["doubt"] = 601.0
+    assert frozen_current.pass_by(1, speed=10.0, current=1.0, confirmed=False) == TORQUE_FROZEN
+
+
+def test_force_without_contact_is_the_torques_fault_and_stays_it():
+    watched = Watched(700.0)
+    assert watched.pass_by(1, speed=10.0, past_contact=-0.59) == UNDECIDED
+    assert watched.pass_by(1, speed=10.0, past_contact=-0.61) == TORQUE_WRONG
+    assert watched.pass_by(1, speed=10.0, past_contact=5.0) == TORQUE_WRONG
+
+
+def test_a_current_that_repeats_while_the_motor_turns_is_frozen():
+    watched = Watched(700.0)
+    assert watched.pass_by(8, speed=10.0, current=3.0) == UNDECIDED
+    assert watched.pass_by(1, speed=10.0, current=3.0) == TORQUE_FROZEN
+    assert frozen(watched.c[0])
+
+
+def test_an_angle_that_repeats_under_torque_that_must_turn_the_motor_is_stuck():
+    watched = Watched(0.0)
+    watched.pass_by(1, speed=0.0)
+    watched.pass_by(7, speed=0.0)
+    watched.c["doubt"] = 700.0
+    assert watched.pass_by(1, speed=0.0) == STIFFNESS_WRONG
+
+
+def test_angle_and_speed_that_repeat_for_fifty_samples_are_stuck_unless_the_motor_stands():
+    watched = Watched()
+    watched.m["speed"] = 0.5
+    assert watched.pass_by(49, speed=0.5, follows=0.0) == AGREE
+    assert watched.pass_by(1, speed=0.5, follows=0.0) == STIFFNESS_WRONG
+    assert watched.c["frozen_s"][0] == pytest.approx(50 * _DT)
+    assert Watched().pass_by(500, speed=0.0) == AGREE
+
+
+def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_does_for_25_samples():
+    """100 rad/s over 0.6 rad and the way of a delay of 10 ms, 1 rad: five samples of 0.4 rad, of which some leak away."""
+    watched = Watched()
+    watched.m["speed"] = 100.0
+    assert watched.pass_by(3, speed=100.0, follows=0.0) == AGREE
+    assert watched.pass_by(2, speed=100.0, follows=0.0) == STIFFNESS_WRONG
+    assert watched.pass_by(24, speed=10.0) == STIFFNESS_WRONG
+    assert watched.pass_by(2, speed=10.0) == AGREE
+    assert watched.c["doubt"][0] == 0.0 and watched.c["frozen_s"][0] == 0.0
+
+
+def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():
+    watched = Watched()
+    watched.pass_by(3, speed=10.0)
+    assert not frozen(watched.c[0])
+    watched.pass_by(2, speed=10.0, current=1.0)
+    assert frozen(watched.c[0])
