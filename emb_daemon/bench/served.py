@@ -101,14 +101,15 @@ class Ledger:
         if self._begun is None:
             return {}
         (begin, used, ticks, missed, resident), end = self._begun, self._stand()
-        columns = (self._rows[: self._used] / 1e3).T
+        *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
             "core_share": (end[1] - used) / (end[0] - begin),
             "ticks": end[2] - ticks,
             "missed": end[3] - missed,
             "resident_KiB": [resident, end[4]],
-            "tick": _quantiles(columns[-1]),
-            "parts": {name: _quantiles(column) for (name, *_), column in zip(_PARTS, columns[:-1], strict=True)},
+            "tick": _quantiles(whole),
+            "parts": {name: _quantiles(part) for (name, *_), part in zip(_PARTS, parts, strict=True)}
+            | {"rest": _quantiles(whole - sum(parts))},
             "wake_up": _quantiles(self._late[: self._woken] / 1e3),
         }
 
