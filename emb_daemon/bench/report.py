@@ -61,14 +61,14 @@ def text(result: dict) -> str:
 
 
 def _loop(loop: dict) -> list[str]:
-    answers, empty = loop["answers"], loop["empty_loop"]
+    answers, beside = loop["answers"], loop["empty_loop"]
     first, last = (value / 1024.0 for value in loop["resident_KiB"])
     title = f"{loop['corners']} corner{'s' if loop['corners'] > 1 else ''}"
     if loop["daemons"] > 1:
         title += f", as {loop['daemons']} daemons of four in one process on a bus each"
     lines = [
         f"{title}, {loop['seconds']:g} s; {'; '.join(loop['measures'])}",
-        f"  {loop['missed']} of {loop['ticks']} ticks missed; {empty['missed']} of {empty['ticks']} by an empty loop beside it",
+        f"  {loop['missed']} of {loop['ticks']} ticks missed, {beside['missed']} of {beside['ticks']} by an empty loop",
         f"  {answers['in_time']} of {answers['samples']} samples answered within their cycle",
         f"  {100 * loop['core_share']:.1f} % of one core; ready after {loop['ready_s']:.1f} s",
         f"  {last:.0f} MiB resident, {last - first:+.1f} after the first second",
@@ -76,7 +76,7 @@ def _loop(loop: dict) -> list[str]:
     ]
     rows = [("tick", loop["tick"]), *((f"  {name}", figures) for name, figures in loop["parts"].items())]
     rows += [("last frame of a sample to its answer", answers), ("wake-up of the daemon", loop["wake_up"])]
-    rows += [("wake-up of an empty loop", empty)]
+    rows += [("wake-up of an empty loop beside it", beside)]
     if loop["cyclictest"]:
         rows.append(("wake-up by cyclictest", loop["cyclictest"]))
     lines += [f"  {name:<36}{figures['p50_us']:8.1f}{figures['p99_us']:8.1f}" for name, figures in rows]

@@ -52,7 +52,7 @@ class Ledger:
         self._late = np.zeros(_ROOM, np.int32)
         self._used = self._woken = 0
         self._spent = [0] * len(_PARTS)
-        self._begun: tuple | None = None
+        self._begun = self._stand()
         for daemon, bus in zip(daemons, buses, strict=True):
             for column, (_, owner, name) in enumerate(_PARTS):
                 self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
@@ -89,8 +89,8 @@ class Ledger:
         if corners["cycle"].sum() > cycles and self._used < _ROOM:
             self._rows[self._used] = [*self._spent, taken]
             self._used += 1
-        if self._used == _SETTLED and self._begun is None:
-            self._begun = self._stand()
+            if self._used == _SETTLED:
+                self._begun = self._stand()
 
     def _stand(self) -> tuple:
         daemon = self._daemons[0]
@@ -98,8 +98,6 @@ class Ledger:
 
     def figures(self) -> dict:
         """Since memory settled: share of a core, ticks and missed ones, memory at both ends; since the start: costs, us."""
-        if self._begun is None:
-            return {}
         (begin, used, ticks, missed, resident), end = self._begun, self._stand()
         *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
