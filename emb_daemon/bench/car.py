@@ -90,7 +90,7 @@ def main() -> None:
     answers = _Answers(live)
     settle_memory()
     use_fifo(priority)
-    print("ready", flush=True)
+    print("ready", time.process_time(), flush=True)
     bus.wait(300.0)
     bus.drain()
     live.run(threading.Event(), seconds, answers.sent, answers.heard)

@@ -31,13 +31,13 @@ _PLAIN = 2000
 
 
 def _medians_s(*functions: Callable[[], object]) -> list[float]:
-    """Median time of each; they take turns, so that what else the machine does meets them alike."""
+    """Median CPU time of each: what else the machine does is not theirs, and meets them alike because they take turns."""
     taken = np.zeros((_REPEATS, len(functions)))
     for repeat in range(_REPEATS):
         for column, function in enumerate(functions):
-            begin = time.perf_counter()
+            begin = time.process_time()
             function()
-            taken[repeat, column] = time.perf_counter() - begin
+            taken[repeat, column] = time.process_time() - begin
     return np.median(taken, axis=0).tolist()
 
 
@@ -58,7 +58,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def measure_logs(seconds: float = 120.0) -> dict:
-    """Figures over a simulated single-corner log of ``seconds``, in memory's page cache and with kernels compiled."""
+    """Figures by CPU time over a simulated single-corner log of ``seconds``, in the page cache and with kernels compiled."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), seconds)
     with tempfile.TemporaryDirectory() as folder:

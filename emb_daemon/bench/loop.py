@@ -34,7 +34,7 @@ class _Child:
     """A module of this package in a process of its own, which prints a line when it is ready and one at its end.
 
     Attributes:
-        ready_s: time from its start to its first line.
+        ready: ``wall_s`` and ``cpu_s`` from its start to its first line.
     """
 
     def __init__(self, module: str, *arguments, inherited: list[socket.socket], environment: dict | None = None):
@@ -49,9 +49,11 @@ class _Child:
         )
         assert self._process.stdout is not None
         said = self._process.stdout.readline()
-        self.ready_s = time.monotonic() - begin
-        if said.strip() != "ready":
+        wall = time.monotonic() - begin
+        word, _, cpu = said.partition(" ")
+        if word != "ready":
             raise RuntimeError(f"bench: {module} ended with status {self._process.wait()} before it was ready")
+        self.ready = {"wall_s": wall, "cpu_s": float(cpu)}
 
     def result(self, patience_s: float = _PATIENCE_S) -> dict:
         """What it prints at its end, which is waited for."""
@@ -86,7 +88,7 @@ def measure_loop(corners: int, seconds: float) -> dict:
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
-        where there is none), and ``ready_s``, the daemon's start.
+        where there is none), and ``ready``, the daemon's start in ``wall_s`` and ``cpu_s``.
     """
     daemons = max(1, corners // len(CORNERS))
     pairs = _buses(daemons)
@@ -114,15 +116,15 @@ def measure_loop(corners: int, seconds: float) -> dict:
         "corners": corners,
         "daemons": daemons,
         "seconds": seconds,
-        "ready_s": served.ready_s,
+        "ready": served.ready,
         **result,
         "answers": answers,
         "cyclictest": latency,
     }
 
 
-def measure_cold_start(corners: int = len(CORNERS)) -> float:
-    """Time (s) from start to ready with nothing compiled yet."""
+def measure_cold_start(corners: int = len(CORNERS)) -> dict:
+    """``wall_s`` and ``cpu_s`` from start to ready with nothing compiled yet."""
     [(ours, theirs)] = _buses(1)
     with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as cache:
         served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment={"NUMBA_CACHE_DIR": cache})
@@ -130,7 +132,7 @@ def measure_cold_start(corners: int = len(CORNERS)) -> float:
             served.stop()
         finally:
             served.kill()
-    return served.ready_s
+    return served.ready
 
 
 def cyclictest(seconds: float) -> dict | None:

@@ -31,8 +31,8 @@ def verdict(result: dict) -> list[dict]:
         (f"share of one core, {corners} corners", 100.0 * loop["core_share"], "<=", 12.0, "%"),
         ("samples answered within their cycle", in_time, ">=", 99.9, "%"),
         ("ticks missed beyond an empty loop's", max(loop["missed"] - empty["missed"], 0), "<=", 0, "ticks"),
-        ("start to ready, compiled before", loop["ready_s"], "<=", 3.0, "s"),
-        ("start to ready, nothing compiled", result["cold_start_s"], "<=", 20.0, "s"),
+        ("start to ready, compiled before", loop["ready"]["wall_s"], "<=", 3.0, "s"),
+        ("start to ready, nothing compiled", result["cold_start"]["wall_s"], "<=", 20.0, "s"),
         ("replay of a single-corner log", logs["replay_times_real_time"], ">=", 1000.0, "times real time"),
         (f"resident memory of the daemon, {corners} corners", last, "<=", 250.0, "MiB"),
         ("its growth after the first second", last - first, "<=", 4.0, "MiB"),
@@ -56,7 +56,8 @@ def text(result: dict) -> str:
     lines = [result["machine"]]
     for loop in result["loops"]:
         lines += ["", *_loop(loop)]
-    lines += ["", *_logs(result["logs"]), "", *_verdict(result["verdict"])]
+    lines += ["", *_logs(result["logs"]), f"start with nothing compiled: ready after {_start(result['cold_start'])}"]
+    lines += ["", *_verdict(result["verdict"])]
     return "\n".join(lines)
 
 
@@ -70,7 +71,7 @@ def _loop(loop: dict) -> list[str]:
         f"{title}, {loop['seconds']:g} s; {'; '.join(loop['measures'])}",
         f"  {loop['missed']} of {loop['ticks']} ticks missed, {beside['missed']} of {beside['ticks']} by an empty loop",
         f"  {answers['in_time']} of {answers['samples']} samples answered within their cycle",
-        f"  {100 * loop['core_share']:.1f} % of one core; ready after {loop['ready_s']:.1f} s",
+        f"  {100 * loop['core_share']:.1f} % of one core; ready after {_start(loop['ready'])}",
         f"  {last:.0f} MiB resident, {last - first:+.1f} after the first second",
         f"  {'us':<36}{'p50':>8}{'p99':>8}",
     ]
@@ -88,7 +89,7 @@ def _loop(loop: dict) -> list[str]:
 def _logs(logs: dict) -> list[str]:
     step, bulk, single = logs["step"], logs["decode_frames_per_s"], logs["cantools_decode_frames_per_s"]
     lines = [
-        f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames/s:",
+        f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames per second of CPU time:",
         f"  read {logs['read_frames_per_s'] / 1e6:.1f}; replayed {logs['replay_frames_per_s'] / 1e6:.2f}, "
         f"{logs['replay_times_real_time']:.0f} times real time",
         f"  decoded {bulk / 1e6:.1f} with E2E check; {single / 1e6:.2f} by cantools, frame by frame, without",
@@ -100,6 +101,10 @@ def _logs(logs: dict) -> list[str]:
         lines.append(f"      in C: not measured: {step['c_missing']}")
     lines.append(f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}")
     return lines
+
+
+def _start(ready: dict) -> str:
+    return f"{ready['wall_s']:.1f} s, {ready['cpu_s']:.1f} s of them on a CPU"
 
 
 def _equal(difference: float) -> str:

@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
         "machine": machine(),
         "loops": [measure_loop(corners, arguments.seconds) for corners in arguments.corners],
         "logs": measure_logs(),
-        "cold_start_s": measure_cold_start(),
+        "cold_start": measure_cold_start(),
     }
     result["verdict"] = verdict(result)
     print(json.dumps(result, indent=1) if arguments.json else text(result))
