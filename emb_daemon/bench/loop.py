@@ -123,11 +123,12 @@ def measure_loop(corners: int, seconds: float) -> dict:
     }
 
 
-def measure_cold_start(corners: int = len(CORNERS)) -> dict:
-    """``wall_s`` and ``cpu_s`` from start to ready with nothing compiled yet."""
+def measure_start(corners: int = len(CORNERS), cold: bool = False) -> dict:
+    """``wall_s`` and ``cpu_s`` from start to ready, with the kernels that are in the cache or ``cold`` with none."""
     [(ours, theirs)] = _buses(1)
-    with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as cache:
-        served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment={"NUMBA_CACHE_DIR": cache})
+    with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as empty_cache:
+        environment = {"NUMBA_CACHE_DIR": empty_cache} if cold else None
+        served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
         try:
             served.stop()
         finally:

@@ -8,6 +8,7 @@ tick of one loop: that is no service of this package, whose process has four cor
 import gc
 import json
 import math
+import os
 import signal
 import socket
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_daemon import jit
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.runtime import daemon as loop
 from emb_daemon.runtime.journal import set_up_logging
@@ -137,6 +139,8 @@ def main() -> None:
     daemons = [loop.Daemon(setup, bus, state=state / str(number)) for number, bus in enumerate(buses)]
     for daemon in daemons:
         daemon.warm_up()
+    if jit.compiled_for_the_next_start():
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     signal.signal(signal.SIGTERM, lambda *_: daemons[0].stop())
     ledger = Ledger(daemons, buses)
     realtime = setup.configuration.realtime
