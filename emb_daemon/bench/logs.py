@@ -1,63 +1,131 @@
-"""The log path: read, decode, estimate; and the cost of one compiled step."""
+"""The log path: read, decode, estimate; and the step beside the same in C and in plain Python."""
 
+import os
+import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.bench.twin import Twin
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
-from emb_daemon.offline import estimate, load_log
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, simulate_log
 from emb_daemon.replay import Replay
 from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
 
-_REPEATS = 5
+_REPEATS = 7
 _ONE_BY_ONE = 20_000
+#: Samples that plain Python steps through.
+_PLAIN = 2000
 
 
-def _median_s(function) -> float:
-    taken = []
-    for _ in range(_REPEATS):
-        begin = time.perf_counter()
-        function()
-        taken.append(time.perf_counter() - begin)
-    return float(np.median(taken))
+def _medians_s(*functions: Callable[[], object]) -> list[float]:
+    """Median CPU time of each: what else the machine does is not theirs, and meets them alike because they take turns."""
+    taken = np.zeros((_REPEATS, len(functions)))
+    for repeat in range(_REPEATS):
+        for column, function in enumerate(functions):
+            begin = time.process_time()
+            function()
+            taken[repeat, column] = time.process_time() - begin
+    return np.median(taken, axis=0).tolist()
+
+
+def difference(one: np.ndarray, other: np.ndarray) -> float:
+    """Largest relative difference of two arrays of ESTIMATE rows: 0 where they are the same to the last bit, infinite where a
+    whole number or a flag differs, or one is NaN and the other is not."""
+    largest = 0.0
+    for name in one.dtype.names:
+        a, b = one[name], other[name]
+        if a.dtype.kind != "f":
+            largest = largest if np.array_equal(a, b) else np.inf
+            continue
+        differ = (a != b) & ~(np.isnan(a) & np.isnan(b))
+        if np.any(differ):
+            off = np.abs(a[differ] - b[differ]) / np.maximum(np.abs(a[differ]), np.abs(b[differ]))
+            largest = max(largest, float(np.max(np.nan_to_num(off, nan=np.inf))))
+    return largest
 
 
 def measure_logs(seconds: float = 120.0) -> dict:
-    """Median figures over a simulated single-corner log of ``seconds``, in memory's page cache and with kernels compiled."""
+    """Figures by CPU time over a simulated single-corner log of ``seconds``, in the page cache and with kernels compiled."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), seconds)
-    parameters = to_parameters(calibration)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.log"
         write_frames(path, frames)
-        log = load_log(path)
-        estimate(log.samples[:10], parameters)
         Replay(calibration).run(path)
-        read = _median_s(lambda: read_frames(path))
-        replay = _median_s(lambda: Replay(calibration).run(path))
-    step = _median_s(lambda: estimate(log.samples, parameters)) / len(log.samples)
-    database = load_database(resource("dbc/emb.dbc"))
-    known = {message.frame_id for message in database.messages}
-    some = [
-        (int(frame["can_id"]), int(frame["data"]).to_bytes(8, "little"))
-        for frame in frames[:_ONE_BY_ONE]
-        if int(frame["can_id"]) in known
-    ]
-    one_by_one = _median_s(lambda: [database.decode_message(can_id, data) for can_id, data in some]) / len(some)
+        read, replay = _medians_s(lambda: read_frames(path), lambda: Replay(calibration).run(path))
+    bulk, one_by_one = _decoders(frames)
     return {
         "seconds": seconds,
         "frames": len(frames),
-        "step_us": 1e6 * step,
         "read_frames_per_s": len(frames) / read,
         "replay_frames_per_s": len(frames) / replay,
         "replay_times_real_time": seconds / replay,
-        "cantools_decode_frames_per_s": 1.0 / one_by_one,
+        "decode_frames_per_s": bulk,
+        "cantools_decode_frames_per_s": one_by_one,
+        "step": measure_step(log_of(frames).samples, np.atleast_1d(to_parameters(calibration))),
     }
+
+
+def _decoders(frames: np.ndarray) -> tuple[float, float]:
+    """Frames per second that the pipeline decodes, E2E check and samples included, and that cantools decodes one by one."""
+    database = load_database(resource("dbc/emb.dbc"))
+    known = [message.frame_id for message in database.messages]
+    some = frames[np.isin(frames["can_id"], known)][:_ONE_BY_ONE]
+    pairs = [(int(frame["can_id"]), int(frame["data"]).to_bytes(8, "little")) for frame in some]
+    # One for each turn: a frame that comes twice is refused.
+    pipelines = iter([Pipeline(np.zeros(4, PARAMETERS), ("FL",), capacity=_ONE_BY_ONE) for _ in range(_REPEATS)])
+
+    def bulk() -> None:
+        next(pipelines).collect(some, predictions=False)
+
+    def one_by_one() -> None:
+        for can_id, data in pairs:
+            database.decode_message(can_id, data)
+
+    return tuple(len(some) / taken for taken in _medians_s(bulk, one_by_one))
+
+
+def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict:
+    """The compiled step over SAMPLE rows, PARAMETERS of shape (1,), beside the same in C and in plain Python.
+
+    Returns:
+        ``compiled_us``, ``c_us`` and ``plain_us`` of one step, and ``c_difference``, ``plain_difference`` as `difference`
+        has it. Plain Python may be off by the last bit: its x ** 2 goes through pow(), which need not round as a product
+        does. What C needs and is not there is named in ``c_missing``.
+    """
+    compiled = estimate(samples, parameters)
+    result: dict = {"samples": len(samples)}
+    try:
+        twin = Twin()
+    except FileNotFoundError as error:
+        result["c_missing"] = str(error)
+        [taken] = _medians_s(lambda: estimate(samples, parameters))
+    else:
+        taken, c_taken = _medians_s(lambda: estimate(samples, parameters), lambda: twin.estimate(samples, parameters))
+        result["c_us"] = 1e6 * c_taken / len(samples)
+        result["c_difference"] = difference(twin.estimate(samples, parameters), compiled)
+        result["compiler"] = twin.version
+    result["compiled_us"] = 1e6 * taken / len(samples)
+    with tempfile.TemporaryDirectory() as folder:
+        files = [f"{folder}/{name}.npy" for name in ("samples", "parameters", "estimates")]
+        np.save(files[0], samples[:_PLAIN])
+        np.save(files[1], parameters)
+        command = [sys.executable, "-m", "emb_daemon.bench.plain", *files]
+        environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+        result["plain_us"] = float(done.stdout)
+        result["plain_difference"] = difference(np.load(files[2]), compiled[:_PLAIN])
+    return result

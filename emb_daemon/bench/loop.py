@@ -1,4 +1,4 @@
-"""The daemon at its cadence: what a tick costs in parts, what is missed, how soon a sample is answered."""
+"""The daemon at its cadence: what a tick costs in parts, what is missed, how soon a sample is answered, memory, start."""
 
 import json
 import os
@@ -6,109 +6,134 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from emb_daemon.bench import empty
-from emb_daemon.calibration.configuration import Setup
 from emb_daemon.resources import resource
-from emb_daemon.runtime.daemon import Daemon
-from emb_daemon.runtime.rawcan import RawCanSocket
-from emb_daemon.runtime.realtime import settle_memory, use_fifo
 from emb_daemon.wire.layout import CORNERS
 
+#: The daemon's own; the car comes before it, as the senders on a bus do.
 _PRIORITY = 60
-_PARTS = (("drain", "bus"), ("collect", "pipeline"), ("answer", "pipeline"), ("broadcast", "pipeline"), ("send", "bus"))
-_LABELS = {"drain": "drain", "collect": "decode", "answer": "step", "broadcast": "encode", "send": "send"}
+_CAR_PRIORITY = 65
+_PATIENCE_S = 300.0
 
 
-class _Stopwatch:
-    """Calls through to a method and keeps how long each took, ns."""
-
-    def __init__(self, method, room: int):
-        self._method = method
-        self._taken = np.zeros(room, np.int64)
-        self._count = 0
-
-    def __call__(self, *arguments, **options):
-        begin = time.perf_counter_ns()
-        result = self._method(*arguments, **options)
-        if self._count < len(self._taken):
-            self._taken[self._count] = time.perf_counter_ns() - begin
-            self._count += 1
-        return result
-
-    def figures(self) -> dict[str, float]:
-        taken = self._taken[: self._count] / 1e3
-        return {"p50_us": float(np.median(taken)), "p99_us": float(np.percentile(taken, 99))} if len(taken) else {}
+def _buses(count: int) -> list[tuple[socket.socket, socket.socket]]:
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(count)]
+    for end in (end for pair in pairs for end in pair):
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    return pairs
 
 
-def _resident_kib() -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1])
-    return 0
+class _Child:
+    """A module of this package in a process of its own, which prints a line when it is ready and one at its end.
+
+    Attributes:
+        ready: ``wall_s`` and ``cpu_s`` from its start to its first line.
+    """
+
+    def __init__(self, module: str, *arguments, inherited: list[socket.socket], environment: dict | None = None):
+        command = [sys.executable, "-m", f"emb_daemon.bench.{module}", *map(str, arguments)]
+        begin = time.monotonic()
+        self._process = subprocess.Popen(
+            command,
+            pass_fds=[end.fileno() for end in inherited],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | (environment or {}),
+        )
+        assert self._process.stdout is not None
+        said = self._process.stdout.readline()
+        wall = time.monotonic() - begin
+        word, _, cpu = said.partition(" ")
+        if word != "ready":
+            raise RuntimeError(f"bench: {module} ended with status {self._process.wait()} before it was ready")
+        self.ready = {"wall_s": wall, "cpu_s": float(cpu)}
+
+    def result(self, patience_s: float = _PATIENCE_S) -> dict:
+        """What it prints at its end, which is waited for."""
+        return json.loads(self._process.communicate(timeout=patience_s)[0])
+
+    def stop(self) -> dict:
+        self._process.terminate()
+        return self.result()
+
+    def kill(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.communicate()
+
+
+@contextmanager
+def _configured(corners: int) -> Iterator[list]:
+    """Configuration and state folder, as arguments of `bench.served`."""
+    with tempfile.TemporaryDirectory() as folder:
+        calibration = str(resource("config/calibration.yaml"))
+        lines = [f"  {name}: {{calibration: {calibration!r}}}" for name in CORNERS[:corners]]
+        config = Path(folder) / "emb.yaml"
+        config.write_text("\n".join(["format: 1", "log_level: error", "corners:", *lines, ""]))
+        yield [config, Path(folder) / "state"]
 
 
 def measure_loop(corners: int, seconds: float) -> dict:
-    """Run the real daemon for ``corners`` brakes of a simulated car in a process of its own, and an empty loop beside it.
+    """Run the real daemon for the brakes of a simulated car, each in a process of its own, and beside them an empty loop and,
+    where it is installed, cyclictest.
 
-    Returns cost of a tick and of its parts, latency from a sample's last frame to its answer, ticks missed here and by the
-    empty loop, share of one core, and resident memory at start and end.
+    More than four ``corners`` are several daemons of four in one process, each on its own bus.
+
+    Returns:
+        What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
+        where there is none), and ``ready``, the daemon's start in ``wall_s`` and ``cpu_s``.
     """
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    for end in (ours, theirs):
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-    with tempfile.TemporaryDirectory() as folder:
-        lines = [f"  {name}: {{calibration: {str(resource('config/calibration.yaml'))!r}}}" for name in CORNERS[:corners]]
-        config = Path(folder) / "emb.yaml"
-        config.write_text("\n".join(["format: 1", "corners:", *lines, ""]))
-        setup = Setup(config)
-    bus = RawCanSocket(ours, stamped=True)
-    daemon = Daemon(setup, bus)
-    daemon.warm_up()
-    room = int(seconds * 600)
-    watches = {}
-    for name, owner in _PARTS:
-        holder = bus if owner == "bus" else daemon.pipeline
-        watches[name] = _Stopwatch(getattr(holder, name), room)
-        setattr(holder, name, watches[name])
-    daemon.tick = whole = _Stopwatch(daemon.tick, room)
+    daemons = max(1, corners // len(CORNERS))
+    pairs = _buses(daemons)
+    each = corners // daemons
+    car = _Child(
+        "car", each, seconds, _CAR_PRIORITY, *(theirs.fileno() for _, theirs in pairs), inherited=[b for _, b in pairs]
+    )
+    served = None
+    try:
+        with _configured(each) as arguments:
+            served = _Child("served", *arguments, *(ours.fileno() for ours, _ in pairs), inherited=[a for a, _ in pairs])
+            command = [sys.executable, empty.__file__, str(seconds), str(_PRIORITY)]
+            with subprocess.Popen(command, stdout=subprocess.PIPE) as nothing:
+                latency = cyclictest(seconds)
+                answers = car.result(seconds + _PATIENCE_S)
+                result = served.stop()
+                result["empty_loop"] = json.loads(nothing.communicate()[0])
+    finally:
+        for child in filter(None, (car, served)):
+            child.kill()
+        # Not before: a bus goes on without the car, a socket without its other end does not.
+        for end in (end for pair in pairs for end in pair):
+            end.close()
+    return {
+        "corners": corners,
+        "daemons": daemons,
+        "seconds": seconds,
+        "ready": served.ready,
+        **result,
+        "answers": answers,
+        "cyclictest": latency,
+    }
 
-    car = [sys.executable, "-m", "emb_daemon.bench.car", str(theirs.fileno()), str(corners), str(seconds), str(_PRIORITY + 5)]
-    beside = [sys.executable, empty.__file__, str(seconds), str(_PRIORITY)]
-    with subprocess.Popen(car, pass_fds=[theirs.fileno()], stdout=subprocess.PIPE, text=True) as driving:
-        theirs.close()
-        # The car says nothing before it hears us; its first frames are the sign that it has finished compiling.
-        result: dict = {"corners": corners, "seconds": seconds}
 
-        def run() -> None:
-            result["scheduling"] = use_fifo(_PRIORITY)
-            daemon.run()
-
-        settle_memory()
-        loop = threading.Thread(target=run)
-        loop.start()
-        while not daemon.pipeline.corners["started"][0] and driving.poll() is None:
-            time.sleep(0.05)
-        memory, missed, ticks, used = _resident_kib(), daemon.missed, daemon.ticks, time.process_time()
-        begin = time.monotonic()
-        with subprocess.Popen(beside, stdout=subprocess.PIPE, text=True) as nothing:
-            answers = json.loads(driving.communicate()[0])
-            result["core_share"] = (time.process_time() - used) / (time.monotonic() - begin)
-            result["missed"], result["ticks"] = daemon.missed - missed, daemon.ticks - ticks
-            result["resident_KiB"] = [memory, _resident_kib()]
-            result["empty_loop"] = json.loads(nothing.communicate()[0])
-        daemon.stop()
-        loop.join()
-    bus.close()
-    result["answers"] = answers
-    result["tick"] = whole.figures()
-    result["parts"] = {_LABELS[name]: watch.figures() for name, watch in watches.items()}
-    return result
+def measure_start(corners: int = len(CORNERS), cold: bool = False) -> dict:
+    """``wall_s`` and ``cpu_s`` from start to ready, with the kernels that are in the cache or ``cold`` with none."""
+    [(ours, theirs)] = _buses(1)
+    with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as empty_cache:
+        environment = {"NUMBA_CACHE_DIR": empty_cache} if cold else None
+        served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
+        try:
+            served.stop()
+        finally:
+            served.kill()
+    return served.ready
 
 
 def cyclictest(seconds: float) -> dict | None:

@@ -1,0 +1,126 @@
+"""What a bench's figures say: every budget with its margin, and all of it as text."""
+
+import math
+
+
+def verdict(result: dict) -> list[dict]:
+    """Each budget: ``measured``, ``limit``, ``unit``, and ``met``, whether the machine holds it.
+
+    Budgets of the loop are for the run with four corners, or the last one if there was none. ``sense`` says which side of the
+    limit is good, ``margin`` how far, as a share of the limit. A figure that could not be measured is NaN and not met.
+    """
+    loop = next((loop for loop in result["loops"] if loop["corners"] == 4), result["loops"][-1])
+    logs, step, answers, empty = result["logs"], result["logs"]["step"], loop["answers"], loop["empty_loop"]
+    corners = loop["corners"]
+    wake = loop["cyclictest"] or empty
+    whose = "cyclictest's" if loop["cyclictest"] else "an empty loop's"
+    first, last = (value / 1024.0 for value in loop["resident_KiB"])
+    ratio = step["compiled_us"] / step["c_us"] if "c_us" in step else math.nan
+    in_time = 100.0 * answers["in_time"] / max(answers["samples"], 1)
+    budgets = [
+        ("compiled step of one corner, both pads", step["compiled_us"], "<=", 3.0, "us"),
+        ("the same over C", ratio, "<=", 1.5, "times"),
+        (f"tick of {corners} corners, p99", loop["tick"]["p99_us"], "<=", 500.0, "us"),
+        (
+            f"last frame of a sample to answer, p99, above {whose} wake-up",
+            answers["p99_us"] - wake["p99_us"],
+            "<=",
+            600.0,
+            "us",
+        ),
+        (f"share of one core, {corners} corners", 100.0 * loop["core_share"], "<=", 12.0, "%"),
+        ("samples answered within their cycle", in_time, ">=", 99.9, "%"),
+        ("ticks missed beyond an empty loop's", max(loop["missed"] - empty["missed"], 0), "<=", 0, "ticks"),
+        ("start to ready, compiled before", loop["ready"]["wall_s"], "<=", 3.0, "s"),
+        ("start to ready, nothing compiled", result["cold_start"]["wall_s"], "<=", 20.0, "s"),
+        ("replay of a single-corner log", logs["replay_times_real_time"], ">=", 1000.0, "times real time"),
+        (f"resident memory of the daemon, {corners} corners", last, "<=", 250.0, "MiB"),
+        ("its growth after the first second", last - first, "<=", 4.0, "MiB"),
+    ]
+    return [
+        {
+            "budget": name,
+            "measured": value,
+            "sense": sense,
+            "limit": limit,
+            "unit": unit,
+            "margin": ((limit - value) if sense == "<=" else (value - limit)) / limit if limit else None,
+            "met": bool(value <= limit if sense == "<=" else value >= limit),
+        }
+        for name, value, sense, limit, unit in budgets
+    ]
+
+
+def text(result: dict) -> str:
+    """The figures as tables of text and the verdict."""
+    lines = [result["machine"]]
+    for loop in result["loops"]:
+        lines += ["", *_loop(loop)]
+    lines += ["", *_logs(result["logs"]), f"start with nothing compiled: ready after {_start(result['cold_start'])}"]
+    lines += ["", *_verdict(result["verdict"])]
+    return "\n".join(lines)
+
+
+def _loop(loop: dict) -> list[str]:
+    answers, beside = loop["answers"], loop["empty_loop"]
+    first, last = (value / 1024.0 for value in loop["resident_KiB"])
+    title = f"{loop['corners']} corner{'s' if loop['corners'] > 1 else ''}"
+    if loop["daemons"] > 1:
+        title += f", as {loop['daemons']} daemons of four in one process on a bus each"
+    lines = [
+        f"{title}, {loop['seconds']:g} s; {'; '.join(loop['measures'])}",
+        f"  {loop['missed']} of {loop['ticks']} ticks missed, {beside['missed']} of {beside['ticks']} by an empty loop",
+        f"  {answers['in_time']} of {answers['samples']} samples answered within their cycle",
+        f"  {100 * loop['core_share']:.1f} % of one core; ready after {_start(loop['ready'])}",
+        f"  {last:.0f} MiB resident, {last - first:+.1f} after the first second",
+        f"  {'us':<36}{'p50':>8}{'p99':>8}",
+    ]
+    rows = [("tick", loop["tick"]), *((f"  {name}", figures) for name, figures in loop["parts"].items())]
+    rows += [("last frame of a sample to its answer", answers), ("wake-up of the daemon", loop["wake_up"])]
+    rows += [("wake-up of an empty loop beside it", beside)]
+    if loop["cyclictest"]:
+        rows.append(("wake-up by cyclictest", loop["cyclictest"]))
+    lines += [f"  {name:<36}{figures['p50_us']:8.1f}{figures['p99_us']:8.1f}" for name, figures in rows]
+    if not loop["cyclictest"]:
+        lines.append("  cyclictest is not installed (package rt-tests), or real-time priority was refused")
+    return lines
+
+
+def _logs(logs: dict) -> list[str]:
+    step, bulk, single = logs["step"], logs["decode_frames_per_s"], logs["cantools_decode_frames_per_s"]
+    lines = [
+        f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames per second of CPU time:",
+        f"  read {logs['read_frames_per_s'] / 1e6:.1f}; replayed {logs['replay_frames_per_s'] / 1e6:.2f}, "
+        f"{logs['replay_times_real_time']:.0f} times real time",
+        f"  decoded {bulk / 1e6:.1f} with E2E check; {single / 1e6:.2f} by cantools, frame by frame, without",
+        f"step: {step['compiled_us']:.2f} us compiled",
+    ]
+    if "c_us" in step:
+        lines.append(f"      {step['c_us']:.2f} us in C ({step['compiler']}, -O2), {_equal(step['c_difference'])}")
+    else:
+        lines.append(f"      in C: not measured: {step['c_missing']}")
+    lines.append(f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}")
+    return lines
+
+
+def _start(ready: dict) -> str:
+    return f"{ready['wall_s']:.1f} s, {ready['cpu_s']:.1f} s of them on a CPU"
+
+
+def _equal(difference: float) -> str:
+    if difference == 0.0:
+        return "estimates equal to the last bit"
+    return f"estimates equal within {difference:.1g}" if math.isfinite(difference) else "ESTIMATES DIFFER"
+
+
+def _verdict(budgets: list[dict]) -> list[str]:
+    lines = [f"  {'budget':<66}{'measured':>12}{'target':>12}{'margin':>28}"]
+    for budget in budgets:
+        figure = "not measured" if math.isnan(budget["measured"]) else f"{budget['measured']:.3g}"
+        sign = "≤" if budget["sense"] == "<=" else "≥"
+        margin = "" if budget["margin"] is None or math.isnan(budget["margin"]) else f"{100 * budget['margin']:+.0f} %"
+        mark = "met" if budget["met"] else "NOT MET"
+        lines.append(
+            f"  {budget['budget']:<66}{figure:>12}{sign:>4}{budget['limit']:>8g} {budget['unit']:<16}{margin:>11}  {mark}"
+        )
+    return lines

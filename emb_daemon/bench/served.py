@@ -1,0 +1,156 @@
+"""The daemon in a process of its own, on inherited sockets, set up as ``emb-daemon run`` sets it up, with a stopwatch.
+
+Run as ``python -m emb_daemon.bench.served CONFIG STATE FD...``. Prints a line when it is ready, with the CPU time that took,
+and, after SIGTERM, a JSON line with what its ticks cost. Several descriptors make as many daemons, one after the other in each
+tick of one loop: that is no service of this package, whose process has four corners at most, and says what more corners cost.
+"""
+
+import gc
+import json
+import math
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon import jit
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.runtime import daemon as loop
+from emb_daemon.runtime.journal import set_up_logging
+from emb_daemon.runtime.rawcan import RawCanSocket
+from emb_daemon.runtime.realtime import set_up, settle_memory
+
+#: Parts of a tick: what they are called, whose method does them.
+_PARTS = (("drain", "bus", "drain"), ("decode", "pipeline", "collect"), ("step", "pipeline", "answer"),
+          ("encode", "pipeline", "broadcast"), ("send", "bus", "send"))  # fmt: skip
+#: Ticks after which memory counts as settled: a second.
+_SETTLED = 250
+#: Ticks that are kept, enough for an hour; memory that no tick has written to costs nothing.
+_ROOM = 1_000_000
+
+
+class Pacer(loop.Pacer):
+    """Remembers which deadline the loop sleeps for; 0 while a sample is overdue."""
+
+    deadline_ns = 0
+
+    def next_wake(self, now_ns: int) -> int:
+        wake = super().next_wake(now_ns)
+        self.deadline_ns = wake if wake > now_ns else 0
+        return wake
+
+
+class Ledger:
+    """What ticks that answered a sample cost, in parts, and how late those that slept woke."""
+
+    def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
+        self._daemons = daemons
+        self._ticks = [daemon.tick for daemon in daemons]
+        self._rows = np.zeros((_ROOM, len(_PARTS) + 1), np.int32)
+        self._late = np.zeros(_ROOM, np.int32)
+        self._used = self._woken = 0
+        self._spent = [0] * len(_PARTS)
+        self._begun = self._stand()
+        for daemon, bus in zip(daemons, buses, strict=True):
+            for column, (_, owner, name) in enumerate(_PARTS):
+                self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
+        now = time.monotonic_ns()
+        self._pacers = [Pacer(now) for _ in daemons[1:]]
+        for daemon in daemons[1:]:
+            daemon.pipeline.begin(now)
+        daemons[0].tick = self._tick
+
+    def _watch(self, holder, name: str, column: int) -> None:
+        method, spent = getattr(holder, name), self._spent
+
+        def timed(*arguments, **options):
+            begin = time.perf_counter_ns()
+            result = method(*arguments, **options)
+            spent[column] += time.perf_counter_ns() - begin
+            return result
+
+        setattr(holder, name, timed)
+
+    def _tick(self, now_ns: int, pacer: Pacer) -> None:
+        corners = self._daemons[0].pipeline.corners
+        cycles = corners["cycle"].sum()
+        begin = time.perf_counter_ns()
+        self._spent[:] = [0] * len(_PARTS)
+        for tick, its in zip(self._ticks, [pacer, *self._pacers], strict=True):
+            tick(now_ns, its)
+        taken = time.perf_counter_ns() - begin
+        if not corners["started"].any():
+            return
+        if pacer.deadline_ns and self._woken < _ROOM:
+            self._late[self._woken] = now_ns - pacer.deadline_ns
+            self._woken += 1
+        if corners["cycle"].sum() > cycles and self._used < _ROOM:
+            self._rows[self._used] = [*self._spent, taken]
+            self._used += 1
+            if self._used == _SETTLED:
+                self._begun = self._stand()
+
+    def _stand(self) -> tuple:
+        daemon = self._daemons[0]
+        return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, resident_KiB()
+
+    def figures(self) -> dict:
+        """Since memory settled: share of a core, ticks and missed ones, memory at both ends; since the start: costs, us."""
+        (begin, used, ticks, missed, resident), end = self._begun, self._stand()
+        *parts, whole = (self._rows[: self._used] / 1e3).T
+        return {
+            "core_share": (end[1] - used) / (end[0] - begin),
+            "ticks": end[2] - ticks,
+            "missed": end[3] - missed,
+            "resident_KiB": [resident, end[4]],
+            "tick": _quantiles(whole),
+            "parts": {name: _quantiles(part) for (name, *_), part in zip(_PARTS, parts, strict=True)}
+            | {"rest": _quantiles(whole - sum(parts))},
+            "wake_up": _quantiles(self._late[: self._woken] / 1e3),
+        }
+
+
+def _quantiles(us: np.ndarray) -> dict[str, float]:
+    if not len(us):
+        return {"p50_us": math.nan, "p99_us": math.nan}
+    return {"p50_us": float(np.median(us)), "p99_us": float(np.percentile(us, 99))}
+
+
+def resident_KiB() -> int:
+    """Of this process."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1])
+    return 0
+
+
+def main() -> None:
+    # As in emb-daemon run: cantools and python-can import it where it is installed, and with it pandas.
+    sys.modules.setdefault("asammdf", None)
+    config, state, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]
+    setup = Setup(config)
+    set_up_logging(setup.configuration.log_level)
+    buses = [RawCanSocket(socket.socket(fileno=int(descriptor)), stamped=True) for descriptor in descriptors]
+    loop.Pacer = Pacer
+    daemons = [loop.Daemon(setup, bus, state=state / str(number)) for number, bus in enumerate(buses)]
+    for daemon in daemons:
+        daemon.warm_up()
+    if jit.compiled_for_the_next_start():
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    signal.signal(signal.SIGTERM, lambda *_: daemons[0].stop())
+    ledger = Ledger(daemons, buses)
+    realtime = setup.configuration.realtime
+    measures = list(set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu))
+    settle_memory()
+    print("ready", time.process_time(), flush=True)
+    daemons[0].run()
+    gc.enable()
+    print(json.dumps({"measures": measures, **ledger.figures()}))
+
+
+if __name__ == "__main__":
+    main()
