@@ -29,7 +29,7 @@ wheel: $(READY)
 wheel-demo: wheel
 	$(PYTHON) -m venv --clear build/empty
 	build/empty/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	cd build && empty/bin/emb-daemon demo --corners 1 --seconds 4
+	cd build && empty/bin/emb-daemon demo --corners 1 --seconds 8
 
 # Needs the extra fuzz. Findings are left in tests/fuzz/findings and become tests.
 FUZZ_SECONDS ?= 60
