@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test lint format lock clean fuzz soak mutation
+.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -16,6 +16,20 @@ $(READY): requirements.lock pyproject.toml
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
+
+# Pages to read in site/index.html.
+docs: $(READY)
+	$(VENV)/bin/mkdocs build --strict --quiet
+
+wheel: $(READY)
+	rm -rf dist
+	$(VENV)/bin/python -m hatchling build
+
+# What a user gets: the wheel in an environment with nothing else in it.
+wheel-demo: wheel
+	$(PYTHON) -m venv --clear build/empty
+	build/empty/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build && empty/bin/emb-daemon demo --corners 1 --seconds 8
 
 # Needs the extra fuzz. Findings are left in tests/fuzz/findings and become tests.
 FUZZ_SECONDS ?= 60
@@ -50,4 +64,4 @@ lock:
 		--no-header --no-annotate --quiet --output-file requirements.lock
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist site

@@ -16,22 +16,11 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator import records as r
 from emb_daemon.estimator.records import ESTIMATE, MODES, REASONS, SAMPLE, SOURCES, new_state
-from emb_daemon.logs.mapping import Mapping
-from emb_daemon.offline import Log, estimate, load_log
+from emb_daemon.logs.mapping import Mapping as Mapping
+from emb_daemon.offline import Log, estimate
+from emb_daemon.offline import load_log as load_log
 from emb_daemon.pipeline import answer
 from emb_daemon.resources import resource
-
-__all__ = [
-    "Answer",
-    "Calibration",
-    "Estimator",
-    "Log",
-    "Mapping",
-    "load_calibration",
-    "load_log",
-    "run",
-    "shipped_calibration",
-]
 
 _NAN = float("nan")
 

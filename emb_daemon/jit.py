@@ -110,3 +110,12 @@ if config.DISABLE_JIT:
 else:
     config.CACHE_DIR = str(_cache_folder())
     njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+
+
+def depend_on(source: Path) -> None:
+    """Keep what is compiled from here on apart from what was compiled without this file, or with another version of it."""
+    if config.DISABLE_JIT:
+        return
+    folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+    folder.mkdir(parents=True, exist_ok=True)
+    config.CACHE_DIR = str(folder)

@@ -1,49 +1,57 @@
-"""An effect of one's own, tried on a log before it becomes a file in emb_daemon/effects.
+"""An effect of one's own in one file: the caliper warms up and widens, so the pads touch later.
 
-Suspicion: the caliper warms up and widens, so the pads touch later than the model believes. The term is one line, the
-regressor is its derivative, and what it explains is judged on the half of the log that did not fit it.
+Run it as you run emb-daemon; every command, the estimator and the calibration file then know the effect:
 
-python examples/own_effect.py LOG
+python examples/own_effect.py diagnose FIT_LOG --calibration FILE --validate LOG --output DIR
 """
 
 import sys
 
 import numpy as np
 
-import emb_daemon
-from emb_daemon.calibration.types import curve_at
+from emb_daemon.effects import paths
+from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.own import extend
+from emb_daemon.jit import njit
+
+STATE = np.dtype([("known", "?"), ("start_C", "f8")], align=True)
 
 
-def caliper_growth(metres_per_kelvin: float, warming_K: np.ndarray) -> np.ndarray:
-    """How much wider the caliper is than when it was cold, m; exactly zero at a zero parameter."""
-    return metres_per_kelvin * warming_K
+@njit
+def term(p, s, m):
+    """Growth of the caliper in m since power-on; exactly zero at zero parameters."""
+    if p.widening_um_per_K == 0.0 or not m.has_thermocouple:
+        return 0.0
+    if not s.known:
+        s.known = True
+        s.start_C = m.caliper
+    return 1e-6 * p.widening_um_per_K * (m.caliper - s.start_C)
 
 
-def main(path: str) -> None:
-    log = emb_daemon.load_log(path)
-    calibration = emb_daemon.shipped_calibration()
-    estimates = emb_daemon.run(log, calibration)
-    known = np.isfinite(log.force_N) & log.samples["has_thermocouple"] & (log.force_N > 200.0)
-    residual = (log.force_N - estimates["stiffness_force"])[known]
+EFFECT = Effect(
+    name="caliper_widening",
+    path="stiffness",
+    parameters=(Parameter("widening_um_per_K", "µm/K", -2.0, 5.0, 0.5, "how much wider a warmer caliper is"),),
+    equation="θ → θ − w (T_caliper − T_start) / γ",
+    source="steel, 100 mm between the abutments, 1.2e-5 1/K: 1.2 µm/K",
+    state=STATE,
+    signal="caliper_temperature",
+    manoeuvre="heat the brake, then clamp repeatedly while the caliper cools more slowly than the disc",
+)
 
-    # What a metre of pad travel is worth in newtons, from the slope of the identified curve: a wider caliper takes that away.
-    curve = [*reversed(curve_at(calibration.stiffness.curves, calibration.pad_thickness_mm)), 0.0]
-    x = np.maximum(log.samples["angle"] - estimates["contact_angle"], 0.0)
-    newtons_per_metre = np.polyval(np.polyder(curve), x) / calibration.motor.gear_gain_m_per_rad
-    regressor = -(newtons_per_metre * caliper_growth(1.0, log.samples["caliper"] - np.nanmin(log.samples["caliper"])))[known]
-    usable = np.isfinite(regressor)
-    residual, regressor = residual[usable], regressor[usable]
+package_thickness = paths.thickness
 
-    half = len(residual) // 2
-    parameter = float(regressor[:half] @ residual[:half] / max(regressor[:half] @ regressor[:half], 1e-30))
-    before = np.sqrt(np.mean(residual[half:] ** 2))
-    after = np.sqrt(np.mean((residual[half:] - parameter * regressor[half:]) ** 2))
-    print(f"caliper growth {1e6 * parameter:.3f} µm/K; RMSE on the other half {before:.1f} N -> {after:.1f} N")
-    if after < 0.9 * before:
-        print("it explains something, or is the shadow of what does: `emb-daemon diagnose` compares it with the catalogue")
-    else:
-        print("it explains nothing here: not worth a file of its own")
 
+@njit
+def thickness(e, s, m, disc, disc_known, power):
+    """What disc and pads have gained, less what the caliper has gained."""
+    gained = package_thickness(e, s, m, disc, disc_known, power)
+    return gained - term(e.caliper_widening, s.caliper_widening, m)
+
+
+extend(EFFECT, thickness=thickness)
+
+from emb_daemon.cli.main import main  # noqa: E402  after the effect is known
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    sys.exit(main())

@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from browserkit import assert_is_drawn
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
@@ -328,3 +329,8 @@ def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calib
     assert _path_effects(result) == {"stiffness_hysteresis", "second_relaxation", "disc_thickness_variation"}
     assert result.before.rmse("fused") > 180.0
     assert result.after.rmse("fused") < 36.0
+
+
+def test_the_report_opens_in_a_browser(uneven_disc, tmp_path):
+    html = (uneven_disc[0] / "out" / "report.html").read_text()
+    assert_is_drawn(html, tmp_path, plots=html.count("data-figure="))

@@ -1,30 +1,36 @@
 """The Python interface gives the daemon's numbers, and the examples run as they are printed in the documentation."""
 
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
+import wirekit
 
 import emb_daemon
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.own import extend
+from emb_daemon.logs.write import write_frames
 from emb_daemon.replay import Replay
+from emb_daemon.resources import resource
 
 _EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def _run(name: str, *arguments) -> str:
+def _run(name: str, *arguments, **environment: str) -> str:
     command = [sys.executable, str(_EXAMPLES / name), *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=_EXAMPLES.parent, env=_environment())
+    result = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=_EXAMPLES.parent,
+                            env=_environment() | environment)  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert "Warning" not in result.stderr
     return result.stdout
 
 
 def _environment() -> dict[str, str]:
-    import os
-
     return os.environ | {"PYTHONPATH": str(_EXAMPLES.parent), "MPLBACKEND": "agg"}
 
 
@@ -88,8 +94,29 @@ def test_example_control_loop_holds_the_force():
     assert estimated == pytest.approx(8000.0, abs=20.0) and true == pytest.approx(8000.0, abs=100.0)
 
 
-def test_example_own_effect(rig):
-    """A pad that softens with heat is no caliper that grows: the example says what it found in numbers."""
-    said = _run("own_effect.py", rig / "undeclared" / "case0" / "fit.log.gz")
-    before, after = (float(value) for value in re.search(r"half ([\d.]+) N -> ([\d.]+) N", said).groups())
-    assert 0.0 < before < 2000.0 and 0.0 < after < 2.0 * before
+def test_example_own_effect(tmp_path):
+    """The commands know the effect; at zero it changes nothing, and a wider caliper leaves less force at the same angle."""
+    angle, speed = 26.0 * np.clip(np.arange(200) / 80.0, 0.0, 1.0), 81.25 * (np.arange(200) < 80)
+    cold = wirekit.drive(120, start_ns=10**9, angle=angle, speed=speed, current=0.2 * angle, backplate=25.0)
+    warm = wirekit.drive(80, start_ns=10**9, angle=angle, speed=speed, current=0.2 * angle, backplate=35.0, first=120)
+    write_frames(tmp_path / "warming.log", np.concatenate([*cold, *warm]))
+    shipped = resource("config/calibration.yaml").read_text()
+    columns = {}
+    for widening in (0.0, 2.0):
+        calibration, table = tmp_path / f"{widening}.yaml", tmp_path / f"{widening}.parquet"
+        effect = f"effects:\n  caliper_widening: {{widening_um_per_K: {widening}}}\n"
+        calibration.write_text(shipped.replace("effects:\n", effect))
+        files = ("--calibration", calibration, "--output", table)
+        # As plain Python: compiling the estimator anew for the one effect more would take longer than everything else here.
+        _run("own_effect.py", "replay", tmp_path / "warming.log", *files, NUMBA_DISABLE_JIT="1")
+        columns[widening] = pyarrow.parquet.read_table(table)["stiffness_force_N"].to_numpy()
+    plain = Replay(emb_daemon.shipped_calibration()).run(tmp_path / "warming.log").estimates["stiffness_force"]
+    assert np.array_equal(columns[0.0], plain)
+    change = columns[2.0] - columns[0.0]
+    assert np.array_equal(change[:120], np.zeros(120)) and plain[-1] > 2000.0 and change[-1] < -20.0
+
+
+def test_an_effect_that_comes_too_late_is_refused():
+    """Once the estimator is compiled without it, it would be believed and do nothing."""
+    with pytest.raises(RuntimeError, match="already"):
+        extend(REGISTRY[0])

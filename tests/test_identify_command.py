@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from browserkit import assert_is_drawn
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
@@ -138,3 +139,8 @@ def test_same_campaign_gives_the_same_calibration_but_for_its_date(identified, m
 def test_missing_campaign_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_campaign(tmp_path / "none.yaml")
+
+
+def test_the_report_opens_in_a_browser(identified, tmp_path):
+    html = (identified[0] / "report" / "report.html").read_text()
+    assert_is_drawn(html, tmp_path, plots=html.count("data-figure="))

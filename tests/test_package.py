@@ -1,5 +1,8 @@
 """The wheel and the sdist hold what an installation needs, under the one version."""
 
+import os
+import subprocess
+import sys
 import tarfile
 import zipfile
 from pathlib import Path
@@ -15,8 +18,6 @@ _ROOT = Path(__file__).parent.parent
 def built(tmp_path_factory):
     """Paths of the wheel and the sdist, built in this process: no network, nothing installed."""
     pytest.importorskip("hatchling", reason="NOT RUN: hatchling is not installed")
-    import os
-
     from hatchling.build import build_sdist, build_wheel
 
     folder = tmp_path_factory.mktemp("dist")
@@ -52,3 +53,17 @@ def test_the_sdist_can_be_tested_and_documented(built):
     for name in ("pyproject.toml", "tests/conftest.py", "docs/index.md", "mkdocs.yml", "examples/control_loop.py",
                  "CHANGELOG.md", "LICENSE", "Makefile", "systemd/emb-daemon.service", "dbc/emb.dbc"):  # fmt: skip
         assert name in names
+
+
+def test_the_wheel_runs_far_from_its_sources(built, tmp_path):
+    """`make wheel-demo` installs it in an empty environment and compiles; here its commands find what ships with it."""
+    with zipfile.ZipFile(built[0]) as wheel:
+        wheel.extractall(tmp_path / "site")
+    config = tmp_path / "site" / "emb_daemon" / "_resources" / "config" / "emb.yaml"
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "check", "--config", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.count("actuator") == 4
+    where = "import emb_daemon.resources as r; print(r.resource('dbc/emb.dbc'))"
+    done = subprocess.run([sys.executable, "-c", where], capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.stdout.startswith(str(tmp_path)), done.stderr

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from browserkit import assert_is_drawn
 
 from emb_daemon.cli.main import main
 from emb_daemon.report.replay import stretches
@@ -69,3 +70,18 @@ def test_a_report_of_frames_is_refused(rig, tmp_path, capsys):
     log = str(rig / "static" / "sine_5Hz.log.gz")
     assert main(["replay", log, "--output", str(tmp_path / "x.log"), "--report", str(tmp_path / "x.html")]) == 2
     assert "--report" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_what_adaptation_learned_is_shown_beside_the_calibration(rig, tmp_path):
+    """Pads of 5 mm under a calibration of 9.5 mm: the page says accepted, and its learned curve is that of the thin pads."""
+    path = tmp_path / "page.html"
+    log = str(rig / "static" / "training_5mm.log.gz")
+    assert main(["replay", log, "--pad-thickness", "9.5", "--state", str(tmp_path), "--report", str(path)]) == 0
+    html = path.read_text()
+    assert '<td class="pass">accepted</td>' in html
+    curves = {trace["name"]: trace for trace in _figures(html)[-1]["data"]}
+    travel = {name: _values(curves[name]["x"])[-1] for name in ("calibration", "learned")}
+    top = {name: _values(curves[name]["y"])[-1] for name in travel}
+    assert top["learned"] == pytest.approx(top["calibration"], rel=0.01)
+    assert travel["learned"] < 0.95 * travel["calibration"]
+    assert_is_drawn(html, tmp_path, plots=3)

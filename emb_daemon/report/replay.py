@@ -1,17 +1,22 @@
 """The page of a replay: estimates, errors and events of a drive on one time axis."""
 
+from pathlib import Path
+
 import numpy as np
 
 from emb_daemon import __version__
+from emb_daemon.adapt.memory import apply_entry
 from emb_daemon.estimator.records import MODES, REASONS, SOURCES
 from emb_daemon.judging import PATHS
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
-from emb_daemon.report.page import Page
+from emb_daemon.report.page import FAIL, PASS, Cell, Page
 
 #: Shortest stretch that is still seen on the whole time axis, as a share of it; closer stretches are drawn as one.
 _SEEN = 1.0 / 1000.0
 _CYCLE_S = 0.004
 _BINS = 120
+#: More than the travel of any brake past contact.
+_TRAVEL_RAD = 100.0
 _LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
 _INNER, _OUTER, _DISC = Style("#c2662d", 1.4), Style("#1b7f4b", 1.4), Style(INK, 1.2, "dot")
 _INNER_MEAN, _OUTER_MEAN = Style("#e3a982", 1.2), Style("#86bfa0", 1.2)
@@ -102,18 +107,20 @@ def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: list[dict]) -> None:
     section = page.section("Errors", "Estimate minus reference. Conditions overlap; figures without a sample are left out.")
     for log in figures:
-        rows = []
+        rows, name = [], Path(log["log"]).name
         for path, label in _LABELS.items():
             part = log["force_N"].get(path, {"samples": 0})
             if part["samples"]:
                 rows.append([label, *_cells(part)])
                 if path == "fused":
-                    rows += [[f"– {name}", *_cells(some)] for name, some in part["conditions"].items() if some["samples"]]
+                    rows += [[f"– {when}", *_cells(some)] for when, some in part["conditions"].items() if some["samples"]]
         if rows:
-            section.table(["", "RMSE / N", "bias / N", "95 % / N", "max / N", "samples"], rows, log["log"])
+            section.table(["", "RMSE / N", "bias / N", "95 % / N", "max / N", "samples"], rows, name)
         if log["temperature_K"]:
-            table = [[name.replace("_", " "), *_cells(part)] for name, part in log["temperature_K"].items() if part["samples"]]
-            section.table(["temperature", "RMSE / K", "bias / K", "95 % / K", "max / K", "samples"], table, log["log"])
+            table = [
+                [place.replace("_", " "), *_cells(part)] for place, part in log["temperature_K"].items() if part["samples"]
+            ]
+            section.table(["temperature", "RMSE / K", "bias / K", "95 % / K", "max / K", "samples"], table, name)
     known = np.isfinite(force_N)
     errors = {label: (estimates[PATHS[path]] - force_N)[known] for path, label in _LABELS.items()}
     errors = {label: error[np.isfinite(error)] for label, error in errors.items()}
@@ -136,11 +143,72 @@ def _cells(part: dict) -> list[str]:
     return [*(f"{part[name]:.1f}" for name in ("rmse", "bias", "p95", "max")), f"{part['samples']}"]
 
 
-def replay_page(results: list, corner: str, calibration: str) -> Page:
+def _adaptation(page: Page, learned, calibration: np.void) -> None:
+    """What park brake adaptation made of the drive."""
+    section = page.section(
+        "Adaptation",
+        "Learned from motor current and angle of training motions, the newest last; only an accepted one is used. Trainings "
+        "before this drive are of the same state directory.",
+    )
+    rows = [
+        [
+            entry.date.replace("T", " "),
+            Cell(entry.verdict, PASS if entry.curve is not None else FAIL),
+            *(
+                "–" if value is None else f"{factor * value:.{digits}f}"
+                for value, factor, digits in (
+                    (entry.samples, 1, 0), (entry.residual_ratio, 1, 2), (entry.curve_change, 100, 1),
+                    (entry.top_force_N, 1e-3, 1), (entry.ambient_C, 1, 0), (entry.pad_rise_K, 1, 0),
+                )
+            ),
+        ]
+        for entry in learned.history
+    ]  # fmt: skip
+    headings = [
+        "training",
+        "verdict",
+        "samples",
+        "residual / noise",
+        "travel changed / %",
+        "up to / kN",
+        "air / °C",
+        "pads / K",
+    ]
+    section.table(headings, rows)
+    if learned.current is None:
+        return
+    adapted = calibration.copy()
+    apply_entry(learned.current, adapted)
+    scales = (
+        ("friction, constant", "offset_friction", 1e3, "mN m"), ("friction per force", "load_friction", 1e6, "µm/rad"),
+        ("presliding angle", "presliding_angle", 1e3, "mrad"), ("clearance", "clearance", 1.0, "rad"),
+    )  # fmt: skip
+    section.table(
+        ["", "calibration", "learned", "unit"],
+        [
+            [label, f"{factor * calibration[name]:.4g}", f"{factor * adapted[name]:.4g}", unit]
+            for label, name, factor, unit in scales
+        ],
+    )
+    traces = []
+    for name, parameters, style in (("calibration", calibration, PALE), ("learned", adapted, MODEL)):
+        angle = np.linspace(0.0, _TRAVEL_RAD, 2000)
+        force = np.polyval([*parameters["curve"][::-1], 0.0], angle)
+        inside = force <= learned.current.top_force_N
+        traces.append(Trace(name, angle[inside], 1e-3 * force[inside], style))
+    section.figure(
+        xy_figure([Panel("Characteristic curve of the cold pads", "kN", traces)], "motor angle past contact / rad"),
+        "As far as the training went.",
+    )
+
+
+def replay_page(results: list, corner: str, calibration: str, learned=None, parameters: np.void | None = None) -> Page:
     """The page of one or more `replay.Result`, one after the other as the drive that they are.
 
     Args:
         calibration: which one it was, in words.
+        learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
+        parameters: the calibration's PARAMETERS record, to compare that with.
     """
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
@@ -178,4 +246,6 @@ def replay_page(results: list, corner: str, calibration: str) -> Page:
     )
     if known.any():
         _errors(page, estimates, force_N, figures)
+    if learned is not None and learned.history:
+        _adaptation(page, learned, parameters)
     return page

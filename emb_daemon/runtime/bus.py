@@ -10,13 +10,22 @@ from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
+#: Frames of our own that may still be on their way back; four corners send 16 in their busiest tick.
+_ECHOES = 256
+
 
 class PythonCanBus:
-    """A bus that python-can drives, frame by frame; same interface as RawCanSocket."""
+    """A bus that python-can drives, frame by frame; same interface as RawCanSocket.
 
-    def __init__(self, bus):
+    Args:
+        echoes: the bus gives a sender its own frames back, which `drain` then leaves out. A frame of somebody else that is
+            equal to one just sent is taken for its echo.
+    """
+
+    def __init__(self, bus, echoes: bool = False):
         self._bus = bus
         self._early = deque()
+        self._echoes = deque(maxlen=_ECHOES) if echoes else None
         self._frames = np.zeros(4096, FRAME)
         self.dropped = self.unsent = 0
         self.down = False
@@ -48,6 +57,8 @@ class PythonCanBus:
                 break
             if message is None:
                 break
+            if self._is_echo(message):
+                continue
             frame = self._frames[count]
             # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
             stamp = round(message.timestamp * 1e9) - offset
@@ -64,6 +75,13 @@ class PythonCanBus:
             count += 1
         return self._frames[:count]
 
+    def _is_echo(self, message) -> bool:
+        # They come in the order in which they were sent, so the first is nearly always the one.
+        if not self._echoes or (key := (message.arbitration_id, bytes(message.data))) not in self._echoes:
+            return False
+        self._echoes.remove(key)
+        return True
+
     def send(self, frames: np.ndarray) -> None:
         import can
 
@@ -74,6 +92,9 @@ class PythonCanBus:
                 self._bus.send(message)
             except can.CanError:
                 self.unsent += 1
+                continue
+            if self._echoes is not None:
+                self._echoes.append((message.arbitration_id, data))
 
     def close(self) -> None:
         self._bus.shutdown()
@@ -98,6 +119,7 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
         return open_socketcan(str(chosen["channel"]), ids)
     filters = [{"can_id": can_id, "can_mask": 0x7FF, "extended": False} for can_id in ids]
     try:
-        return PythonCanBus(can.Bus(**chosen, can_filters=filters))
+        # Its multicast loops back, or programs on one machine could not hear each other.
+        return PythonCanBus(can.Bus(**chosen, can_filters=filters), echoes=chosen["interface"] == "udp_multicast")
     except Exception as error:
         raise Unavailable(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None

@@ -1,0 +1,55 @@
+"""The monitor beside the daemon on a real CAN interface."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from bus_tools import CHANNEL, PROJECT, playing, wait_for
+
+pytestmark = pytest.mark.target("can")
+
+COMMAND = [sys.executable, "-m", "emb_daemon.cli.main"]
+BUS = ["--interface", "socketcan", "--channel", CHANNEL]
+
+
+@pytest.fixture
+def daemon() -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen([*COMMAND, "run", "--config", str(PROJECT / "config" / "emb.yaml"), *BUS])
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+def monitor() -> dict | None:
+    """What a script gets to know; None while nobody speaks."""
+    done = subprocess.run([*COMMAND, "monitor", "--once", "--json", *BUS], capture_output=True, text=True)
+    if done.returncode == 1:
+        return None
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)["corners"]
+
+
+def test_a_script_sees_what_the_daemon_says(daemon: subprocess.Popen[bytes], rig_log: Path) -> None:
+    """Four corners without a car; then one of them braking."""
+    said: list[dict] = []
+    wait_for("the daemon speaks", lambda: said.append(monitor()) or said[-1], timeout_s=120, poll_s=1)
+    assert list(said[-1]) == ["FL", "FR", "RL", "RR"]
+    # Without a sample there is no force to be used, and the reason is told in words.
+    assert all(corner["clamp_force_kN"] is None and "resolver lost" in corner["reasons"] for corner in said[-1].values())
+    with playing(rig_log, "-l", "i"):
+        wait_for("a force", lambda: said.append(monitor()) or said[-1]["FL"]["clamp_force_kN"] is not None, timeout_s=60)
+    assert daemon.poll() is None
+    front_left = said[-1]["FL"]
+    print(front_left)
+    assert 0.0 <= front_left["clamp_force_kN"] < 20.0 and 0.0 < front_left["clamp_force_sigma_kN"] < 2.0
+    assert front_left["source"] in ("fused", "stiffness", "torque") and front_left["damaged"] == 0
+    # A guest with one CPU, shared with a program that starts: most of them, not all.
+    assert front_left["forces_per_s"] > 150.0
+    assert said[-1]["RR"]["clamp_force_kN"] is None
