@@ -203,8 +203,11 @@ class Daemon:
     def _report(self, corner: int, state: int) -> None:
         mode, reasons = state >> 16, state & 0xFFFF
         words = [text for bit, text in enumerate(records.REASONS) if reasons >> bit & 1]
-        level = 30 if mode in (records.DEGRADED, records.FAULT) else 20
-        fields = {"corner": CORNERS[corner], "mode": records.MODES[mode], "reasons": ", ".join(words) or "none"}
+        amiss = mode in (records.DEGRADED, records.FAULT)
+        level = 30 if amiss else 20
+        # Bus and loop are reported once for all corners; here they are only referred to.
+        none = "bus or loop" if amiss else "none"
+        fields = {"corner": CORNERS[corner], "mode": records.MODES[mode], "reasons": ", ".join(words) or none}
         log.log(level, "corner %(corner)s: %(mode)s (%(reasons)s)", fields, extra={"fields": fields})
 
     def _count(self, now_ns: int, pacer: Pacer) -> None:
