@@ -328,3 +328,62 @@ def test_restarted_controller(car):  # noqa: F811
     samples = estimates[estimates["is_sample"]]
     assert len(samples) == 159 and 100 not in samples["cycle"] and samples["cycle"][-1] == 159
     assert samples["source"][-1] == r.FUSED
+
+
+def _heated(parameters, change, seconds=150.0):
+    """Times and estimates of a brake that drags for ``seconds``; ``change(rows, time)`` spoils the samples. Backing plates
+    warm by 0.2 K/s with noise of 0.2 K."""
+    from emb_daemon.offline import estimate
+
+    time = np.arange(0.0, seconds, 0.004)
+    rows = np.zeros(len(time), r.SAMPLE)
+    rows["dt"] = np.where(time > 0.0, 0.004, 0.0)
+    rows["angle"] = 17.5 * np.clip(time / 0.5, 0.0, 1.0)
+    rows["speed"] = np.where(time < 0.5, 35.0, 0.0)
+    rows["wheel_speed"], rows["ambient"], rows["caliper"], rows["brake_torque"] = 25.0, 22.0, 22.0, np.nan
+    noise = np.repeat(np.random.default_rng(2).normal(0.0, 0.2, (len(time) // 25 + 1, 2)), 25, axis=0)[: len(time)]
+    for number, name in enumerate(("inner_backplate", "outer_backplate")):
+        rows[name] = 22.0 + 0.2 * time + noise[:, number]
+    for name in ("has_thermocouple", "has_wheel_speed", "has_status"):
+        rows[name] = True
+    change(rows, time)
+    return time, estimate(rows, parameters[:1])
+
+
+def test_thermocouples_that_follow_raise_nothing(parameters):
+    _, estimates = _heated(parameters, lambda rows, time: None)
+    assert not np.any(estimates["reasons"] & (r.STUCK | r.TEMPERATURE_UNCERTAIN))
+    assert estimates["mean"][-1].min() > 80.0, "the pads did heat up"
+
+
+def test_stuck_thermocouple(parameters):
+    """Repeats to the bit while the pad heats: Signal stuck and Pad temperature uncertain once heat must have come through,
+    sigma up; a reading that moves again ends the first at once."""
+
+    def stick(rows, time):
+        held = (time >= 10.0) & (time < 120.0)
+        rows["inner_backplate"][held] = rows["inner_backplate"][held][0]
+
+    time, estimates = _heated(parameters, stick)
+    _, good = _heated(parameters, lambda rows, time: None)
+    stuck = (estimates["reasons"] & r.STUCK) != 0
+    assert 15.0 < time[stuck][0] < 90.0 and stuck[(time > time[stuck][0]) & (time < 120.0)].all()
+    assert not stuck[time > 121.0].any()
+    assert np.all(estimates["reasons"][stuck] & r.TEMPERATURE_UNCERTAIN)
+    assert np.all(estimates["sigma"][stuck] > good["sigma"][stuck])
+    assert np.all(estimates["source"][100:] != r.INVALID)
+
+
+def test_jumping_thermocouple(parameters):
+    """40 K from one reading to the next: Pad temperature uncertain in that heat step, sigma covers what the stiffness lost."""
+
+    def jump(rows, time):
+        rows["outer_backplate"][time >= 60.0] += 40.0
+
+    time, estimates = _heated(parameters, jump, 100.0)
+    _, good = _heated(parameters, lambda rows, time: None, 100.0)
+    raised = time[(estimates["reasons"] & r.TEMPERATURE_UNCERTAIN) != 0]
+    assert 60.0 <= raised[0] < 60.1
+    after = time >= 60.1
+    assert np.all(np.abs(estimates["force"] - good["force"])[after] < estimates["sigma"][after])
+    assert np.all(estimates["sigma"][after] > good["sigma"][after])

@@ -15,6 +15,10 @@ TOUCHING_N = 200.0
 TURNING_RAD_PER_S = 0.5
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
 _HEAT_STEP_S = 0.046
+#: Change of a backing plate, K, that no steel makes between two heat steps.
+_JUMP_K = 10.0
+#: Change of the pad's mean temperature, K, that its backing plate must show once heat has had the time to get there.
+_SHOWN_K = 20.0
 
 
 @njit
@@ -31,6 +35,8 @@ def _start_heat(s, t, m):
     s.ambient = s.disc
     s.temperature_doubt = s.history_doubt = abs(s.disc - m.caliper)
     _tell_temperatures(s, t)
+    s.plate[0], s.plate[1] = m.inner_backplate, m.outer_backplate
+    s.plate_mean[:] = s.mean
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     s.factor = stiffness_factor(t, s.history, s.history)
     s.temperature_known = True
@@ -45,6 +51,32 @@ def _tell_temperatures(s, t):
 
 
 @njit
+def _watch_plates(s, t, m, dt):
+    """Whether the thermocouples can be true; doubts the pads' temperature by what a false one may hide, K.
+
+    A reading that repeats to the bit is stuck once the pad has been hotter or colder than when it last moved for as long as
+    heat takes through the pad, L^2/(4 a), by `_SHOWN_K` in the mean over that time. A reading that jumps is one of two that
+    cannot both be true. One that drifts as slowly as plates do is not seen.
+    """
+    conducting = 0.25 * t.thickness * t.thickness * t.density * t.specific_heat / t.conductivity
+    stuck = False
+    for side in range(2):
+        reading = (m.inner_backplate if side == 0 else m.outer_backplate) if m.has_thermocouple else np.nan
+        step = abs(reading - s.plate[side])
+        if step == 0.0:
+            s.unanswered[side] += dt * (s.mean[side] - s.plate_mean[side])
+        else:
+            s.unanswered[side], s.plate_mean[side] = 0.0, s.mean[side]
+        if step > _JUMP_K:
+            s.temperature_doubt = max(s.temperature_doubt, step)
+        stuck = stuck or abs(s.unanswered[side]) > _SHOWN_K * conducting
+        s.plate[side] = reading
+    s.plate_stuck = stuck
+    if stuck:
+        s.temperature_doubt = max(s.temperature_doubt, _SHOWN_K)
+
+
+@njit
 def _flow(s, t, e, m):
     """Let the heat of the time since the last heat step flow, and find the stiffness factor anew."""
     dt = s.heat_time
@@ -56,6 +88,7 @@ def _flow(s, t, e, m):
     # Without thermocouples the backing plates follow the pads' own last nodes: no heat passes.
     inner = m.inner_backplate if m.has_thermocouple else s.pads[0, NODES - 1]
     outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
+    _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
     s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
     s.disc += effects.disc_cooling(e, t.disc_heat_capacity, s.disc, ambient, dt)

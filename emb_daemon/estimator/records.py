@@ -190,6 +190,12 @@ STATE = np.dtype(
         ("temperature_doubt", "f8"),
         ("history_doubt", "f8"),
         ("temperature_known", "?"),
+        # Backing plates: last readings, degC, the pads' mean temperatures when they last moved, what these have gained
+        # since over time, K s, and whether a reading is stuck.
+        ("plate", "f8", (2,)),
+        ("plate_mean", "f8", (2,)),
+        ("unanswered", "f8", (2,)),
+        ("plate_stuck", "?"),
         ("work", "f8", (4, CHAIN)),
         ("effects", EFFECT_STATES),
         # Last answer, which predictions start from.

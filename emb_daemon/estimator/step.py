@@ -22,6 +22,7 @@ from emb_daemon.estimator.records import (
     PREDICTED,
     RUNNING,
     STIFFNESS_ONLY,
+    STUCK,
     TEMPERATURE_UNCERTAIN,
     TORQUE_ONLY,
 )
@@ -102,6 +103,8 @@ def step(s, p, m, out):
         reasons |= OUT_OF_RANGE
     if not s.temperature_known or s.temperature_doubt > _DOUBTED_K:
         reasons |= TEMPERATURE_UNCERTAIN
+    if s.plate_stuck:
+        reasons |= STUCK
     out.engaged = s.contact.engaged
     if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD:
         reasons |= CONTACT_UNCERTAIN
