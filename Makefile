@@ -31,7 +31,8 @@ wheel-demo: wheel
 	build/empty/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build && empty/bin/emb-daemon demo --corners 1 --seconds 8
 
-# Needs the extra fuzz. Findings are left in tests/fuzz/findings and become tests.
+# Needs the extra fuzz, which the lock file leaves out: $(VENV)/bin/pip install --editable '.[fuzz]'.
+# Findings are left in tests/fuzz/findings and become tests.
 FUZZ_SECONDS ?= 60
 fuzz: $(READY)
 	mkdir -p tests/fuzz/findings

@@ -139,9 +139,19 @@ def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_does_for_25_s
     watched.m["speed"] = 100.0
     assert watched.pass_by(3, speed=100.0, follows=0.0) == AGREE
     assert watched.pass_by(2, speed=100.0, follows=0.0) == STIFFNESS_WRONG
+    before = watched.c["frozen_s"][0]
     assert watched.pass_by(24, speed=10.0) == STIFFNESS_WRONG
+    assert watched.c["frozen_s"][0] == pytest.approx(before + 24 * _DT), "the motor turned on meanwhile"
     assert watched.pass_by(2, speed=10.0) == AGREE
     assert watched.c["doubt"][0] == 0.0 and watched.c["frozen_s"][0] == 0.0
+
+
+def test_a_small_mismatch_of_angle_and_speed_is_forgotten():
+    """One percent at 200 rad/s, the gain error of a tachometer: 0.2 rad within the time that is compared, and never more."""
+    watched = Watched()
+    watched.m["speed"] = 200.0
+    assert watched.pass_by(2000, speed=200.0, follows=0.99) == AGREE
+    assert abs(watched.c["unlike"][0]) == pytest.approx(0.008 / (1.0 - np.exp(-0.04)), rel=0.01)
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():
@@ -149,4 +159,10 @@ def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():
     watched.pass_by(3, speed=10.0)
     assert not frozen(watched.c[0])
     watched.pass_by(2, speed=10.0, current=1.0)
-    assert frozen(watched.c[0])
+    assert watched.c["idle"][0] == 1 and frozen(watched.c[0])
+    watched = Watched()
+    watched.pass_by(1, speed=10.0)
+    watched.pass_by(2, speed=0.0)
+    assert watched.c["still"][0] == 1 and frozen(watched.c[0])
+    watched.pass_by(3, speed=0.0, current=1.0)
+    assert watched.c["idle"][0] == 2 and not frozen(watched.c[0]), "both repeat: nothing happens at all"

@@ -28,6 +28,12 @@ with atheris.instrument_imports(include=["emb_daemon"]):
 import numpy as np
 
 _OURS = (0x100, 0x110, 0x120, 0x180, 0x181, 0x182, 0x200)
+_CALIBRATION = resource("config/calibration.yaml").read_bytes()
+_CALIBRATION = _CALIBRATION[: _CALIBRATION.index(b"provenance:")]
+_LOG = b"".join(
+    b"(%d.%06d) can0 %s\n" % (1, 1000 * number, frame)
+    for number, frame in enumerate((b"100#0102030405060708", b"18FEF100#AA", b"123##311223344", b"7FF#R8", b"20000040#00") * 3)
+)
 _parameters = Setup(resource("config/emb.yaml")).parameters
 _folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
 
@@ -49,11 +55,25 @@ def frames(data: bytes) -> None:
         frame["data"] = protect(can_id, np.uint64(payload << 16), counters[can_id], 0) if kind > 1 else payload
         start = 0
         while start < 1:
-            start, count = pipeline.consume(frame, start)
+            # As the daemon does it, which tells of a long silence once.
+            start, count = pipeline.collect(frame, start, predictions=False)
+            count = pipeline.overdue(max(now, 0), count)
+            pipeline.answer(count)
             for estimate in pipeline.estimates[:count]:
                 usable = estimate["source"] != INVALID
                 assert not usable or (np.isfinite(estimate["force"]) and estimate["sigma"] > 0.0), estimate
             pipeline.broadcast(count)
+
+
+def _edited(good: bytes, data: bytes) -> bytes:
+    """A good file with pieces of it replaced: random bytes alone never get past a reader's first line."""
+    feed = atheris.FuzzedDataProvider(data)
+    content = bytearray(good)
+    while feed.remaining_bytes() >= 4:
+        at = feed.ConsumeIntInRange(0, len(content))
+        removed = feed.ConsumeIntInRange(0, 40)
+        content[at : at + removed] = feed.ConsumeBytes(feed.ConsumeIntInRange(0, 40))
+    return bytes(content)
 
 
 def _file(name: str, data: bytes, read) -> None:
@@ -64,11 +84,11 @@ def _file(name: str, data: bytes, read) -> None:
 
 
 def yaml(data: bytes) -> None:
-    _file("calibration.yaml", data, load_calibration)
+    _file("calibration.yaml", _edited(_CALIBRATION, data), load_calibration)
 
 
 def candump(data: bytes) -> None:
-    _file("drive.log", data, read_frames)
+    _file("drive.log", _edited(_LOG, data), read_frames)
 
 
 if __name__ == "__main__":
