@@ -233,8 +233,9 @@ def _cycles(corner, counter, time_ns):
         step = COUNTER_MODULO
     late = time_ns - corner.clock_ns - step * CYCLE_NS
     wraps = COUNTER_MODULO * max(0, round(late / (COUNTER_MODULO * CYCLE_NS)))
-    late -= wraps * CYCLE_NS
-    step += wraps
+    if abs(late - wraps * CYCLE_NS) <= _JITTER_NS:
+        late -= wraps * CYCLE_NS
+        step += wraps
     counted = abs(late) <= _JITTER_NS
     if counted:
         corner.agreed = min(corner.agreed + 1, _AGREED)
@@ -243,7 +244,7 @@ def _cycles(corner, counter, time_ns):
         corner.clock_ns += step * CYCLE_NS + late // 16
         return step
     recovering = corner.late_ns == 0 or late < corner.late_ns - CYCLE_NS // 2
-    if corner.agreed == _AGREED and wraps == 0 and late > 0 and recovering:
+    if corner.agreed == _AGREED and late > 0 and recovering:
         corner.late_ns = late
         corner.clock_ns += step * CYCLE_NS
         return step

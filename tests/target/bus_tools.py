@@ -78,10 +78,14 @@ class Recording:
 
 @contextlib.contextmanager
 def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
-    """canplayer plays the log, in its own time unless options say otherwise, until it or the `with` block ends."""
+    """canplayer plays the log, in its own time unless options say otherwise, until it or the `with` block ends.
+
+    Before the daemon: a car's other controllers do not wait for it, but in a guest they would share its only CPU."""
     recorded_on = re.findall(r"\) (\S+) ", log.open().readline())[0]
     command = ["canplayer", "-I", str(log), *options, f"{CHANNEL}={recorded_on}"]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(70))
     try:
         yield process
     finally:

@@ -27,10 +27,11 @@ UNIT = "emb-daemon.service"
 CONFIG = Path("/etc/emb_daemon/emb.yaml")
 CACHE = Path("/var/cache/emb_daemon")
 LOG = RIG / "static" / "random_6p5mm.log.gz"
-CLAMP_FORCE = 0x200
+RESOLVER, CLAMP_FORCE = 0x100, 0x200
 PREDICTED = 3
 FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
 PERIOD_S = 0.004
+HELD_UP_S = 0.04
 
 COLD_START_S = 240  # all kernels compiled
 WARM_START_S = 30
@@ -165,18 +166,22 @@ def test_compiled_kernels_are_kept(service: None) -> None:
 
 def test_forces_come_250_times_a_second(inputs: None, record: Callable[..., Recording]) -> None:
     wait_for_forces(record, timeout_s=10)
-    with record(FORCES) as recording:
+    with record(FORCES + ",100:7FF") as recording:
         time.sleep(10)
-    corners = {frame.can_id for frame in recording.frames}
-    assert corners, "no clamp force on the bus"
-    for corner in corners:
-        times = [frame.time_s for frame in recording.frames if frame.can_id == corner]
+    heard = sum(frame.can_id == RESOLVER for frame in recording.frames)
+    answered = sum(frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED for frame in recording.frames)
+    print(
+        f"{answered} answers to {heard} resolver samples in {recording.frames[-1].time_s - recording.frames[0].time_s:.2f} s"
+    )
+    assert heard > 0.9 * 10 / PERIOD_S
+    assert abs(answered - heard) <= 2, "of the samples at the edges of the recording, one half may be outside"
+    # A corner without input says so once a tick, and a tick that comes late says it once.
+    for corner in range(1, 4):
+        times = [frame.time_s for frame in recording.frames if frame.can_id == CLAMP_FORCE + corner]
         mean = (times[-1] - times[0]) / (len(times) - 1)
         late = sum(b - a > 1.5 * PERIOD_S for a, b in itertools.pairwise(times)) / len(times)
-        print(f"{corner:#x}: mean period {mean * 1e3:.4f} ms, {late:.2%} of the gaps above {1.5 * PERIOD_S * 1e3:.0f} ms")
-        # A corner without input says so once a tick, and a tick that comes late says it once.
-        answered = any(frame.data[6] >> 4 < 3 for frame in recording.frames if frame.can_id == corner)
-        assert mean == pytest.approx(PERIOD_S, rel=0.02 if answered else 0.1)
+        print(f"corner {corner}: mean period {mean * 1e3:.4f} ms, {late:.2%} of the gaps above {1.5 * PERIOD_S * 1e3:.0f} ms")
+        assert mean == pytest.approx(PERIOD_S, rel=0.1)
 
 
 def test_reload_is_heard_and_changes_nothing_else(inputs: None, record: Callable[..., Recording]) -> None:
@@ -295,14 +300,20 @@ def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., 
     """Every resolver sample that the daemon received is answered by the payload that replay gives it."""
     plain = tmp_path / "random_6p5mm.log"
     plain.write_bytes(gzip.decompress(LOG.read_bytes()))
-    systemctl("restart", UNIT)
-    with record(",200:7FF,100:7FF") as recording:
-        time.sleep(1)
-        with playing(plain) as player:
-            wait_for("the log is played", lambda: player.poll() is not None, timeout_s=90, poll_s=0.5)
-        time.sleep(0.5)
-    live = answers(recording.frames)
-    received = sum(frame.can_id == 0x100 for frame in recording.frames)
+    for _ in range(3):
+        systemctl("restart", UNIT)
+        with record(",200:7FF,100:7FF") as recording:
+            time.sleep(1)
+            with playing(plain) as player:
+                wait_for("the log is played", lambda player=player: player.poll() is not None, timeout_s=90, poll_s=0.5)
+            time.sleep(0.5)
+        played = [frame.time_s for frame in recording.frames if frame.can_id == RESOLVER]
+        held_up_s = max(b - a for a, b in itertools.pairwise(played))
+        print(f"longest gap between two samples as played: {1e3 * held_up_s:.1f} ms")
+        # Beyond that a sender who was held up cannot be told from one who lost frames; another log was played then.
+        if held_up_s < HELD_UP_S:
+            break
+    live, received = answers(recording.frames), len(played)
     replayed_log = tmp_path / "replayed.log"
     command = ["emb-daemon", "replay", str(plain), "--output", str(replayed_log)]
     # With the daemon's own compiled code: compiling anew beside the running daemon takes minutes in a guest with one CPU.
