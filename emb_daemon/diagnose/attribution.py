@@ -92,6 +92,7 @@ class Attribution:
     recalibrated: dict[str, float]
     signals: dict[str, np.ndarray]
     penalties: dict[str, np.ndarray]
+    centre: dict[Knob, float]
 
 
 class Search:
@@ -114,10 +115,16 @@ class Search:
                     knobs += [effect_knob(effect, p.name, channel, float(initial[p.name])) for p in effect.parameters]
         self.knobs: list[Knob] = knobs
         self.values: dict[Knob, float] = dict.fromkeys(knobs, 0.0)
+        #: Where a knob's prior is centred, if not at the calibration: a shape is touched up about the start it was chosen at.
+        self.centre: dict[Knob, float] = {}
         self.accepted: dict[str, list[Knob]] = {}
         self.initial = bench.residuals({})
         self.residual = self.initial
         self.columns: dict[Knob, np.ndarray] = {}
+        #: What became of each effect so far, and channels whose base parameters were off, with what refitting them gains.
+        self.history: dict[str, Finding] = {}
+        self.recalibrated: dict[str, float] = {}
+        self.dropped: set[str] = set()
         self.signals = signals(bench, parameters)
         braking = self.signals["brake_torque"][self.signals["brake_torque"] > 20.0]
         self.scale = dict.fromkeys(bench.channels, float(np.sqrt(np.mean(self.signals["clamp_force"] ** 2))))
@@ -158,9 +165,13 @@ class Search:
         table = np.column_stack(columns) if columns else np.zeros((len(residual), 0))
         return Moments.of(table, residual, self.bench.episode[channel], self.bench.episodes)
 
+    def moved(self, knobs: list[Knob]) -> np.ndarray:
+        """How far knobs are from where their priors are centred."""
+        return np.array([self.values[knob] - self.centre.get(knob, 0.0) for knob in knobs])
+
     def objective(self, residual: dict[str, np.ndarray], values: dict[Knob, float], channel: str) -> float:
         knobs = self.channel_knobs(channel)
-        moved = np.array([values[knob] for knob in knobs])
+        moved = np.array([values[knob] - self.centre.get(knob, 0.0) for knob in knobs])
         return float(residual[channel] @ residual[channel] + self.penalty(knobs, channel) @ moved**2)
 
     def refine(self, channels: set[str]) -> None:
@@ -177,7 +188,8 @@ class Search:
                 table = np.column_stack([self.columns[knob] for knob in own])
                 penalty = self.penalty(own, channel)
                 now = np.array([self.values[knob] for knob in own])
-                normal, right = table.T @ table + np.diag(penalty), table.T @ self.residual[channel] - penalty * now
+                normal = table.T @ table + np.diag(penalty)
+                right = table.T @ self.residual[channel] - penalty * self.moved(own)
                 size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
                 step = np.linalg.solve(normal / np.outer(size, size) + 1e-9 * np.eye(len(own)), right / size) / size
                 low, high = np.array([k.low for k in own]), np.array([k.high for k in own])
@@ -414,20 +426,21 @@ class Search:
 
     # -- the search ---------------------------------------------------------------------------------------------------
 
-    def run(self) -> Attribution:
+    def run(self) -> None:
+        """Recalibrate, accept effects until none is proven any more, and revise; `outcome` has the result."""
         channels = set(self.bench.channels)
         self.progress("recalibrating", 0.1)
         self.refine(channels)
-        recalibrated = self._recalibration()
+        self.recalibrated = self._recalibration()
         self._free: dict[str, tuple[float, str]] = {}
         #: Dependence of the residual on each signal before any effect was accepted.
         self.first = {channel: self.dependence(channel) for channel in self.bench.channels if channel in FORCE_CHANNELS}
-        history: dict[str, Finding] = {}
+        history = self.history
         effects = [effect for effect in REGISTRY if effect.name not in self.calibrated]
         limit = len(effects)
         for number in range(limit):
             self._free = {}
-            left = [effect for effect in effects if effect.name not in self.accepted]
+            left = [effect for effect in effects if effect.name not in self.accepted and effect.name not in self.dropped]
             self.progress(f"testing {len(left)} candidates, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
             tested = self.round(left)
             for name, (finding, plan) in tested.items():
@@ -435,22 +448,46 @@ class Search:
                 earlier = history.get(name)
                 if earlier is None or not earlier.confounded_with or not finding.reason:
                     history[name] = finding
-            chosen: set[str] = set()
+            chosen: list[tuple] = []
             for channel in self.bench.channels:
                 passed = [t for t in tested.values() if t[0].channel == channel and not t[0].reason]
                 if not passed:
                     continue
-                self._accept(self._settle(passed, history))
-                chosen.add(channel)
+                chosen.append(self._settle(passed))
             if not chosen:
                 break
-            self.refine(chosen)
+            self._enter(chosen)
         if self.accepted:
             # The force that heats the pads has changed: everything once more, together.
             self.progress("refitting everything together", 0.75)
             self.refine(channels)
-        self._revise(history)
-        return self._outcome(history, recalibrated)
+        self._revise()
+
+    def _enter(self, winners: list[tuple]) -> None:
+        """Accept one effect per channel and refit; one that leaves its channel worse than before goes out again."""
+        channels = {winner[0].channel for winner in winners}
+        before = {channel: self.noise(channel) for channel in channels}
+        for winner in winners:
+            self._accept(winner)
+        self.refine(channels)
+        for finding, _ in winners:
+            if self.noise(finding.channel) >= before[finding.channel]:
+                self.drop(finding.effect.name, "no fit of it with the calibration's own parameters is better than without it")
+
+    def drop(self, name: str, reason: str) -> None:
+        """Take out an accepted effect, or the recalibration of a channel, and refit what remains of its channel."""
+        if name in self.recalibrated:
+            del self.recalibrated[name]
+            return
+        channel = self.history[name].channel
+        gone = set(self.accepted.pop(name))
+        self.history[name].accepted, self.history[name].reason = False, reason
+        self.dropped.add(name)
+        self.knobs = [knob for knob in self.knobs if knob not in gone]
+        for knob in gone:
+            del self.values[knob]
+        self.residual = self.bench.residuals(self.values)
+        self.refine({channel})
 
     def _accept(self, winner: tuple[Finding, tuple]) -> None:
         finding, (knobs, shape, _, verdict) = winner
@@ -459,15 +496,15 @@ class Search:
         every = [effect_knob(finding.effect, p.name, finding.channel) for p in finding.effect.amplitudes]
         self.values.update(dict.fromkeys(every, 0.0))
         self.accepted[finding.effect.name] = [*every, *shapes]
-        self.knobs += [*every, *shapes]
+        # The number of teeth is a whole number, and chosen as one.
+        self.knobs += every if finding.effect.name == "cogging_torque" else [*every, *shapes]
         for knob, value in zip(knobs, verdict.values, strict=True):
             self.values[knob] = float(np.clip(value, knob.low, knob.high))
         for knob, start in shape:
-            # The prior of a shape is centred on its start.
-            self.values[knob] = start
+            self.values[knob] = self.centre[knob] = start
         self.residual = self.bench.residuals(self.values)
 
-    def _settle(self, passed: list[tuple], history: dict[str, Finding]) -> tuple:
+    def _settle(self, passed: list[tuple]) -> tuple:
         """The candidate to accept out of those that passed in one channel, and why the others of equal gain are not.
 
         Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
@@ -483,7 +520,7 @@ class Search:
             beside_other = self.verdict_given(best[0].channel, other[1][2], best[1][2])
             if beside_other.p_value < Q_VALUE and beside_other.gain > 0.0:
                 other[0].reason = f"explained by {best[0].effect.name}, beside which it says nothing"
-                history[other[0].effect.name] = other[0]
+                self.history[other[0].effect.name] = other[0]
             else:
                 rivals.append(other)
         equal = [best] + [rival for rival in rivals if rival[1][3].gain >= _EQUAL * best[1][3].gain]
@@ -496,7 +533,7 @@ class Search:
                 f"confounded with {winner[0].effect.name} on these logs, which is simpler or explains more; to separate them: "
                 f"{loser[0].effect.manoeuvre}"
             )
-            history[loser[0].effect.name] = loser[0]
+            self.history[loser[0].effect.name] = loser[0]
         return winner
 
     def verdict_given(self, channel: str, given: list[np.ndarray], own: list[np.ndarray]) -> Verdict:
@@ -506,22 +543,22 @@ class Search:
         first = len(knobs) + len(given)
         return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
-    def _revise(self, history: dict[str, Finding]) -> None:
+    def _revise(self) -> None:
         """Test each accepted effect once more with all others in place; drop what, or which order, no longer holds."""
         for name in list(self.accepted):
-            finding, knobs = history[name], self.accepted[name]
+            finding, knobs = self.history[name], self.accepted[name]
             channel = finding.channel
             own = self.channel_knobs(channel)
-            values = np.array([self.values[k] for k in own])
-            restored = self.residual[channel] + np.column_stack([self.columns[k] for k in own]) @ values
+            amplitudes = [knob for knob in knobs if not is_shape(knob)]
+            # Its own shape would explain away what the amplitude does: it stands as fitted.
+            free = [knob for knob in own if knob not in knobs or knob in amplitudes]
+            restored = self.residual[channel] + np.column_stack([self.columns[k] for k in free]) @ self.moved(free)
             moments = self.moments(channel, [self.columns[k] for k in own], restored)
-            amplitudes = [knob for knob in knobs if not _is_shape(finding.effect, knob)]
             groups = _orders(amplitudes)
             dropped: list[Knob] = []
             for group in groups:
                 tested = [own.index(knob) for knob in group]
-                # Its own shape would explain away what the amplitude does: it stands as fitted.
-                rest = [i for i, k in enumerate(own) if i not in tested and (k not in knobs or k in amplitudes)]
+                rest = [own.index(knob) for knob in free if knob not in group]
                 verdict = judge(moments, rest, tested, self.penalty(own, channel))
                 if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
                     dropped += group
@@ -562,7 +599,9 @@ class Search:
         first, last, bare = (float(r[channel] @ r[channel]) for r in (self.initial, self.residual, without))
         return float(np.clip((bare - last) / first, 0.0, 1.0)) if first > 0.0 else 0.0
 
-    def _outcome(self, history: dict[str, Finding], recalibrated: dict[str, float]) -> Attribution:
+    def outcome(self) -> Attribution:
+        """What the search has found, and what it leaves."""
+        history = dict(self.history)
         sigmas: dict[Knob, float] = {}
         penalties = {}
         for channel in self.bench.channels:
@@ -571,9 +610,10 @@ class Search:
             penalties[channel] = self.penalty(own, channel)
             sigmas.update(zip(own, np.sqrt(np.diag(fitted.covariance)), strict=True))
         touched = {history[name].channel for name in self.accepted}
+        values = dict(self.values)
         for knob in self.knobs:
-            if knob.channel not in touched and knob.channel not in recalibrated:
-                self.values[knob] = 0.0
+            if knob.channel not in touched and knob.channel not in self.recalibrated:
+                values[knob] = 0.0
         for name, knobs in self.accepted.items():
             finding = history[name]
             finding.accepted = True
@@ -586,7 +626,7 @@ class Search:
             for knob in knobs:
                 key = knob.name.partition(".")[2]
                 finding.values[key] = self.values[knob]
-                finding.sigmas[key] = float(sigmas[knob])
+                finding.sigmas[key] = float(sigmas.get(knob, 0.0))
         for effect in REGISTRY:
             if effect.name in self.calibrated:
                 channel = self.bench.channel_of(effect.path, effect.name)
@@ -601,7 +641,8 @@ class Search:
                 history[effect.name] = finding
         return Attribution(
             [history[effect.name] for effect in REGISTRY],
-            self.values, sigmas, self.initial, self.residual, self.knobs, self.columns, recalibrated, self.signals, penalties,
+            values, sigmas, self.initial, self.residual, self.knobs, self.columns, self.recalibrated, self.signals, penalties,
+            self.centre,
         )  # fmt: skip
 
 
@@ -620,8 +661,12 @@ def _parts(knobs: list[Knob]) -> list[list[Knob]]:
     return [list(chain.from_iterable(groups[: count + 1])) for count in range(len(groups))] or [[]]
 
 
-def _is_shape(effect: Effect, knob: Knob) -> bool:
-    return any(f"{effect.name}.{p.name}" == knob.name for p in effect.shapes)
+_SHAPES = {f"{effect.name}.{parameter.name}" for effect in REGISTRY for parameter in effect.shapes}
+
+
+def is_shape(knob: Knob) -> bool:
+    """Whether a knob shapes an effect without switching it on."""
+    return knob.name in _SHAPES
 
 
 def _trust(knob: Knob, now: float) -> float:
@@ -631,7 +676,8 @@ def _trust(knob: Knob, now: float) -> float:
     return 3.0 * knob.prior if np.isfinite(knob.prior) else np.inf
 
 
-def attribute_with(bench: Bench, progress: Callable[[str, float], None]) -> tuple[Search, Attribution]:
+def searched(bench: Bench, progress: Callable[[str, float], None]) -> Search:
     """Find the effects that the logs of ``bench`` prove. ``progress`` is told what is being done, and the share done."""
     search = Search(bench, progress)
-    return search, search.run()
+    search.run()
+    return search

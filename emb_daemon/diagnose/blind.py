@@ -1,6 +1,9 @@
 """Blind test of diagnose on simulated brakes whose effects a seed has drawn.
 
-    python -m emb_daemon.diagnose.blind --null 200 --single 10 --pairs 20 --foreign 10 --output blind.json
+    python -m emb_daemon.diagnose.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
+
+Trials are appended to the file one by one; started again with the same file, the command goes on where it was stopped, and
+prints the table of all.
 
 Each trial draws a unit that scatters about the calibration as units do, gives it no effect, one, two, or one that the
 catalogue does not know, drives a campaign with it, and hands log and calibration to `diagnose`, which is not told. Sizes are
@@ -9,11 +12,13 @@ code with the estimator (see emb_daemon/plant).
 """
 
 import argparse
-import json
 import sys
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
@@ -65,6 +70,9 @@ class Trial:
         found: effects accepted, with their parameters.
         before, after: RMSE of the fused force on the validation log, N.
         unexplained: signal that a rest depends on, or None.
+        contribution_error: of what the found effects do on their paths against what the hidden ones do, RMS over RMS; None
+            where not exactly those were found.
+        seconds: of CPU, for diagnose alone.
     """
 
     seed: int
@@ -75,6 +83,8 @@ class Trial:
     before: float
     after: float
     unexplained: str | None
+    contribution_error: float | None = None
+    seconds: float = 0.0
 
     @property
     def false_findings(self) -> set[str]:
@@ -126,8 +136,8 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
     return result
 
 
-def force_of(bench: Bench, name: str, values: dict[str, float]) -> float:
-    """RMS (N) of what an effect does on its own path, by the estimator's own term."""
+def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarray:
+    """What an effect does on its own path, N, by the estimator's own term."""
     effect = next(e for e in REGISTRY if e.name == name)
     channel = bench.channel_of(effect.path, name)
     other = Bench.__new__(Bench)
@@ -135,8 +145,11 @@ def force_of(bench: Bench, name: str, values: dict[str, float]) -> float:
     other.parameters = bench.parameters.copy()
     for key, value in values.items():
         other.parameters["effects"][name][key] = value
-    change = other.residuals({})[channel] - bench.residuals({})[channel]
-    return float(np.sqrt(np.mean(change**2)))
+    return other.residuals({})[channel] - bench.residuals({})[channel]
+
+
+def _rms(signal: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(signal**2)))
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
@@ -145,8 +158,6 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     start = calibration
     removed = [name for name in names if name in calibration.effects]
     if removed:
-        import msgspec
-
         start = msgspec.structs.replace(
             calibration, effects={k: v for k, v in calibration.effects.items() if k not in removed}
         )
@@ -164,7 +175,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
             values = draw(name, rng)
             # Twice, because large sizes are not quite linear.
             for _ in range(2):
-                values = scaled(name, values, size / max(force_of(bench, name, values), 1e-9))
+                values = scaled(name, values, size / max(_rms(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
     plant = base.copy()
     for name, values in hidden.items():
@@ -172,32 +183,52 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
             plant["effects"][name][key] = value
     fit_frames, _ = simulate_log(plant, schedule, seed=seed + 1)
     val_frames, _ = simulate_log(plant, campaign(plant, rng, stops), seed=seed + 2)
-    result = diagnose([log_of(fit_frames)], start, [log_of(val_frames)])
+    fit_log, val_log = log_of(fit_frames), log_of(val_frames)
+    begin = time.process_time()
+    result = diagnose([fit_log], start, [val_log])
+    seconds = time.process_time() - begin
     rest_ = result.unexplained
+    found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in result.accepted}
+    error = None
+    if kind in ("single", "pair") and set(found) == set(hidden):
+        bench = Bench([val_log], to_parameters(start))
+        true = {name: contribution(bench, name, values) for name, values in hidden.items()}
+        error = max(_rms(contribution(bench, name, found[name]) - true[name]) / _rms(true[name]) for name in hidden)
     return Trial(
         seed,
         kind,
         hidden,
         size,
-        {f.effect.name: dict(f.values) for f in result.accepted},
+        found,
         result.before.rmse("fused"),
         result.after.rmse("fused"),
         rest_.signal if rest_ else None,
+        error,
+        seconds,
     )
 
 
 def parameter_error(trial: Trial) -> float:
-    """Largest relative error of the amplitudes that were hidden, against the effect's largest amplitude; NaN if not found."""
+    """Largest relative error of the amplitudes that were hidden, against the effect's largest amplitude; NaN if not found.
+
+    A ripple's cosine and sine count as one amplitude: over a motor angle that starts anywhere, phase means nothing."""
     worst = np.nan
     for name, values in trial.hidden.items():
         if name not in trial.found:
             return float("nan")
         effect = next(e for e in REGISTRY if e.name == name)
         keys = [p.name for p in effect.amplitudes]
-        scale = max(abs(values[key]) for key in keys)
-        error = max(abs(trial.found[name].get(key, 0.0) - values[key]) for key in keys) / scale
+        true, found = (_amplitudes({key: v.get(key, 0.0) for key in keys}) for v in (values, trial.found[name]))
+        error = max(abs(found[key] - true[key]) for key in true) / max(abs(value) for value in true.values())
         worst = float(np.nanmax([worst, error]))
     return worst
+
+
+def _amplitudes(values: dict[str, float]) -> dict[str, float]:
+    """Values with cosine and sine of one order as one amplitude."""
+    pairs = {key: key.replace("cosine", "sine") for key in values if "cosine" in key}
+    result = {key: value for key, value in values.items() if "cosine" not in key and key not in pairs.values()}
+    return result | {key: float(np.hypot(values[key], values[sine])) for key, sine in pairs.items()}
 
 
 def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, str, tuple[str, ...], float]]:
@@ -223,27 +254,61 @@ def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, st
 
 
 def summary(trials: list[Trial]) -> str:
-    """Markdown table of the score."""
-    lines = [
-        "| trials | n | named | false findings | error before → after / N | parameter error, median |",
-        "|---|---|---|---|---|---|",
-    ]
+    """The score as Markdown: one line for each kind, and the power curve."""
     groups: dict[str, list[Trial]] = {}
     for trial in trials:
-        label = trial.kind if trial.kind in ("null", "pair") else f"{trial.kind} {next(iter(trial.hidden))}"
-        if trial.kind == "single":
-            label += f" {trial.size:.0f} N"
-        groups.setdefault(label, []).append(trial)
+        groups.setdefault(f"foreign: {_names(trial)}" if trial.kind == "foreign" else _KINDS[trial.kind], []).append(trial)
+    lines = [
+        "| plants | trials | named correctly | with a false finding | fused error before → after, RMS in N | worse after |",
+        "|---|---|---|---|---|---|",
+    ]
     for label, group in groups.items():
-        named = sum(trial.named for trial in group)
+        before, after = (_rms(np.array([getattr(trial, when) for trial in group])) for when in ("before", "after"))
+        worse = sum(trial.after > _WORSE * trial.before for trial in group)
         false = sum(bool(trial.false_findings) for trial in group)
-        before = np.sqrt(np.mean([trial.before**2 for trial in group]))
-        after = np.sqrt(np.mean([trial.after**2 for trial in group]))
-        errors = [parameter_error(trial) for trial in group if trial.kind in ("single", "pair")]
-        errors = [error for error in errors if np.isfinite(error)]
-        error = f"{100 * np.median(errors):.1f} %" if errors else "–"
-        lines.append(f"| {label} | {len(group)} | {named} | {false} | {before:.0f} → {after:.0f} | {error} |")
+        lines.append(f"| {label} | {len(group)} | {_share(group)} | {false} | {before:.0f} → {after:.0f} | {worse} |")
+    singles = [trial for trial in trials if trial.kind == "single"]
+    if singles:
+        sizes = sorted({trial.size for trial in singles})
+        heads = [f"{size:.0f} N" for size in sizes]
+        lines += ["", "| effect, named at | " + " | ".join(heads) + " | error of its amplitude, median | of what it does |"]
+        lines.append("|---" * (len(sizes) + 3) + "|")
+        for name in dict.fromkeys(_names(trial) for trial in singles):
+            own = [trial for trial in singles if _names(trial) == name]
+            power = [_share([trial for trial in own if trial.size == size]) for size in sizes]
+            amplitude = _percent([parameter_error(trial) for trial in own])
+            effect = _percent([trial.contribution_error for trial in own if trial.contribution_error is not None])
+            lines.append(f"| {name} | {' | '.join(power)} | {amplitude} | {effect} |")
     return "\n".join(lines)
+
+
+_KINDS = {"null": "no effect", "single": "one effect", "pair": "two effects"}
+#: From here a validation error counts as worse; below it is the noise of the reference.
+_WORSE = 1.05
+
+
+def _names(trial: Trial) -> str:
+    return " + ".join(trial.hidden).replace("_", " ")
+
+
+def _share(group: list[Trial]) -> str:
+    return f"{sum(trial.named for trial in group)}/{len(group)}"
+
+
+def _percent(errors: list[float]) -> str:
+    known = [error for error in errors if np.isfinite(error)]
+    return f"{100 * np.median(known):.1f} %" if known else "–"
+
+
+def recorded(path: Path | None) -> list[Trial]:
+    """Trials that an earlier run has left in a file; the last line may be cut."""
+    trials = []
+    for line in path.read_bytes().splitlines() if path and path.exists() else []:
+        try:
+            trials.append(msgspec.json.decode(line, type=Trial))
+        except msgspec.DecodeError:
+            break
+    return trials
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -252,22 +317,31 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--single", type=int, default=5, help="plants per effect and size")
     parser.add_argument("--pairs", type=int, default=40, help="plants with two effects")
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
-    parser.add_argument("--output", type=Path, help="trials as JSON")
+    parser.add_argument("--output", type=Path, help="trials, one JSON object per line; those already there are not run again")
     parser.add_argument("--calibration", type=Path, help="default: the shipped one")
     arguments = parser.parse_args(argv)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    planned = plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign)
+    done = {_key(t.seed, t.kind, t.hidden, t.size): t for t in recorded(arguments.output)}
     trials = []
-    for seed, kind, names, size in plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign):
-        trial = run_trial(calibration, seed, kind, names, size)
+    for seed, kind, names, size in planned:
+        trial = done.get(_key(seed, kind, names, size))
+        if trial is None:
+            trial = run_trial(calibration, seed, kind, names, size)
+            state = "ok" if trial.named else "WRONG"
+            found = ", ".join(trial.found) or "-"
+            text = f"{seed} {kind} {'+'.join(names)} {size:.0f} N: {state}, {found}, {trial.before:.1f} -> {trial.after:.1f} N"
+            print(text, trial.unexplained or "", file=sys.stderr, flush=True)
+            if arguments.output:
+                with arguments.output.open("ab") as file:
+                    file.write(msgspec.json.encode(trial) + b"\n")
         trials.append(trial)
-        state = "ok" if trial.named else "WRONG"
-        found = ", ".join(trial.found) or "-"
-        text = f"{kind} {'+'.join(names)} {size:.0f} N: {state}, found {found}, {trial.before:.0f} -> {trial.after:.0f} N"
-        print(text, trial.unexplained or "", file=sys.stderr, flush=True)
-        if arguments.output:
-            arguments.output.write_text(json.dumps([asdict(t) for t in trials], indent=1))
     print(summary(trials))
     return 0
+
+
+def _key(seed: int, kind: str, names: Iterable[str], size: float) -> tuple:
+    return seed, kind, tuple(names), size
 
 
 if __name__ == "__main__":

@@ -12,17 +12,14 @@ import numpy as np
 
 from emb_daemon import __version__
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
-from emb_daemon.diagnose.attribution import Attribution, Finding, attribute_with
+from emb_daemon.diagnose.attribution import Attribution, Finding, searched
 from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench
-from emb_daemon.diagnose.evidence import Moments, fit
-from emb_daemon.diagnose.judged import Errors, comparison, errors_of, innovation_errors, joined, judged
+from emb_daemon.diagnose.confirmation import confirm
+from emb_daemon.diagnose.judged import Errors, comparison, judged
 from emb_daemon.diagnose.knobs import Knob, calibrated
 from emb_daemon.diagnose.unexplained import Rest, rests
 from emb_daemon.errors import InputError
-from emb_daemon.offline import Log, estimate
-
-#: Parts into which the episodes are dealt when no validation log is given.
-_FOLDS = 4
+from emb_daemon.offline import Log
 
 Progress = Callable[[str, float], None]
 
@@ -234,8 +231,10 @@ def diagnose(
     bench = Bench(fit_logs, to_parameters(calibration))
     if bench.episodes < 6:
         raise InputError(f"{fit_logs[0].path}: only {bench.episodes} episodes, expected at least 6 to tell effect from chance")
-    search, attribution = attribute_with(bench, progress)
-    progress("what is left", 0.85)
+    search = searched(bench, progress)
+    progress("confirming with the running estimator", 0.8)
+    attribution, left_out_errors = confirm(search, calibration)
+    progress("what is left", 0.87)
     after_rests = {
         channel: rests(channel, search.dependence(channel), search.counted(channel), search.floor(channel))
         for channel in bench.channels
@@ -252,7 +251,7 @@ def diagnose(
     else:
         judges = bench
         before = judged(bench, to_parameters(calibration))
-        after = _left_out(bench, attribution, calibration)
+        after = left_out_errors
     result = Diagnosis(
         calibration, augmented, bench, attribution, "validate" if validate else "left_out_episodes",
         judges, before, after, after_rests, before_rests, time.monotonic() - begin,
@@ -264,31 +263,6 @@ def diagnose(
     )
     result.calibration = _with_provenance(result, sources)
     progress("done", 1.0)
-    return result
-
-
-def _left_out(bench: Bench, attribution: Attribution, calibration: Calibration) -> Errors:
-    """Errors of each quarter of the episodes with parameters that the other quarters gave."""
-    fold = np.arange(bench.episodes) % _FOLDS
-    parts: list[Errors] = []
-    of = errors_of if bench.has_reference else innovation_errors
-    for number in range(_FOLDS):
-        values: dict[Knob, float] = {}
-        for channel in bench.channels:
-            own = [knob for knob in attribution.knobs if knob.channel == channel]
-            if not any(attribution.values[knob] for knob in own):
-                continue
-            table = np.column_stack([attribution.regressors[knob] for knob in own])
-            restored = attribution.residual[channel] + table @ np.array([attribution.values[knob] for knob in own])
-            moments = Moments.of(table, restored, bench.episode[channel], bench.episodes)
-            kept = Moments(moments.products[fold != number], moments.counts[fold != number])
-            values.update(zip(own, fit(kept, attribution.penalties[channel]).values, strict=True))
-        parameters = to_parameters(calibrated(calibration, values)) if values else to_parameters(calibration)
-        parts.append(joined([of(trial, estimate(trial.log.samples, parameters)) for trial in bench.trials]))
-    result = parts[0]
-    for number in range(1, _FOLDS):
-        result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
-        result.counts[:, :, fold == number] = parts[number].counts[:, :, fold == number]
     return result
 
 
