@@ -32,7 +32,7 @@ from emb_daemon.effects.base import Effect
 #: False discovery rate over the catalogue.
 Q_VALUE = 0.01
 #: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference.
-_RESIDUAL_SHARE = 0.1
+_RESIDUAL_SHARE = 0.06
 _SIGNAL_SHARE = 0.002
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K = 1.5
@@ -47,6 +47,8 @@ _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
 _GAUSS_NEWTON = 4
+#: Standard deviations of what is known beforehand by which a calibration may be off.
+_OFF = 3.0
 _FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
 
 
@@ -126,6 +128,7 @@ class Search:
         self.recalibrated: dict[str, float] = {}
         self.dropped: set[str] = set()
         self.signals = signals(bench, parameters)
+        self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in bench.trials])))
         braking = self.signals["brake_torque"][self.signals["brake_torque"] > 20.0]
         self.scale = dict.fromkeys(bench.channels, float(np.sqrt(np.mean(self.signals["clamp_force"] ** 2))))
         self.scale["brake_torque"] = float(np.sqrt(np.mean(braking**2))) if len(braking) else 0.0
@@ -187,28 +190,43 @@ class Search:
                 own = self.channel_knobs(channel)
                 table = np.column_stack([self.columns[knob] for knob in own])
                 penalty = self.penalty(own, channel)
-                now = np.array([self.values[knob] for knob in own])
                 normal = table.T @ table + np.diag(penalty)
                 right = table.T @ self.residual[channel] - penalty * self.moved(own)
                 size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
                 step = np.linalg.solve(normal / np.outer(size, size) + 1e-9 * np.eye(len(own)), right / size) / size
-                low, high = np.array([k.low for k in own]), np.array([k.high for k in own])
                 limit = np.array([_trust(knob, self.values[knob]) for knob in own])
                 # Shortened as a whole: knobs that act against each other must move together.
                 step /= max(1.0, float(np.max(np.abs(step) / limit)))
-                steps.update(zip(own, np.clip(now + step, low, high) - now, strict=True))
+                steps.update(zip(own, step, strict=True))
             before = {channel: self.objective(self.residual, self.values, channel) for channel in channels}
             channels -= self._advance(steps, before, channels)
             if not channels:
                 break
 
+    def _stepped(self, steps: dict[Knob, float]) -> dict[Knob, float]:
+        """Values after a step, inside their bounds.
+
+        The motor angle counts from anywhere, so a small change of a ripple's order turns its phase by much: cosine and sine
+        are turned along, about the middle of the angles that occur."""
+        values = self.values | {knob: self.values[knob] + step for knob, step in steps.items()}
+        named = {knob.name: knob for knob in steps}
+        order = named.get("gear_mesh_ripple.order_per_turn")
+        if order:
+            cosine, sine = named["gear_mesh_ripple.cosine"], named["gear_mesh_ripple.sine"]
+            turn = steps[order] * self.middle
+            size = complex(
+                values[cosine] + turn * self.values[sine], -(values[sine] - turn * self.values[cosine])
+            ) * np.exp(-1j * turn)  # fmt: skip
+            values[cosine], values[sine] = float(size.real), float(-size.imag)
+        for knob in steps:
+            values[knob] = float(np.clip(values[knob], knob.low, knob.high))
+        return values
+
     def _advance(self, steps: dict[Knob, float], before: dict[str, float], channels: set[str]) -> set[str]:
         """Take the steps, shortened where they do not help; returns the channels that have converged."""
         share = dict.fromkeys(channels, 1.0)
         for _ in range(8):
-            tried = dict(self.values)
-            for knob, step in steps.items():
-                tried[knob] += share[knob.channel] * step
+            tried = self._stepped({knob: share[knob.channel] * step for knob, step in steps.items()})
             residual = self.bench.residuals(tried)
             after = {channel: self.objective(residual, tried, channel) for channel in channels}
             # A channel that stands still gets worse only through another one, which is then to be followed.
@@ -374,6 +392,10 @@ class Search:
         if channel not in self._free:
             best = (0.0, "")
             for name, (without, with_) in self.dependence(channel).items():
+                # What a base parameter answers for is nobody's shadow: smoothed, the acceleration shows inertia better than
+                # the estimator's own difference of noisy speeds can.
+                if (channel, name) == ("torque", "motor_acceleration"):
+                    continue
                 gain = float((without - with_).sum())
                 if gain > best[0]:
                     best = (gain, name)
@@ -585,6 +607,9 @@ class Search:
             knobs = self.channel_knobs(channel)
             if not knobs:
                 continue
+            # Further off than any calibration is, parameters stand in for something that the models lack.
+            if any(abs(self.values[knob]) > _OFF * knob.prior for knob in knobs):
+                continue
             table = np.column_stack([self.columns[knob] for knob in knobs])
             moments = self.moments(channel, [table], self.initial[channel])
             gain = float((moments.products[:, -1, -1] - fit(moments, self.penalty(knobs, channel)).left_out).sum())
@@ -671,6 +696,8 @@ def is_shape(knob: Knob) -> bool:
 
 def _trust(knob: Knob, now: float) -> float:
     """Longest step that Gauss-Newton may take at once."""
+    if "order_per_turn" in knob.name:
+        return 0.05
     if knob.unit == "1" and np.isfinite(knob.prior):
         return max(0.3, 0.5 * abs(now))
     return 3.0 * knob.prior if np.isfinite(knob.prior) else np.inf

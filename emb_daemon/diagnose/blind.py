@@ -54,6 +54,7 @@ _FOREIGN = {
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
 }
+_POSITIVE = ("signal_delay", "second_relaxation")
 #: Largest delay drawn, s: a delay is undone to first order, which a longer one than a cycle and a half outgrows.
 _LONGEST_DELAY_S = 0.006
 #: Sizes (N RMS on the effect's own path) of the power curve.
@@ -120,8 +121,8 @@ def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
         elif "order_3" in parameter.name or "order_4" in parameter.name:
             values[parameter.name] = 0.0
         else:
-            # Only the future would make a delay negative.
-            sign = 1.0 if parameter.low >= 0.0 or name == "signal_delay" else rng.choice([-1.0, 1.0])
+            # Only the future would make a delay negative, and only pads that pull a relaxation.
+            sign = 1.0 if parameter.low >= 0.0 or name in _POSITIVE else rng.choice([-1.0, 1.0])
             values[parameter.name] = float(parameter.prior * sign * rng.uniform(0.5, 1.5))
     return values
 

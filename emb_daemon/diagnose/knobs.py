@@ -142,7 +142,7 @@ def effect_knob(effect: Effect, parameter_name: str, channel: str, initial: floa
     scale = abs(initial) if initial else parameter.prior
     if "order" in parameter_name and parameter.starts:
         # Phase runs away with the angle: an order is only ever touched up.
-        step, prior = 1e-3, 0.1
+        step, prior = 1e-4, 0.1
     elif parameter.starts:
         step, prior = 0.02 * (scale or 1.0), max(scale, 0.5)
     else:
