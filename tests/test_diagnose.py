@@ -1,15 +1,18 @@
 """diagnose: statistics that do not fool themselves, and the loop closed on simulated brakes that hide something."""
 
+import dataclasses
 import json
 
 import msgspec
 import numpy as np
 import pytest
 from browserkit import assert_is_drawn
+from scipy.signal import lfilter
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
+from emb_daemon.diagnose import blind, confirmation
 from emb_daemon.diagnose.blind import campaign, run_trial
 from emb_daemon.diagnose.channels import Bench
 from emb_daemon.diagnose.diagnosis import diagnose
@@ -21,7 +24,7 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import simulate_log
+from emb_daemon.plant.scenarios import random_angle, simulate_log, training
 from emb_daemon.resources import resource
 
 
@@ -35,9 +38,8 @@ def calibration():
 
 def _autocorrelated(rng, episodes_, samples):
     noise = rng.standard_normal((episodes_, samples))
-    for k in range(1, samples):
-        noise[:, k] = 0.98 * noise[:, k - 1] + np.sqrt(1.0 - 0.98**2) * noise[:, k]
-    return noise.ravel()
+    noise[:, 1:] *= np.sqrt(1.0 - 0.98**2)
+    return lfilter([1.0], [1.0, -0.98], noise).ravel()
 
 
 def test_autocorrelated_noise_is_no_effect():
@@ -267,8 +269,12 @@ def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration):
     ("seed", "kind", "names", "size"),
     [
         (1003, "null", (), 0.0),
-        (51000, "single", ("signal_delay",), 100.0),
-        (52000, "single", ("friction_asymmetry",), 300.0),
+        (51000, "single", ("backlash",), 150.0),
+        # More than the refitted curve and relaxation can hide.
+        (20920, "single", ("stiffness_hysteresis",), 300.0),
+        # An order, its phase and friction, all told from an angle that counts from anywhere.
+        (20310, "single", ("gear_mesh_ripple",), 600.0),
+        (21140, "pair", ("friction_asymmetry", "cogging_torque"), 319.5),
         (53000, "pair", ("disc_thickness_variation", "current_offset"), 300.0),
     ],
 )
@@ -277,6 +283,83 @@ def test_blind(calibration, seed, kind, names, size):
     trial = run_trial(calibration, seed, kind, names, size)
     assert trial.named, trial
     assert trial.after < 45.0
+    assert trial.after < 1.05 * trial.before
+    if trial.contribution_error is not None:
+        assert trial.contribution_error < 0.15
+
+
+def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monkeypatch):
+    """Something periodic in the motor angle is wrong, and the wheel stands: no fit may so much as try to vary the disc."""
+    plant = plant_from_calibration(
+        calibration, seed=71, effects={"spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0}}
+    )
+    rng = np.random.default_rng(71)
+    logs = [log_of(simulate_log(plant, training(plant, 21.0) + random_angle(plant, 20.0, rng), seed=k)[0]) for k in (1, 2)]
+    assert all(np.nanmax(log.samples["wheel_speed"]) < 0.5 for log in logs)
+    tried = set()
+    residuals = Bench.residuals
+
+    def spy(bench, values):
+        tried.update(knob.name for knob, value in values.items() if value != 0.0)
+        return residuals(bench, values)
+
+    monkeypatch.setattr(Bench, "residuals", spy)
+    result = diagnose(logs[:1], calibration, logs[1:])
+    finding = next(f for f in result.attribution.findings if f.effect.name == "disc_thickness_variation")
+    assert not finding.accepted and finding.p_value > 0.01
+    assert tried and not any(name.startswith("disc_thickness_variation") for name in tried)
+    assert "disc_thickness_variation" not in result.calibration.effects
+
+
+def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_disc):
+    """The same stops with the wheel angle of each disturbed: the residual is there, its cause must not be named."""
+    log = load_log(uneven_disc[0] / "fit.log")
+    samples = log.samples.copy()
+    cut = episodes(log.time_s, np.nan_to_num(log.force_N))
+    offset = np.random.default_rng(0).integers(0, 96, cut[-1] + 1)[cut]
+    samples["wheel_pulse"] = np.mod(samples["wheel_pulse"] + offset, 4096)
+    result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
+    assert "disc_thickness_variation" not in {finding.effect.name for finding in result.accepted}
+
+
+def test_what_makes_the_running_estimator_worse_is_taken_out_again(calibration, monkeypatch):
+    """Whatever the residual says: an effect with which left-out episodes get worse is not written."""
+    plant = plant_from_calibration(calibration, seed=31, effects={"viscous_friction": {"viscous_Nms_per_rad": 3e-4}})
+    rng = np.random.default_rng(31)
+    log = log_of(simulate_log(plant, campaign(plant, rng, 4), seed=1)[0])
+    judge_left_out = confirmation.left_out
+
+    def worse_with_it(bench, attribution, start, without=""):
+        errors = judge_left_out(bench, attribution, start, without)
+        if any(f.accepted and f.effect.name == "viscous_friction" != without for f in attribution.findings):
+            errors.sums[errors.names.index("fused")] *= 4.0
+        return errors
+
+    monkeypatch.setattr(confirmation, "left_out", worse_with_it)
+    result = diagnose([log], calibration)
+    finding = next(f for f in result.attribution.findings if f.effect.name == "viscous_friction")
+    assert not finding.accepted
+    assert "fused error on left-out episodes goes from" in finding.reason
+    assert "viscous_friction" not in result.calibration.effects
+
+
+def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, capsys):
+    ran = []
+
+    def pretend(calibration, seed, kind, names, size):
+        ran.append(seed)
+        return blind.Trial(seed, kind, {name: {} for name in names}, size, {}, 30.0, 27.0, None)
+
+    monkeypatch.setattr(blind, "run_trial", pretend)
+    output = tmp_path / "blind.jsonl"
+    few = ["--single", "0", "--pairs", "1", "--foreign", "0", "--output", str(output)]
+    assert blind.main(["--null", "2", *few]) == 0
+    output.write_bytes(output.read_bytes()[:-20])
+    assert blind.main(["--null", "3", *few]) == 0
+    # The line that was cut is run again, and the new plant; nothing else.
+    assert ran[:3] == [1000, 1001, 20000] and sorted(ran[3:]) == [1002, 20000]
+    table = capsys.readouterr().out
+    assert "| no effect | 3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0 |" in table
 
 
 def test_bench_runs_the_production_estimator(calibration):

@@ -18,7 +18,7 @@ effects only work together (a slow branch without slip gains nothing), so effect
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, combinations, product
 
 import numpy as np
 
@@ -47,8 +47,10 @@ _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
 _GAUSS_NEWTON = 4
-#: Standard deviations of what is known beforehand by which a calibration may be off.
-_OFF = 3.0
+#: Correlation from which two parameters are known only together.
+_TRADE = 0.9
+#: Disc speed (rad/s) below which the wheel stands but for the sensor's noise.
+_STANDING = 0.5
 _FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
 
 
@@ -437,6 +439,15 @@ class Search:
             random = np.random.default_rng(0)
             shifted = angle + random.uniform(0.0, 2.0 * np.pi, self.bench.episodes)[episode]
             trials.append([lever * part(order * shifted) for order in (1, 2) for part in (np.cos, np.sin)])
+            # The counterfactual: under pads that stand on it, a disc keeps its thickness.
+            standing = self.signals["disc_speed"] < _STANDING
+            count = np.maximum(np.bincount(episode, standing, minlength=self.bench.episodes), 1.0)
+            varying = []
+            for order, part in product((1, 2), (np.cos, np.sin)):
+                shape = standing * part(order * angle)
+                mean = np.bincount(episode, shape, minlength=self.bench.episodes) / count
+                varying.append(lever * standing * (shape - mean[episode]))
+            trials.append(varying)
         else:
             # Temperatures mostly rise through a log, so a shifted one is much the same: each episode gets another's.
             signal = self.signals["disc_temperature" if effect.placebo == "disc" else "energy"]
@@ -607,9 +618,6 @@ class Search:
             knobs = self.channel_knobs(channel)
             if not knobs:
                 continue
-            # Further off than any calibration is, parameters stand in for something that the models lack.
-            if any(abs(self.values[knob]) > _OFF * knob.prior for knob in knobs):
-                continue
             table = np.column_stack([self.columns[knob] for knob in knobs])
             moments = self.moments(channel, [table], self.initial[channel])
             gain = float((moments.products[:, -1, -1] - fit(moments, self.penalty(knobs, channel)).left_out).sum())
@@ -629,11 +637,15 @@ class Search:
         history = dict(self.history)
         sigmas: dict[Knob, float] = {}
         penalties = {}
+        covariances: dict[tuple[Knob, Knob], float] = {}
         for channel in self.bench.channels:
-            own = self.channel_knobs(channel)
-            fitted = fit(self.moments(channel, [self.columns[k] for k in own]), self.penalty(own, channel))
-            penalties[channel] = self.penalty(own, channel)
-            sigmas.update(zip(own, np.sqrt(np.diag(fitted.covariance)), strict=True))
+            every = self.channel_knobs(channel)
+            penalties[channel] = self.penalty(every, channel)
+            # At a fixed order a ripple's cosine and sine are as sure as its amplitude; with the order they only turn.
+            for own in (every, [knob for knob in every if not knob.name.endswith("order_per_turn")]):
+                fitted = fit(self.moments(channel, [self.columns[k] for k in own]), self.penalty(own, channel))
+                sigmas.update(zip(own, np.sqrt(np.diag(fitted.covariance)), strict=True))
+                covariances.update(zip(product(own, own), fitted.covariance.ravel(), strict=True))
         touched = {history[name].channel for name in self.accepted}
         values = dict(self.values)
         for knob in self.knobs:
@@ -643,7 +655,7 @@ class Search:
             finding = history[name]
             finding.accepted = True
             finding.share_explained = self._share(finding.channel, knobs)
-            finding.reason = finding.reason or (
+            finding.reason = (
                 f"q = {finding.q_value:.1g} over episodes, gains {finding.gain:.3g} {UNITS[finding.channel]} on left-out ones"
                 + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
                 + (", from the difference of both paths: no reference was recorded" if finding.channel == "innovation" else "")
@@ -652,6 +664,7 @@ class Search:
                 key = knob.name.partition(".")[2]
                 finding.values[key] = self.values[knob]
                 finding.sigmas[key] = float(sigmas.get(knob, 0.0))
+            finding.reason += _tradeoffs(knobs, sigmas, covariances)
         for effect in REGISTRY:
             if effect.name in self.calibrated:
                 channel = self.bench.channel_of(effect.path, effect.name)
@@ -661,7 +674,7 @@ class Search:
                 for knob in self.knobs:
                     group, _, key = knob.name.partition(".")
                     if group == effect.name:
-                        finding.values[key] += self.values[knob]
+                        finding.values[key] += values[knob]
                         finding.sigmas[key] = float(sigmas[knob])
                 history[effect.name] = finding
         return Attribution(
@@ -669,6 +682,16 @@ class Search:
             values, sigmas, self.initial, self.residual, self.knobs, self.columns, self.recalibrated, self.signals, penalties,
             self.centre,
         )  # fmt: skip
+
+
+def _tradeoffs(knobs: list[Knob], sigmas: dict[Knob, float], covariances: dict[tuple[Knob, Knob], float]) -> str:
+    """Which parameters of an effect these logs know only together."""
+    text = ""
+    for one, other in combinations([knob for knob in knobs if "order_" not in knob.name and (knob, knob) in covariances], 2):
+        if abs(covariances[one, other]) > _TRADE * sigmas[one] * sigmas[other]:
+            names = " and ".join(knob.name.partition(".")[2] for knob in (one, other))
+            text += f"; {names} trade off on these logs: what they do together is known better than either"
+    return text
 
 
 def _orders(knobs: list[Knob]) -> list[list[Knob]]:

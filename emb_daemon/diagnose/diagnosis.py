@@ -21,6 +21,9 @@ from emb_daemon.diagnose.unexplained import Rest, rests
 from emb_daemon.errors import InputError
 from emb_daemon.offline import Log
 
+#: A stated noise this many times what is left is none.
+_OVERSTATED = 3.0
+
 Progress = Callable[[str, float], None]
 
 
@@ -121,6 +124,11 @@ class Diagnosis:
                 knob.name: {"change": value, "sigma": self.attribution.sigmas.get(knob, 0.0), "unit": knob.unit}
                 for knob, value in self.attribution.values.items()
                 if value != 0.0 and not _of_effect(knob)
+            },
+            "noise": {
+                name: {"before": getattr(self.original.noise, name), "after": getattr(self.calibration.noise, name)}
+                for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
+                if getattr(self.original.noise, name) != getattr(self.calibration.noise, name)
             },
             "unexplained": {
                 "present": rest is not None,
@@ -242,7 +250,7 @@ def diagnose(
     }
     before_rests = {channel: rests(channel, gains, search.counted(channel), 0.0) for channel, gains in search.first.items()}
     used = {knob: value for knob, value in attribution.values.items() if value != 0.0}
-    augmented = calibrated(calibration, used) if used else calibration
+    augmented = _with_noise(calibrated(calibration, used), bench, attribution) if used else calibration
     progress("judging", 0.9)
     if validate:
         judges = Bench(validate, to_parameters(calibration))
@@ -264,6 +272,32 @@ def diagnose(
     result.calibration = _with_provenance(result, sources)
     progress("done", 1.0)
     return result
+
+
+def _with_noise(calibration: Calibration, bench: Bench, attribution: Attribution) -> Calibration:
+    """The calibration with the stiffness path's noise as it now is, if what it states contains what has been explained.
+
+    The filter would go on trusting the worse path. It is only ever lowered: a rest that nothing explains is no noise."""
+    from emb_daemon.identify.noise import force_error_levels, integral_time
+
+    noise = calibration.noise
+    if not bench.has_reference:
+        return calibration
+    residual, force = attribution.residual["stiffness"], attribution.signals["clamp_force"]
+    known = residual != 0.0
+    stated = np.sqrt(np.mean(noise.stiffness_N**2 + (noise.stiffness_relative * force[known]) ** 2))
+    fitted = any(v != 0.0 for knob, v in attribution.values.items() if knob.channel == "stiffness")
+    if not fitted or stated < _OVERSTATED * np.sqrt(np.mean(residual[known] ** 2)):
+        return calibration
+    floor, relative = force_error_levels(residual[known], force[known])
+    lengths = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]
+    levels = msgspec.structs.replace(
+        noise,
+        stiffness_N=floor,
+        stiffness_relative=relative,
+        stiffness_correlation_s=integral_time(np.split(residual, lengths)),
+    )
+    return msgspec.structs.replace(calibration, noise=levels)
 
 
 def _with_provenance(diagnosis: Diagnosis, sources: tuple[Source, ...]) -> Calibration:

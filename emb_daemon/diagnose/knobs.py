@@ -71,6 +71,8 @@ def _heat_share(side: int) -> Callable[[np.void, float], None]:
     return apply
 
 
+#: Presliding angle (rad at the motor) that gears have.
+_PRESLIDING_RAD = 0.03
 #: Where the slopes of the pads' friction over force and disc speed turn about, N and rad/s.
 _FRICTION_FORCE_N, _FRICTION_SPEED = 5000.0, 20.0
 
@@ -96,6 +98,13 @@ def _softening(key: str, column: str, value: float) -> Knob:
     return Knob(f"thermal.softening.{key}", "stiffness", 1e-5, prior, "1/K", change, low=-max(value, 0.0), high=2e-3)
 
 
+def _presliding(value: float) -> Knob:
+    """In radians: a calibration with friction by sign has next to none, and no factor leads away from that."""
+    size = max(value, _PRESLIDING_RAD)
+    change = _shift("presliding_angle")
+    return Knob("friction.presliding_angle_rad", "torque", 0.02 * size, size, "rad", change, low=-0.9 * value)
+
+
 def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     """Knobs of the base calibration; the contact angle has one for each log, because each power-on finds its own."""
     knobs = [
@@ -115,7 +124,7 @@ def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
         Knob("motor.inertia_kg_m2", "torque", 0.01, 0.5, "1", _scale("inertia"), low=-0.9),
         Knob("friction.load_m_per_rad", "torque", 0.01, 0.5, "1", _scale("load_friction"), low=-0.99),
         Knob("friction.offset_Nm", "torque", 0.01, 1.0, "1", _scale("offset_friction"), low=-0.99),
-        Knob("friction.presliding_angle_rad", "torque", 0.02, 1.0, "1", _scale("presliding_angle"), low=-0.9),
+        _presliding(float(parameters["presliding_angle"])),
     ]
     for key, column, prior in (
         ("pad.conductivity_W_per_mK", "conductivity", 0.15),
