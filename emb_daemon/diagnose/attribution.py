@@ -167,7 +167,7 @@ class Search:
 
     def moments(self, channel: str, columns: list[np.ndarray], residual: np.ndarray | None = None) -> Moments:
         residual = self.residual[channel] if residual is None else residual
-        table = np.column_stack(columns) if columns else np.zeros((len(residual), 0))
+        table = np.vstack([column.T for column in columns]).T if columns else np.zeros((len(residual), 0))
         return Moments.of(table, residual, self.bench.episode[channel], self.bench.episodes)
 
     def moved(self, knobs: list[Knob]) -> np.ndarray:
@@ -190,7 +190,7 @@ class Search:
             steps: dict[Knob, float] = {}
             for channel in channels:
                 own = self.channel_knobs(channel)
-                table = np.column_stack([self.columns[knob] for knob in own])
+                table = np.array([self.columns[knob] for knob in own]).T
                 penalty = self.penalty(own, channel)
                 normal = table.T @ table + np.diag(penalty)
                 right = table.T @ self.residual[channel] - penalty * self.moved(own)

@@ -281,13 +281,12 @@ def _with_noise(calibration: Calibration, bench: Bench, attribution: Attribution
     from emb_daemon.identify.noise import force_error_levels, integral_time
 
     noise = calibration.noise
-    if not bench.has_reference:
+    if not any(v != 0.0 and knob.channel == "stiffness" for knob, v in attribution.values.items()):
         return calibration
     residual, force = attribution.residual["stiffness"], attribution.signals["clamp_force"]
     known = residual != 0.0
     stated = np.sqrt(np.mean(noise.stiffness_N**2 + (noise.stiffness_relative * force[known]) ** 2))
-    fitted = any(v != 0.0 for knob, v in attribution.values.items() if knob.channel == "stiffness")
-    if not fitted or stated < _OVERSTATED * np.sqrt(np.mean(residual[known] ** 2)):
+    if stated < _OVERSTATED * np.sqrt(np.mean(residual[known] ** 2)):
         return calibration
     floor, relative = force_error_levels(residual[known], force[known])
     lengths = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]

@@ -27,7 +27,7 @@ class Moments:
     @classmethod
     def of(cls, regressors: np.ndarray, residual: np.ndarray, episode: np.ndarray, episodes: int) -> "Moments":
         """``regressors`` (N, columns), ``residual`` (N,), ``episode`` (N,) ascending."""
-        table = np.column_stack([regressors, residual]) if regressors.size else residual[:, None]
+        table = np.vstack([regressors.T, residual]).T
         bounds = np.searchsorted(episode, np.arange(episodes + 1))
         products = np.zeros((episodes, table.shape[1], table.shape[1]))
         for index in range(episodes):

@@ -18,7 +18,7 @@ EFFECT = Effect(
     name="stribeck_friction",
     path="torque",
     parameters=(
-        Parameter("rise", "1", -0.5, 3.0, 0.5, "breakaway over Coulomb friction, minus one"),
+        Parameter("rise", "1", 0.0, 3.0, 0.5, "breakaway over Coulomb friction, minus one"),
         Parameter("speed_rad_per_s", "rad/s", 0.2, 60.0, 5.0, "speed at which the rise has fallen to 1/e", (2.0, 6.0, 20.0)),
     ),
     equation="T_f → T_f [1 + r exp(−|ω|/ω_s)]",
