@@ -356,7 +356,7 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
     output.write_bytes(output.read_bytes()[:-20])
     assert blind.main(["--null", "3", *few]) == 0
     # The line that was cut is run again, and the new plant; nothing else.
-    assert ran[:3] == [1000, 1001, 20000] and sorted(ran[3:]) == [1002, 20000]
+    assert ran[:3] == [1000, 1001, 40000] and sorted(ran[3:]) == [1002, 40000]
     table = capsys.readouterr().out
     assert "| no effect | 3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0 |" in table
 

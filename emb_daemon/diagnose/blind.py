@@ -233,25 +233,17 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
 
 
 def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, str, tuple[str, ...], float]]:
-    """Trials (seed, kind, effects, size); ``single`` counts per effect and size."""
+    """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
     names = list(_SHAPES)
     trials: list[tuple[int, str, tuple[str, ...], float]] = [(1000 + k, "null", (), 0.0) for k in range(null)]
-    seed = 20000
-    for name in names:
-        for size in SIZES_N:
-            for _ in range(single):
-                trials.append((seed, "single", (name,), size))
-                seed += 10
-    for _ in range(pairs):
+    cells = [((name,), size) for name in names for size in SIZES_N]
+    trials += [(20000 + 10 * k, "single", *cell) for k, cell in enumerate(cells * single)]
+    for k in range(pairs):
         first, second = rng.choice(len(names), 2, replace=False)
-        trials.append((seed, "pair", (names[first], names[second]), float(rng.uniform(150.0, 500.0))))
-        seed += 10
-    for name in _FOREIGN:
-        for _ in range(foreign):
-            trials.append((seed, "foreign", (name,), 0.0))
-            seed += 10
-    return trials
+        trials.append((40000 + 10 * k, "pair", (names[first], names[second]), float(rng.uniform(150.0, 500.0))))
+    strangers = [name for _ in range(foreign) for name in _FOREIGN]
+    return trials + [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
 
 
 def summary(trials: list[Trial]) -> str:
