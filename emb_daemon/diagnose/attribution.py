@@ -47,6 +47,9 @@ _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
 _GAUSS_NEWTON = 4
+#: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
+#: before it is judged.
+_DOUBTFUL, _LARGE = 0.05, 0.25
 #: Correlation from which two parameters are known only together.
 _TRADE = 0.9
 #: Disc speed (rad/s) below which the wheel stands but for the sensor's noise.
@@ -182,9 +185,10 @@ class Search:
     def refine(self, channels: set[str]) -> None:
         """Gauss-Newton through the estimator over all knobs of some channels."""
         channels = set(channels)
-        for _ in range(_GAUSS_NEWTON):
-            knobs = [knob for knob in self.knobs if knob.channel in channels]
-            probes = [Probe(knob) for knob in knobs]
+        for iteration in range(_GAUSS_NEWTON):
+            # Heat answers to its parameters so nearly in proportion that one derivative serves all iterations.
+            again = channels.intersection(FORCE_CHANNELS) if iteration else channels
+            probes = [Probe(knob) for knob in self.knobs if knob.channel in again]
             found = self.bench.regressors(self.values, probes, self.residual)
             self.columns.update({probe.knob: column for probe, column in found.items()})
             steps: dict[Knob, float] = {}
@@ -358,15 +362,21 @@ class Search:
 
     def why_not(self, finding: Finding, plan: tuple) -> str:
         """Empty if a tested candidate may be accepted."""
-        knobs, _, own, verdict = plan
+        _, _, own, verdict = plan
         effect, channel = finding.effect, finding.channel
-        unit = UNITS.get(channel, "")
         if channel is None:
             return "these logs hold no reference on which it would show"
         if not own or not len(verdict.values):
             return f"not excited by these logs; {effect.manoeuvre}"
         if finding.q_value > Q_VALUE:
             return f"not significant over {verdict.clusters:.0f} effective episodes (q = {finding.q_value:.2g})"
+        return self._unfit(finding, plan)
+
+    def _unfit(self, finding: Finding, plan: tuple) -> str:
+        """Empty if nothing but chance speaks against a candidate."""
+        knobs, _, _, verdict = plan
+        effect, channel = finding.effect, finding.channel
+        unit = UNITS.get(channel, "")
         if verdict.gain <= 0.0:
             return "no gain on left-out episodes"
         if finding.gain < self.floor(channel):
@@ -487,14 +497,51 @@ class Search:
                 if not passed:
                     continue
                 chosen.append(self._settle(passed))
-            if not chosen:
+            if chosen:
+                self._enter(chosen)
+            elif not self._tried(tested):
                 break
-            self._enter(chosen)
         if self.accepted:
             # The force that heats the pads has changed: everything once more, together.
             self.progress("refitting everything together", 0.75)
             self.refine(channels)
         self._revise()
+
+    def _tried(self, tested: dict[str, tuple]) -> bool:
+        """Whether a candidate that would explain much, but is not sure in the linear test, is sure once it has been fitted.
+
+        Far from the solution the rest of a strong effect, whose shape was only guessed, is what makes it unsure. The fitted
+        effect must then pass for itself and all others that might have been tried (Bonferroni)."""
+        large = [
+            t
+            for t in tested.values()
+            if t[0].channel in FORCE_CHANNELS
+            and t[0].p_value < _DOUBTFUL
+            and t[0].gain ** 2 > _LARGE * self.noise(t[0].channel)
+            and t[0].q_value > Q_VALUE
+            and not self._unfit(*t)
+        ]
+        if not large:
+            return False
+        finding, plan = max(large, key=lambda t: t[0].gain / np.sqrt(self.noise(t[0].channel)))
+        shapes = finding.p_value / max(plan[3].p_value, 1e-300)
+        unsure = finding.reason
+        self._enter([(finding, plan)])
+        if finding.effect.name not in self.accepted:
+            return False
+        amplitudes = [knob for knob in self.accepted[finding.effect.name] if not is_shape(knob)]
+        verdict = self._as_fitted(finding.effect.name, amplitudes)
+        chance = min(1.0, verdict.p_value * shapes * len(REGISTRY))
+        if chance > Q_VALUE or verdict.gain <= 0.0:
+            self.drop(finding.effect.name, unsure)
+            return False
+        finding.p_value, finding.q_value, finding.gain = (
+            verdict.p_value * shapes,
+            chance,
+            self.rms(verdict.gain, finding.channel),
+        )
+        finding.reason = ""
+        return True
 
     def _enter(self, winners: list[tuple]) -> None:
         """Accept one effect per channel and refit; one that leaves its channel worse than before goes out again."""
@@ -576,23 +623,27 @@ class Search:
         first = len(knobs) + len(given)
         return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
+    def _as_fitted(self, name: str, group: list[Knob]) -> Verdict:
+        """Test some amplitudes of an accepted effect about the fit, everything else in place."""
+        channel, knobs = self.history[name].channel, self.accepted[name]
+        own = self.channel_knobs(channel)
+        # Its own shape would explain away what the amplitude does: it stands as fitted.
+        free = [knob for knob in own if knob not in knobs or not is_shape(knob)]
+        restored = self.residual[channel] + np.column_stack([self.columns[k] for k in free]) @ self.moved(free)
+        moments = self.moments(channel, [self.columns[k] for k in own], restored)
+        tested = [own.index(knob) for knob in group]
+        rest = [own.index(knob) for knob in free if knob not in group]
+        return judge(moments, rest, tested, self.penalty(own, channel))
+
     def _revise(self) -> None:
         """Test each accepted effect once more with all others in place; drop what, or which order, no longer holds."""
         for name in list(self.accepted):
             finding, knobs = self.history[name], self.accepted[name]
             channel = finding.channel
-            own = self.channel_knobs(channel)
             amplitudes = [knob for knob in knobs if not is_shape(knob)]
-            # Its own shape would explain away what the amplitude does: it stands as fitted.
-            free = [knob for knob in own if knob not in knobs or knob in amplitudes]
-            restored = self.residual[channel] + np.column_stack([self.columns[k] for k in free]) @ self.moved(free)
-            moments = self.moments(channel, [self.columns[k] for k in own], restored)
-            groups = _orders(amplitudes)
             dropped: list[Knob] = []
-            for group in groups:
-                tested = [own.index(knob) for knob in group]
-                rest = [own.index(knob) for knob in free if knob not in group]
-                verdict = judge(moments, rest, tested, self.penalty(own, channel))
+            for group in _orders(amplitudes):
+                verdict = self._as_fitted(name, group)
                 if verdict.p_value > Q_VALUE or verdict.gain <= 0.0:
                     dropped += group
             if not dropped:
