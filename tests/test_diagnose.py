@@ -152,6 +152,15 @@ def test_a_calibration_moved_by_knobs_gives_the_parameters_moved_by_them(calibra
                 np.testing.assert_allclose(written[name], moved[name], rtol=1e-12, err_msg=knob.name)
 
 
+def test_no_step_of_a_fit_leaves_what_a_calibration_may_say(calibration):
+    """However far a fold's fit goes: at its bounds every base knob still gives a calibration that loads."""
+    by_sign = msgspec.structs.replace(calibration.friction, presliding_angle_rad=1e-6)
+    for start in (calibration, msgspec.structs.replace(calibration, friction=by_sign)):
+        for knob in base_knobs(to_parameters(start), 1):
+            for value in (max(knob.low, -20.0), min(knob.high, 20.0)):
+                calibrated(start, {knob: value})
+
+
 # -- the loop ---------------------------------------------------------------------------------------------------------
 
 

@@ -73,6 +73,8 @@ def _heat_share(side: int) -> Callable[[np.void, float], None]:
 
 #: Presliding angle (rad at the motor) that gears have.
 _PRESLIDING_RAD = 0.03
+#: Least that a calibration may state.
+_LEAST_RAD = 1e-6
 #: Where the slopes of the pads' friction over force and disc speed turn about, N and rad/s.
 _FRICTION_FORCE_N, _FRICTION_SPEED = 5000.0, 20.0
 
@@ -102,7 +104,9 @@ def _presliding(value: float) -> Knob:
     """In radians: a calibration with friction by sign has next to none, and no factor leads away from that."""
     size = max(value, _PRESLIDING_RAD)
     change = _shift("presliding_angle")
-    return Knob("friction.presliding_angle_rad", "torque", 0.02 * size, size, "rad", change, low=-0.9 * value)
+    return Knob(
+        "friction.presliding_angle_rad", "torque", 0.02 * size, size, "rad", change, low=max(-0.9 * value, _LEAST_RAD - value)
+    )
 
 
 def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
@@ -114,10 +118,12 @@ def base_knobs(parameters: np.void, logs: int) -> list[Knob]:
     for index, value in enumerate(parameters["curve"]):
         if value != 0.0:
             name = f"stiffness.curves.coefficients[{index}]"
-            knobs.append(Knob(name, "stiffness", 0.01, 0.1, "1", _coefficient(index)))
+            # Force rises from contact: the first coefficient keeps its sign.
+            low = -np.inf if index else -0.95
+            knobs.append(Knob(name, "stiffness", 0.01, 0.1, "1", _coefficient(index), low=low))
     thermal = parameters["thermal"]
     knobs += [
-        Knob("stiffness.relaxation_time_s", "stiffness", 0.02, 0.5, "1", _scale("relaxation_time")),
+        Knob("stiffness.relaxation_time_s", "stiffness", 0.02, 0.5, "1", _scale("relaxation_time"), low=-0.99),
         _softening("per_K", "softening", float(thermal["softening"])),
         _softening("history_per_K", "softening_history", float(thermal["softening_history"])),
         Knob("motor.torque_constant_Nm_per_A", "torque", 1e-3, 0.03, "1", _scale("torque_constant"), low=-0.5),
