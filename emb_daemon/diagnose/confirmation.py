@@ -82,7 +82,7 @@ def confirm(search: Search, calibration: Calibration) -> tuple[Attribution, Erro
     while True:
         attribution = search.outcome()
         after = left_out(bench, attribution, calibration)
-        worse = harm(before, after, {search.history[name].channel for name in search.accepted} | set(search.recalibrated))
+        worse = harm(before, after, {search.history[name].channel for name in search.accepted})
         suspects = [*search.accepted, *search.recalibrated]
         if not worse or not suspects:
             return attribution, after
