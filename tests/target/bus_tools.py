@@ -51,7 +51,8 @@ class Recording:
 
     def __init__(self, path: Path, filters: str = "") -> None:
         self.path = path
-        self._command = ["candump", "-L", f"{CHANNEL}{filters}"]
+        # A large buffer: in a guest with one CPU the real-time daemon and player go before it.
+        self._command = ["candump", "-L", "-r", str(8 << 20), f"{CHANNEL}{filters}"]
         self.frames: list[Frame] = []
 
     def __enter__(self) -> Self:
