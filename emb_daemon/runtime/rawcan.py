@@ -140,6 +140,7 @@ class RawCanSocket:
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self._last_drain_ns = time.monotonic_ns()
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.dropped = 0
         self.unsent = 0
         self.down = False
@@ -170,10 +171,15 @@ class RawCanSocket:
         return self._frames[:count]
 
     def _take(self, count: int, now: int) -> tuple[int, int]:
-        batch, offset = self._received, time.time_ns() - now
+        batch = self._received
+        # The thread may be held up between two readings of clocks: what they prove of the offset is an interval, and only an
+        # offset outside of it (the clock was set, or drifts) is moved, to its edge.
+        real, after = time.time_ns(), time.monotonic_ns()
+        self._offset_ns = min(max(self._offset_ns, real - after), real - now)
         return _from_kernel(
-            batch.raw, batch.headers, batch.control, count, self._stamped, offset, self._last_drain_ns, now, self._frames
-        )
+            batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, self._last_drain_ns, now,
+            self._frames,
+        )  # fmt: skip
 
     def send(self, frames: np.ndarray) -> None:
         """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
