@@ -4,6 +4,7 @@ estimate does meanwhile."""
 import errno
 import logging
 import os
+import socket
 import time
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.estimator import records as r
 from emb_daemon.pipeline import CYCLE_NS
 from emb_daemon.runtime.daemon import Daemon, Pacer
-from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
 from emb_daemon.wire.frames import ERROR, FRAME
 
 CONFIG = Path(__file__).parent.parent / "config" / "emb.yaml"
