@@ -285,12 +285,13 @@ enum { NOTHING, TOO_LATE, TOO_EARLY };
 #define LOG_RUN 17.0
 #define TURNED_OVER 0.9
 #define LEAST 100.0
-#define HALF_KNOWN 30.0
 #define MOST 500.0
 #define SMOOTHED 15.0
 #define CONFIRMING 100
 #define TOLERANCE 0.07
 #define TELLING 3.0
+#define SHOWN 20.0
+#define CORRELATED 1.5
 #define CERTAIN 4.0
 
 static double threshold(double current_share, double correlation_time, double dt)
@@ -308,14 +309,24 @@ static void engaged(Contact *c, double x, double contact_sigma)
         c->engaged = false;
 }
 
+static double clearance_level(const Contact *c, double sigma, double offset, double *offset_sigma)
+{
+    if (c->samples < SHOWN)
+        return offset;
+    *offset_sigma = CORRELATED * sigma / sqrt(c->samples);
+    return c->level;
+}
+
 static int watch_closing(
     Contact *c, double torque, double predicted, double friction_mean, double sigma, double limit, double x,
-    double contact_sigma)
+    double contact_sigma, double offset, double offset_sigma)
 {
     if (!isfinite(torque))
         return NOTHING;
     c->watched = min(c->watched + 1.0, SMOOTHED);
-    c->excess += (torque - predicted - c->level - c->excess) / c->watched;
+    double level_sigma = offset_sigma;
+    double level = clearance_level(c, sigma, offset, &level_sigma);
+    c->excess += (torque - predicted - level - c->excess) / c->watched;
     if (friction_mean < TURNED_OVER)
         return NOTHING;
     bool clear = x < -CERTAIN * contact_sigma;
@@ -323,8 +334,7 @@ static int watch_closing(
         c->samples = min(c->samples + 1.0, MOST);
         c->level += (torque - c->level) / c->samples;
     }
-    double level = c->level * c->samples / (c->samples + HALF_KNOWN);
-    double above = torque - predicted - level, tolerated = TOLERANCE * predicted;
+    double above = torque - predicted - level, tolerated = TOLERANCE * predicted + level_sigma;
     if (c->samples >= LEAST || !clear)
         c->rise = max(0.0, c->rise + (above - tolerated) / sigma - DRIFT);
     c->shortfall = max(0.0, c->shortfall - (above + tolerated) / sigma - DRIFT);
@@ -383,7 +393,7 @@ static double maximum_likelihood(double stiffness, double stiffness_sigma, doubl
 
 static void predict_errors(
     double *x, double P[STATES][STATES], double decay, double contact_variance, double gain_variance, double noise_decay,
-    double noise_variance)
+    double noise_variance, double offset_variance)
 {
     const int coloured[2] = {0, 3};
     const double factors[2] = {decay, noise_decay};
@@ -400,6 +410,7 @@ static void predict_errors(
     P[1][1] += contact_variance;
     P[2][2] += gain_variance;
     P[3][3] += (1.0 - noise_decay * noise_decay) * noise_variance;
+    P[4][4] += offset_variance;
 }
 
 static double update_errors(
@@ -771,10 +782,18 @@ static double gear(const Effects *e, double angle, double travel, double mean_sp
 #define CLAMPED 0.1
 #define LONG_S 1e6
 #define TORQUE_GAIN_WALK 1e-9
+#define OFFSET 4
+#define OFFSET_SHARE 0.1
+#define OFFSET_DRIFTS_S 36000.0
+#define GATE 5.0
+#define JUMP_K 10.0
+#define SHOWN_K 20.0
 static const double depths_m[] = {0.002, 0.004, 0.006, 0.008};
 enum { DEPTHS = sizeof depths_m / sizeof *depths_m };
 
 static inline double square(double value) { return value * value; }
+
+static double torque_offset(const Parameters *p) { return OFFSET_SHARE * p->gear_gain * p->maximum_force; }
 
 static void start(State *s, const Parameters *p, const Sample *m)
 {
@@ -790,6 +809,7 @@ static void start(State *s, const Parameters *p, const Sample *m)
     s->covariance[1][1] = s->contact.prior = p->clearance_sigma * p->clearance_sigma;
     s->covariance[2][2] = p->torque_relative_sigma * p->torque_relative_sigma;
     s->covariance[3][3] = square(p->torque_constant * p->current_sigma);
+    s->covariance[OFFSET][OFFSET] = square(torque_offset(p));
     s->balance = NAN;
 }
 
@@ -828,9 +848,36 @@ static void start_heat(State *s, const Thermal *t, const Sample *m)
     s->ambient = s->disc;
     s->temperature_doubt = s->history_doubt = fabs(s->disc - m->caliper);
     tell_temperatures(s, t);
+    s->plate[0] = m->inner_backplate;
+    s->plate[1] = m->outer_backplate;
+    for (int side = 0; side < 2; side++)
+        s->plate_mean[side] = s->mean[side];
     s->history = 0.5 * (s->mean[0] + s->mean[1]) - t->reference;
     s->factor = stiffness_factor(t, s->history, s->history);
     s->temperature_known = true;
+}
+
+static void watch_plates(State *s, const Thermal *t, const Sample *m, double dt)
+{
+    double conducting = 0.25 * t->thickness * t->thickness * t->density * t->specific_heat / t->conductivity;
+    bool stuck = false;
+    for (int side = 0; side < 2; side++) {
+        double reading = m->has_thermocouple ? side == 0 ? m->inner_backplate : m->outer_backplate : NAN;
+        double jump = fabs(reading - s->plate[side]);
+        if (jump == 0.0) {
+            s->unanswered[side] += dt * (s->mean[side] - s->plate_mean[side]);
+        } else {
+            s->unanswered[side] = 0.0;
+            s->plate_mean[side] = s->mean[side];
+        }
+        if (jump > JUMP_K)
+            s->temperature_doubt = max(s->temperature_doubt, jump);
+        stuck = stuck || fabs(s->unanswered[side]) > SHOWN_K * conducting;
+        s->plate[side] = reading;
+    }
+    s->plate_stuck = stuck;
+    if (stuck)
+        s->temperature_doubt = max(s->temperature_doubt, SHOWN_K);
 }
 
 static void flow(State *s, const Thermal *t, const Effects *e, const Sample *m)
@@ -842,6 +889,7 @@ static void flow(State *s, const Thermal *t, const Effects *e, const Sample *m)
     double ambient = s->ambient;
     double inner = m->has_thermocouple ? m->inner_backplate : s->pads[0][NODES - 1];
     double outer = m->has_thermocouple ? m->outer_backplate : s->pads[1][NODES - 1];
+    watch_plates(s, t, m, dt);
     thermocouple_lag(&e->thermocouple_lag, &s->effects.thermocouple_lag, &inner, &outer, dt);
     s->disc = heat_step(
         t, s->pads, s->disc, inner, outer, ambient, s->heat_energy / dt, s->touching, wheel_speed, dt, s->work);
@@ -942,7 +990,8 @@ static double torque_path(State *s, const Parameters *p, const Sample *m, double
     return torque - p->inertia * (m->speed - s->speed) / m->dt - p->offset_friction * friction * mean;
 }
 
-static void start_contact(State *s, const Parameters *p, const Sample *m, double force, double sigma)
+static void start_contact(
+    State *s, const Parameters *p, const Sample *m, double force, double sigma, double leverage)
 {
     double travel = force > 0.0 ? travel_at(min(force, p->maximum_force) / s->factor, p->curve) : 0.0;
     if (!isfinite(travel))
@@ -952,9 +1001,11 @@ static void start_contact(State *s, const Parameters *p, const Sample *m, double
     deform(s, p, travel, LONG_S, s->factor);
     double slope = s->factor * max(characteristic_curve(max(travel, 1.0), p->curve).slope, p->curve[0]);
     double lag = p->relaxation_time * m->speed;
+    double misread = 1.0 / (leverage * slope);
     for (int i = 0; i < STATES; i++)
-        s->covariance[1][i] = s->covariance[i][1] = 0.0;
-    s->covariance[1][1] = square(sigma / slope) + lag * lag + KNOWN_RAD * KNOWN_RAD;
+        s->covariance[1][i] = s->covariance[i][1] = misread * s->covariance[OFFSET][i];
+    double own = square(sigma / slope) + lag * lag + KNOWN_RAD * KNOWN_RAD;
+    s->covariance[1][1] = own + misread * misread * s->covariance[OFFSET][OFFSET];
     start_anew(&s->contact, s->covariance[1][1]);
 }
 
@@ -972,20 +1023,29 @@ static void watch_contact(
     double sigma = sqrt(variance), current_share = current_torque * current_torque / variance;
     double limit = threshold(current_share, p->current_correlation_time, CYCLE_S);
     double predicted = leverage * 0.5 * (force_before + s->force);
-    int found = watch_closing(c, torque, predicted, s->friction_mean, sigma, limit, x, doubt);
+    double offset = s->error[OFFSET], offset_sigma = sqrt(s->covariance[OFFSET][OFFSET]);
+    int found
+        = watch_closing(c, torque, predicted, s->friction_mean, sigma, limit, x, doubt, offset, offset_sigma);
+    offset = clearance_level(c, sigma, offset, &offset_sigma);
     double seen = predicted + c->excess;
+    if (found != NOTHING) {
+        s->error[OFFSET] = offset;
+        for (int i = 0; i < STATES; i++)
+            s->covariance[OFFSET][i] = s->covariance[i][OFFSET] = 0.0;
+        s->covariance[OFFSET][OFFSET] = offset_sigma * offset_sigma;
+    }
+    double noticeable = max(leverage * CLAMPED * p->maximum_force, clearly_above(c, sigma));
     if (found == TOO_EARLY) {
-        start_contact(s, p, m, 0.0, p->curve[0] * UNKNOWN_RAD);
+        start_contact(s, p, m, 0.0, p->curve[0] * UNKNOWN_RAD, leverage);
     } else if (found != NOTHING) {
-        start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage);
-    } else if (
-        !c->confirmed
-        && c->excess > max(max(predicted, leverage * CLAMPED * p->maximum_force), clearly_above(c, sigma))) {
-        double force = (seen + c->level) / leverage;
+        start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage, leverage);
+    } else if (!c->confirmed && c->excess > max(predicted, noticeable)) {
+        s->covariance[OFFSET][OFFSET] += seen * seen;
+        double force = seen / leverage;
         double friction = (p->offset_friction + p->load_friction * force) * sqrt(s->friction_variance);
         c->level = c->samples = 0.0;
         c->engaged = true;
-        start_contact(s, p, m, force, (sigma + friction) / leverage);
+        start_contact(s, p, m, force, (sigma + friction) / leverage, leverage);
     }
     doubt = sqrt(s->covariance[1][1]);
     if (doubt < KNOWN_RAD)
@@ -993,12 +1053,13 @@ static void watch_contact(
     engaged(c, s->past_contact, doubt);
 }
 
-static inline void set4(double *h, double h0, double h1, double h2, double h3)
+static inline void along(double *h, double h0, double h1, double h2, double h3, double h4)
 {
     h[0] = h0;
     h[1] = h1;
     h[2] = h2;
     h[3] = h3;
+    h[4] = h4;
 }
 
 static void fuse(
@@ -1012,7 +1073,9 @@ static void fuse(
     double current_torque = p->torque_constant * p->current_sigma;
     double decay = exp(-m->dt / p->stiffness_correlation_time), noise_decay = exp(-m->dt / p->current_correlation_time);
     double walked = p->contact_walk * p->contact_walk * m->dt;
-    predict_errors(x, P, decay, walked, TORQUE_GAIN_WALK * m->dt, noise_decay, current_torque * current_torque);
+    double drifted = square(torque_offset(p)) * m->dt / OFFSET_DRIFTS_S;
+    predict_errors(
+        x, P, decay, walked, TORQUE_GAIN_WALK * m->dt, noise_decay, current_torque * current_torque, drifted);
     if (m->dt > ONE_CYCLE_S) {
         double lag_error = p->relaxation_time * s->slope * (m->speed - (m->angle - s->angle) / m->dt);
         P[0][0] += square(lag_error / spread);
@@ -1020,7 +1083,7 @@ static void fuse(
     s->contact.prior += walked;
     double misread = p->torque_relative_sigma * p->offset_friction / (p->gear_gain * p->curve[0]);
     double offset = torque_bias(&s->contact, P[1][1], misread);
-    set4(h, spread, -s->slope, 0.0, 0.0);
+    along(h, spread, -s->slope, 0.0, 0.0, 0.0);
     out->stiffness_sigma = sqrt(variance_along(P, h) + square(s->slope * offset));
     out->innovation = out->innovation_sigma = NAN;
     double mean_force = 0.5 * (force_before + s->force);
@@ -1029,30 +1092,31 @@ static void fuse(
     double speed_torque = p->inertia * unknown_speed / CYCLE_S;
     double white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance;
     double gain_error = p->torque_relative_sigma * mean_force;
-    out->torque_sigma
-        = sqrt((white + current_torque * current_torque) / (leverage * leverage) + gain_error * gain_error);
+    double offset_error = x[OFFSET] * x[OFFSET] + P[OFFSET][OFFSET];
+    double noise = white + current_torque * current_torque;
+    out->torque_sigma = sqrt((noise + offset_error) / (leverage * leverage) + gain_error * gain_error);
     if (isfinite(torque)) {
-        double variance;
         white += square(friction_torque * s->friction_variance) / (DISSOLVING_PER_S * m->dt);
-        set4(h, leverage * spread, -leverage * s->slope, leverage * mean_force, 1.0);
+        along(h, leverage * spread, -leverage * s->slope, leverage * mean_force, 1.0, 1.0);
         double innovation = torque - leverage * mean_force;
         for (int i = 0; i < STATES; i++)
             innovation -= h[i] * x[i];
         out->innovation = innovation / leverage;
-        if (s->plausibility.verdict == AGREE) {
-            variance = update_errors(x, P, s->gain, innovation, h, white);
+        double variance = white + variance_along(P, h);
+        if (s->plausibility.verdict == AGREE && innovation * innovation < GATE * GATE * variance) {
+            update_errors(x, P, s->gain, innovation, h, white);
             s->torque_age = 0.0;
         } else {
-            variance = white + variance_along(P, h);
+            s->torque_age += m->dt;
         }
         out->innovation_sigma = sqrt(variance) / leverage;
-    }
-    if (!isfinite(torque) || s->plausibility.verdict != AGREE)
+    } else {
         s->torque_age += m->dt;
+    }
     s->contact_angle += x[1];
     s->force -= s->slope * x[1];
     x[1] = 0.0;
-    set4(h, spread, -s->slope, 0.0, 0.0);
+    along(h, spread, -s->slope, 0.0, 0.0, 0.0);
     out->force = s->force + spread * x[0];
     if (out->force < 0.0)
         out->force = 0.0;
@@ -1063,7 +1127,7 @@ static void fuse(
 static int64_t take_sides(State *s, const Parameters *p, const Sample *m, Estimate *out)
 {
     Plausibility *c = &s->plausibility;
-    double torque_of_current = p->torque_constant * m->current_q, sigma;
+    double torque_of_current = p->torque_constant * m->current_q - s->error[OFFSET], sigma;
     double force = force_of_torque_alone(
         c, torque_of_current, m->has_current, m->dt, p->gear_gain, p->load_friction, p->offset_friction, &sigma);
     if (isfinite(out->innovation)) {
@@ -1076,12 +1140,12 @@ static int64_t take_sides(State *s, const Parameters *p, const Sample *m, Estima
     if (s->contact.lost)
         c->doubt = 0.0;
     if (c->verdict == AGREE)
-        return 0;
+        return fabs(s->error[OFFSET]) > torque_offset(p) ? PATHS_DISAGREE : 0;
     out->source = STIFFNESS_ONLY;
     if (c->verdict == STIFFNESS_WRONG) {
         out->source = m->has_current ? TORQUE_ONLY : INVALID;
         out->force = force;
-        out->sigma = sigma;
+        out->sigma = sqrt(sigma * sigma + s->covariance[OFFSET][OFFSET] / (p->gear_gain * p->gear_gain));
         return PATHS_DISAGREE | STUCK;
     }
     if (c->verdict == UNDECIDED && isfinite(out->innovation))
@@ -1116,7 +1180,7 @@ static void step(State *s, const Parameters *p, const Sample *m, Estimate *out)
     double torque = torque_path(s, p, m, &leverage, &friction_variance);
     if (moved_zero)
         torque = NAN;
-    if (!frozen(&s->plausibility))
+    if (m->dt <= ONE_CYCLE_S && !frozen(&s->plausibility))
         watch_contact(s, p, m, force_before, torque, leverage);
     fuse(s, p, m, force_before, torque, leverage, friction_variance, out);
     out->stiffness_force = s->force;
@@ -1143,6 +1207,8 @@ static void step(State *s, const Parameters *p, const Sample *m, Estimate *out)
         reasons |= OUT_OF_RANGE;
     if (!s->temperature_known || s->temperature_doubt > DOUBTED_K)
         reasons |= TEMPERATURE_UNCERTAIN;
+    if (s->plate_stuck)
+        reasons |= STUCK;
     out->engaged = s->contact.engaged;
     if (s->contact.lost || out->contact_sigma > UNCERTAIN_RAD) {
         reasons |= CONTACT_UNCERTAIN;

@@ -133,11 +133,12 @@ class Daemon:
         scratch.begin(0)
         _, count = scratch.collect(np.zeros(1, FRAME))
         count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
-        scratch.answer(count)
-        scratch.broadcast(count)
-        _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
         if self._adaptation:
             self._adaptation.warm_up(scratch)
+        else:
+            scratch.answer(count)
+        scratch.broadcast(count)
+        _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
         self._bus.drain()
 
     def run(self) -> None:

@@ -137,8 +137,6 @@ class RawCanSocket:
         self._stamped = stamped
         self._frames = np.zeros(capacity, FRAME)
         self._capacity = capacity
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
         self._last_drain_ns = time.monotonic_ns()
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.dropped = 0
@@ -150,7 +148,8 @@ class RawCanSocket:
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until a frame is there or the time is over."""
-        return bool(self._poll.poll(timeout_s * 1000.0)) if timeout_s > 0 else False
+        # Not poll(), whose timeout is whole milliseconds.
+        return bool(select.select([self._fd], [], [], timeout_s)[0]) if timeout_s > 0 else False
 
     def drain(self) -> np.ndarray:
         """All frames that have arrived, at most ``capacity``, as a FRAME array valid until the next call."""
