@@ -11,6 +11,8 @@ import hashlib
 import os
 import sys
 import tempfile
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -98,6 +100,26 @@ class _Compilations(event.Listener):
 def compiled_for_the_next_start() -> bool:
     """Whether this process has compiled what another start would find in the cache."""
     return _compilations.count > 0 and _private is None
+
+
+def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
+    """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
+
+    Only where ``function`` is not in the cache, a second CPU is there, and no other thread that may hold a lock. Returns
+    what waits for the end of it.
+    """
+    possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
+    if config.DISABLE_JIT or _private is not None or not possible:
+        return lambda: None
+    if any(Path(config.CACHE_DIR).rglob(f"*.{function.__name__}-*.nbi")):
+        return lambda: None
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return lambda: os.waitpid(child, 0)
 
 
 _compilations = _Compilations()

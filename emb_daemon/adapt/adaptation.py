@@ -96,9 +96,7 @@ class Adaptation:
         return r.VERDICTS[adapter["verdict"]] if adapter["result"] != r.NO_RESULT else ""
 
     def warm_up(self, pipeline) -> None:
-        """Compile, or load from the cache, what answers and evaluations call, on a pipeline that may be spoilt; start the
-        helper thread."""
-        self._answer(pipeline.samples, 0, 0, pipeline.states, pipeline.parameters, pipeline.estimates)
+        """Compile, or load from the cache, what evaluations call, for a pipeline like this; start the helper thread."""
         compile_fit(pipeline.parameters[0], pipeline.states[0])
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)

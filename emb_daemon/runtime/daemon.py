@@ -20,7 +20,8 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.errors import InputError
 from emb_daemon.estimator import records
-from emb_daemon.jit import njit
+from emb_daemon.estimator.step import step
+from emb_daemon.jit import compile_beside, njit
 from emb_daemon.pipeline import CYCLE_NS, LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.systemd import ServiceManager
@@ -130,16 +131,24 @@ class Daemon:
     def warm_up(self) -> None:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
         scratch = Pipeline(self._setup.parameters.copy(), CORNERS, self._setup.layout)
+        # Two thirds of the compiler's work is the estimator.
+        wait = compile_beside(step, lambda: self._warm_up_answers(scratch))
         scratch.begin(0)
         _, count = scratch.collect(np.zeros(1, FRAME))
         count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
-        if self._adaptation:
-            self._adaptation.warm_up(scratch)
-        else:
-            scratch.answer(count)
         scratch.broadcast(count)
         _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
+        if self._adaptation:
+            self._adaptation.warm_up(scratch)
+        wait()
+        self._warm_up_answers(scratch)
         self._bus.drain()
+
+    def _warm_up_answers(self, scratch: Pipeline) -> None:
+        if self._adaptation:
+            self._adaptation.answer(scratch.samples, 0, scratch.states, scratch.parameters, scratch.estimates)
+        else:
+            scratch.answer(0)
 
     def run(self) -> None:
         """Tick until `stop`."""
