@@ -96,7 +96,10 @@ class Adaptation:
         return r.VERDICTS[adapter["verdict"]] if adapter["result"] != r.NO_RESULT else ""
 
     def warm_up(self, pipeline) -> None:
-        """Compile, or load from the cache, what evaluations call, for a pipeline like this; start the helper thread."""
+        """Compile, or load from the cache, what evaluations call, for a pipeline like this; touch the memory that training
+        will need; start the helper thread."""
+        for corner in self._stores:
+            self.rows[corner] = np.zeros((), r.TRAINING)
         compile_fit(pipeline.parameters[0], pipeline.states[0])
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)
