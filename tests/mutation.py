@@ -18,7 +18,11 @@ ROOT = Path(__file__).resolve().parent.parent
 #: Module, and the tests that must notice, quick enough as plain Python.
 SCOPE = {
     "emb_daemon/wire/e2e.py": ["tests/test_wire.py"],
-    "emb_daemon/wire/receive.py": ["tests/test_wire.py", "tests/test_hostile.py::test_a_sender_that_was_held_up_may_catch_up"],
+    "emb_daemon/wire/receive.py": [
+        "tests/test_wire.py",
+        "tests/test_hostile.py::test_a_sender_that_was_held_up_may_catch_up",
+        "tests/test_hostile.py::test_spoofed_frames_with_the_next_counter_come_too_early",
+    ],
     "emb_daemon/models/plausibility.py": ["tests/test_plausibility_kernels.py"],
     "emb_daemon/models/fusion.py": ["tests/test_kernels.py"],
 }
