@@ -72,7 +72,7 @@ def _begin(a, phase):
 
 
 @njit
-def _collect(a, rows, m, estimate):
+def _collect(a, s, rows, m):
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
     # The current is a cycle's mean: it does not tell of the acceleration over a gap.
@@ -80,7 +80,7 @@ def _collect(a, rows, m, estimate):
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
-    row.factor = estimate.stiffness_factor
+    row.factor = s.factor * s.scale
     a.rows += 1
 
 
@@ -139,7 +139,7 @@ def take_over(s, p, scratch, rows, learned):
             if i != j:
                 s.covariance[i, j] = 0.0
     s.covariance[0, 0] = 1.0
-    s.covariance[1, 1] = s.contact.prior = learned.contact_given_curve_sigma**2
+    s.covariance[1, 1] = learned.contact_given_curve_sigma**2
     s.contact.confirmed, s.contact.lost = True, False
 
 
@@ -223,7 +223,7 @@ def _advance(a, s, p, limits, scratch, rows, m, estimate):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
-        _collect(a, rows, m, estimate)
+        _collect(a, s, rows, m)
         if a.rows - a.training_rows >= r.EVALUATION_SAMPLES:
             _effect(a, s, p, scratch, rows)
         return
@@ -232,7 +232,7 @@ def _advance(a, s, p, limits, scratch, rows, m, estimate):
             a.tried = True
             end(a, r.NO_ANSWER, r.RESULT_ABORTED)
         return
-    _collect(a, rows, m, estimate)
+    _collect(a, s, rows, m)
     if _stroke(a, limits, m.dt):
         a.phase, a.training_rows, a.ready, a.wanted = r.EVALUATING, a.rows, False, True
         a.generation += 1

@@ -4,6 +4,7 @@ from math import sqrt
 
 import numpy as np
 
+from emb_daemon.estimator.hypotheses import open_again
 from emb_daemon.estimator.paths import CYCLE_S, rest
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
@@ -41,10 +42,11 @@ def follow_zero(s, p, m):
     if abs(jump) <= SPEED_MARGIN * reach + _ANGLE_MARGIN:
         return False
     s.angle += jump
+    s.angle_before += jump
     s.slid_angle += jump
     s.contact_angle += jump
     s.covariance[1, 1] += reach * reach
-    s.contact.prior += reach * reach
+    open_again(s, p)
     s.contact.confirmed = False
     return True
 
@@ -108,4 +110,5 @@ def _start_contact(s, p, m, force, sigma, leverage):
         s.covariance[1, i] = s.covariance[i, 1] = misread * s.covariance[OFFSET, i]
     own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
     s.covariance[1, 1] = own + misread * misread * s.covariance[OFFSET, OFFSET]
-    start_anew(s.contact, s.covariance[1, 1])
+    start_anew(s.contact)
+    open_again(s, p)

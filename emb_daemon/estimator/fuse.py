@@ -4,11 +4,12 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, ONE_CYCLE_S
+from emb_daemon.estimator.hypotheses import fold, learn, mix, place, settle, suspected, to_force, to_torque, weigh
+from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
 from emb_daemon.estimator.records import INVALID, PATHS_DISAGREE, STIFFNESS_ONLY, STUCK, TORQUE_ONLY
 from emb_daemon.jit import njit
-from emb_daemon.models.contact import torque_bias
-from emb_daemon.models.fusion import OFFSET, STATES, predict_errors, update_errors, variance_along
+from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, set_walks, torque_offset
+from emb_daemon.models.fusion import CONTACT, FAST, OFFSET, SCALE, force_variance, predict_errors, variance_along
 from emb_daemon.models.plausibility import (
     AGREE,
     STIFFNESS_WRONG,
@@ -19,80 +20,100 @@ from emb_daemon.models.plausibility import (
     force_of_torque_alone,
 )
 
-#: Variance that the torque path's relative error gains, 1/s: friction changes over months.
-_TORQUE_GAIN_WALK = 1e-9
-#: Offset that the motor torque may have, as a standard deviation: share of the torque that the largest force needs; and time
-#: in which it drifts as far again, s. An offset that turns out larger is a fault of the current sensor.
-_OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
-#: Standard deviations of the innovation beyond which a sample teaches the filter nothing: sensors jump, what it learns walks.
-_GATE = 5.0
+#: Part of a sample by which current and angle may be apart in time.
+_LATE = 0.3
+#: Counts of the resolver that the second difference of its angle must exceed.
+_CLEAR = 4.0
 
 
 @njit
-def torque_offset(p):
-    """Standard deviation of the motor torque's offset at power-on, N m."""
-    return _OFFSET * p.gear_gain * p.maximum_force
+def _clear_acceleration(s, m):
+    """Acceleration (rad/s^2) from three angles where it is clear of their quantisation, else 0.
+
+    A gain error shows in what the motor torque must have been, and only a value that shares no noise with current and speed
+    may stand for it: regressed on itself, noise would look like a gain that is too small."""
+    if m.dt != CYCLE_S or s.dt_before != CYCLE_S:
+        return 0.0
+    acceleration = (m.angle - 2.0 * s.angle + s.angle_before) / (CYCLE_S * CYCLE_S)
+    return acceleration if abs(acceleration) > _CLEAR * 2.0 * FLICKER_RAD / (CYCLE_S * CYCLE_S) else 0.0
 
 
 @njit
 def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
-    """Kalman filter over the errors of both paths; fills force, sigma and innovation of ``out``."""
-    x, P, h = s.error, s.covariance, s.sensitivity
+    """Both hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``."""
+    a, factor = s.alternative, s.factor * s.scale
+    warmth = s.disc - s.growth_start if s.temperature_known else 0.0
+    known = p.clearance_sigma == 0.0
     softening = p.thermal.softening * s.temperature_doubt + p.thermal.softening_history * s.history_doubt
     relative = (p.stiffness_relative_sigma + softening) * s.force
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
-    walked = p.contact_walk * p.contact_walk * m.dt
-    drifted = torque_offset(p) ** 2 * m.dt / _OFFSET_DRIFTS_S
-    predict_errors(x, P, decay, walked, _TORQUE_GAIN_WALK * m.dt, noise_decay, current_torque * current_torque, drifted)
+    h, ha, walked = s.sensitivity[0], s.sensitivity[1], s.sensitivity[2]
+    set_walks(walked, p, m.dt)
+    if known:
+        walked[CONTACT] = walked[SCALE] = 0.0
+    predict_errors(s.error, s.covariance, decay, noise_decay, current_torque * current_torque, walked)
+    predict_errors(a.error, a.covariance, decay, noise_decay, current_torque * current_torque, walked)
     if m.dt > ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
-        P[0, 0] += (lag_error / spread) ** 2
-    s.contact.prior += walked
-    # What friction's offset may be wrong by, the torque reads as contact angle, and no number of samples averages it out.
-    misread = p.torque_relative_sigma * p.offset_friction / (p.gear_gain * p.curve[0])
-    offset = torque_bias(s.contact, P[1, 1], misread)
-    h[0], h[1], h[2], h[3], h[4] = spread, -s.slope, 0.0, 0.0, 0.0
-    out.stiffness_sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
-    out.innovation = out.innovation_sigma = np.nan
+        s.covariance[FAST, FAST] += (lag_error / spread) ** 2
+    place(s, p, factor, warmth)
+    share = p.torque_constant * m.current_q / ((p.gear_gain + p.load_friction) * p.maximum_force)
+    for_ever = share * share if m.has_current else s.housing
+    s.winding += (1.0 - exp(-m.dt / WINDING_S)) * (for_ever - s.winding)
+    s.housing += (1.0 - exp(-m.dt / HOUSING_S)) * (for_ever - s.housing)
+
     mean_force = 0.5 * (force_before + s.force)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
-    white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance
-    gain_error = p.torque_relative_sigma * mean_force
-    offset_error = x[OFFSET] * x[OFFSET] + P[OFFSET, OFFSET]
-    noise = white + current_torque * current_torque
-    out.torque_sigma = sqrt((noise + offset_error) / (leverage * leverage) + gain_error * gain_error)
+    late = _LATE * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
+    white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance + late * late
+    s.current_before, s.had_current = m.current_q, m.has_current
+    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(ha, spread, a.slope, s.force + a.shift, warmth)
+    out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
+    out.innovation = out.innovation_sigma = np.nan
+    jumped = False
     if np.isfinite(torque):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
-        h[0], h[1], h[2], h[3], h[4] = leverage * spread, -leverage * s.slope, leverage * mean_force, 1.0, 1.0
-        innovation = torque - leverage * mean_force
-        for i in range(STATES):
-            innovation -= h[i] * x[i]
-        out.innovation = innovation / leverage
-        variance = white + variance_along(P, h)
-        if s.plausibility.verdict == AGREE and innovation * innovation < _GATE * _GATE * variance:
-            update_errors(x, P, s.gain, innovation, h, white)
+        speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
+        needed = leverage * mean_force + p.offset_friction * s_mean + p.inertia * _clear_acceleration(s, m)
+        to_torque(h, leverage, s_mean, mean_force, speed, needed, s.winding, s.housing)
+        to_torque(ha, leverage, s_mean, mean_force + a.shift, speed, needed + leverage * a.shift, s.winding, s.housing)
+        h[FAST], ha[FAST] = leverage * spread, leverage * spread
+        slow = variance_along(s.covariance, h) - (leverage * spread) ** 2 * s.covariance[FAST, FAST]
+        out.torque_sigma = sqrt(white + max(slow, 0.0)) / leverage
+        if s.plausibility.verdict == AGREE:
+            unexplained = torque - leverage * mean_force
+            first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white)
+            second, variance_a = first, variance
+            if not known:
+                second, variance_a = learn(a.error, a.covariance, s.gain, ha, unexplained - leverage * a.shift, white)
+                weigh(s, first, variance, second, variance_a, m.dt)
+            better = first * first / variance <= second * second / variance_a
+            out.innovation = (first if better else second) / leverage
+            out.innovation_sigma = sqrt(variance if better else variance_a) / leverage
             s.torque_age = 0.0
         else:
             s.torque_age += m.dt
-        out.innovation_sigma = sqrt(variance) / leverage
+        fold(s, warmth, True)
+        if not known:
+            jumped = settle(s, p, s.past_contact < 0.0, True)
+            if jumped:
+                fold(s, warmth, False)
     else:
+        out.torque_sigma = np.inf
         s.torque_age += m.dt
-    # What was learned of the contact angle moves the contact angle itself: the curve is not straight.
-    s.contact_angle += x[1]
-    s.force -= s.slope * x[1]
-    x[1] = 0.0
-    h[0], h[1], h[2], h[3], h[4] = spread, -s.slope, 0.0, 0.0, 0.0
-    out.force = s.force + spread * x[0]
+    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(ha, spread, a.slope, s.force + a.shift, warmth)
+    out.force, out.sigma = mix(s, h, ha, spread)
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
-    out.sigma = sqrt(variance_along(P, h) + (s.slope * offset) ** 2)
-    out.contact_sigma = sqrt(P[1, 1] + offset * offset)
+    out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
 
 
 @njit
@@ -110,7 +131,7 @@ def take_sides(s, p, m, out):
         # The contact angle was found wrong and explains what came before.
         c.doubt = 0.0
     if c.verdict == AGREE:
-        return PATHS_DISAGREE if abs(s.error[OFFSET]) > torque_offset(p) else 0
+        return PATHS_DISAGREE if suspected(s) or abs(s.error[OFFSET]) > 3.0 * torque_offset(p) else 0
     out.source = STIFFNESS_ONLY
     if c.verdict == STIFFNESS_WRONG:
         out.source = TORQUE_ONLY if m.has_current else INVALID

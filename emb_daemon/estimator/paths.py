@@ -29,7 +29,8 @@ def position(s, p, m):
     """Motor angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
-    return m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain - s.contact_angle
+    grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
+    return m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain + grown - s.contact_angle
 
 
 @njit

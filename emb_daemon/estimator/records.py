@@ -3,6 +3,8 @@
 import numpy as np
 
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
+from emb_daemon.estimator.consistency import HORIZONS
+from emb_daemon.estimator.hypotheses import ALTERNATIVE
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.plausibility import PLAUSIBILITY
@@ -150,6 +152,8 @@ STATE = np.dtype(
         ("started", "?"),
         ("angle", "f8"),
         ("speed", "f8"),
+        ("angle_before", "f8"),
+        ("dt_before", "f8"),
         ("contact_angle", "f8"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         ("past_contact", "f8"),
@@ -170,8 +174,22 @@ STATE = np.dtype(
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
-        ("sensitivity", "f8", (STATES,)),
+        ("alternative", ALTERNATIVE),
+        ("sensitivity", "f8", (3, STATES)),
+        # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)
+        # takes away, rad/K: learned.
         ("gain", "f8", (STATES,)),
+        ("current_before", "f8"),
+        ("had_current", "?"),
+        ("scale", "f8"),
+        ("growth", "f8"),
+        ("growth_start", "f8"),
+        # Heat of winding and housing: share of what the largest force's current would leave for ever.
+        ("winding", "f8"),
+        ("housing", "f8"),
+        # Innovation (N) smoothed over `consistency.HORIZONS_S`, and the variance of each mean.
+        ("drift", "f8", (HORIZONS,)),
+        ("drift_variance", "f8", (HORIZONS,)),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("heat_time", "f8"),
         ("heat_energy", "f8"),

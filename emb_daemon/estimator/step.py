@@ -9,8 +9,9 @@ from math import sqrt
 import numpy as np
 
 from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, watch_contact
-from emb_daemon.estimator.fuse import fuse, take_sides, torque_offset
+from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
+from emb_daemon.estimator.hypotheses import open_again
 from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
 from emb_daemon.estimator.records import (
     CONTACT_UNCERTAIN,
@@ -26,8 +27,9 @@ from emb_daemon.estimator.records import (
     TEMPERATURE_UNCERTAIN,
     TORQUE_ONLY,
 )
+from emb_daemon.estimator.unknown import set_priors
 from emb_daemon.jit import njit
-from emb_daemon.models.fusion import OFFSET, maximum_likelihood
+from emb_daemon.models.fusion import SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
@@ -38,6 +40,8 @@ SILENCE_S = 0.1
 _DOUBTED_K = 10.0
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
 _UNCERTAIN_RAD = 0.5
+#: Standard deviation of the force, share of the largest, from which it is reported as uncertain.
+_UNCERTAIN = 0.01
 
 
 @njit
@@ -49,12 +53,11 @@ def _start(s, p, m):
     s.past_contact = -p.clearance
     s.friction_variance = 1.0
     s.torque_age = 1e9
-    s.covariance[:, :] = 0.0
-    s.covariance[0, 0] = 1.0
-    s.covariance[1, 1] = s.contact.prior = p.clearance_sigma * p.clearance_sigma
-    s.covariance[2, 2] = p.torque_relative_sigma * p.torque_relative_sigma
-    s.covariance[3, 3] = (p.torque_constant * p.current_sigma) ** 2
-    s.covariance[OFFSET, OFFSET] = torque_offset(p) ** 2
+    s.scale = 1.0
+    set_priors(s.covariance, p, m.caliper if m.has_thermocouple else m.ambient if m.has_status else 20.0)
+    if p.clearance_sigma == 0.0:
+        s.covariance[SCALE, SCALE] = 0.0
+    open_again(s, p)
     s.balance = np.nan
 
 
@@ -73,9 +76,12 @@ def step(s, p, m, out):
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
+    knew = s.temperature_known
     heat(s, p, m)
+    if s.temperature_known and not knew:
+        s.growth_start = s.disc
     force_before = s.force
-    stiffness_path(s, p, m, s.factor)
+    stiffness_path(s, p, m, s.factor * s.scale)
     torque, leverage, friction_variance = torque_path(s, p, m)
     if moved_zero:
         torque = np.nan
@@ -93,10 +99,11 @@ def step(s, p, m, out):
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
     out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
     reasons = take_sides(s, p, m, out)
+    s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
     s.fused, s.fused_sigma = out.force, out.sigma
     out.contact_angle = s.contact_angle
-    out.stiffness_factor = s.factor
+    out.stiffness_factor = s.factor * s.scale
     tell(s, out)
     out.mode = RUNNING
     if moved_zero:
@@ -106,7 +113,7 @@ def step(s, p, m, out):
     if s.plate_stuck:
         reasons |= STUCK
     out.engaged = s.contact.engaged
-    if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD:
+    if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD or out.sigma > _UNCERTAIN * p.maximum_force:
         reasons |= CONTACT_UNCERTAIN
         if out.stiffness_sigma > out.torque_sigma and out.source == FUSED:
             out.source = TORQUE_ONLY
@@ -129,12 +136,12 @@ def predict(s, p, age, out):
     # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
     reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * age, p.curve)
     start, _ = characteristic_curve(s.past_contact, p.curve)
-    moved = min(s.factor * (reached - start), p.maximum_force)
+    moved = min(s.factor * s.scale * (reached - start), p.maximum_force)
     out.force = s.fused
     out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
     out.contact_angle = s.contact_angle
     out.contact_sigma = sqrt(s.covariance[1, 1])
-    out.stiffness_factor = s.factor if s.started else 1.0
+    out.stiffness_factor = s.factor * s.scale if s.started else 1.0
     out.innovation = out.innovation_sigma = np.nan
     tell(s, out)

@@ -15,8 +15,7 @@ from emb_daemon.jit import njit
 
 #: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
 #: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``excess``: torque not believed, smoothed
-#: over ``watched`` samples. ``agreed``: closing samples that confirm. ``prior``: variance of the contact angle but for what
-#: torque told of it.
+#: over ``watched`` samples. ``agreed``: closing samples that confirm.
 CONTACT = np.dtype(
     [
         ("engaged", "?"),
@@ -29,7 +28,6 @@ CONTACT = np.dtype(
         ("agreed", "i8"),
         ("excess", "f8"),
         ("watched", "f8"),
-        ("prior", "f8"),
     ],
     align=True,
 )
@@ -133,21 +131,10 @@ def clearance_level(state, sigma, offset, offset_sigma):
 
 
 @njit
-def start_anew(state, variance):
-    """Forget what was summed; ``variance`` (rad^2) of the contact angle that is now believed."""
+def start_anew(state):
+    """Forget what was summed: another contact angle is now believed."""
     state.lost, state.confirmed, state.agreed = True, False, 0
     state.rise = state.shortfall = state.excess = state.watched = 0.0
-    state.prior = variance
-
-
-@njit
-def torque_bias(state, variance, misread):
-    """Standard deviation (rad) that the contact angle of ``variance`` has beside it because torque told of it, which itself
-    may be off by ``misread`` rad: none if nothing came from torque, and never more than was unknown before."""
-    if not state.prior > 0.0:
-        return 0.0
-    share = max(0.0, 1.0 - variance / state.prior)
-    return share * misread * sqrt(state.prior / (state.prior + misread * misread))
 
 
 @njit

@@ -3,14 +3,22 @@
 Thesis 5.2 and 6.1 (maximum likelihood), 5.3 and 6.2 (Kalman filter). The thesis filters the force itself with squared RMSE
 for noise, which takes slow model error for white noise. Here the filter estimates the errors that make the paths differ:
 
-    x0  error of the stiffness path in units of its own standard deviation, first-order Gauss-Markov
-    x1  error of the contact angle (rad), random walk: acts through the local stiffness G
-    x2  relative error of the torque path (torque constant, friction), nearly constant
-    x3  coloured noise of the current as motor torque (N m), first-order Gauss-Markov
-    x4  offset of the motor torque (N m), random walk: a current sensor's zero, seen alone wherever the pads do not touch
+    FAST      error of the stiffness path in units of its own standard deviation, first-order Gauss-Markov
+    CONTACT   error of the contact angle, rad: acts through the local stiffness G
+    GAIN      relative error of the motor torque: torque constant, current gain
+    NOISE     coloured noise of the current as motor torque, N m, first-order Gauss-Markov
+    OFFSET    offset of the motor torque, N m: a current sensor's zero, seen alone wherever the pads do not touch
+    SCALE     relative error of the stiffness: other pads, another compound, ageing
+    GROWTH    contact angle that a warmer disc takes away, rad/K
+    LOAD      error of the gear friction per clamp force, m/rad
+    COULOMB   error of the gear friction without clamp force, N m
+    VISCOUS   error of the friction torque per motor speed, N m s/rad
+    FADE      relative loss of motor torque per heat that the motor's own current left in the winding
+    HOUSING   the same for the heat left in the motor's housing
 
-    F = F_stiffness + sigma_stiffness x0 - G x1
-    torque not explained by F_stiffness = D (F - F_stiffness) + D F x2 + x3 + x4 + white noise,  D = gamma + mu s
+    F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH
+    torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS
+                                          - T_m (GAIN + u FADE + v HOUSING) + NOISE + OFFSET + white noise,  D = gamma + mu s
 
 so that what is slow stays correlated and the standard deviation means what it says.
 """
@@ -19,9 +27,10 @@ from math import sqrt
 
 from emb_daemon.jit import njit
 
-STATES = 5
-#: Index of the torque's offset.
-OFFSET = 4
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING) = range(12)
+STATES = 12
+#: States that the clamp force itself rests on.
+OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
 
 
 @njit
@@ -32,22 +41,21 @@ def maximum_likelihood(stiffness, stiffness_sigma, torque, torque_sigma):
 
 
 @njit
-def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance, offset_variance):
+def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
     """Time update of the error state and its covariance.
 
-    ``decay`` and ``noise_decay`` of x0 and x3 over the step, ``noise_variance`` the stationary variance of x3; the random
-    walks of x1, x2 and x4 gain the other variances.
+    ``decay`` and ``noise_decay`` of FAST and NOISE over the step, ``noise_variance`` the stationary variance of NOISE;
+    ``walked``, shape (STATES,): variance that each of the others gains.
     """
-    for i, factor in ((0, decay), (3, noise_decay)):
+    for i, factor in ((FAST, decay), (NOISE, noise_decay)):
         x[i] *= factor
         for j in range(STATES):
             P[i, j] *= factor
             P[j, i] *= factor
-    P[0, 0] += 1.0 - decay * decay
-    P[1, 1] += contact_variance
-    P[2, 2] += gain_variance
-    P[3, 3] += (1.0 - noise_decay * noise_decay) * noise_variance
-    P[4, 4] += offset_variance
+    P[FAST, FAST] += 1.0 - decay * decay
+    P[NOISE, NOISE] += (1.0 - noise_decay * noise_decay) * noise_variance
+    for i in range(STATES):
+        P[i, i] += walked[i]
 
 
 @njit
@@ -74,5 +82,15 @@ def variance_along(P, h):
     total = 0.0
     for i in range(STATES):
         for j in range(STATES):
+            total += h[i] * P[i, j] * h[j]
+    return total
+
+
+@njit
+def force_variance(P, h):
+    """h P h' over the states that the force rests on."""
+    total = 0.0
+    for i in OF_THE_FORCE:
+        for j in OF_THE_FORCE:
             total += h[i] * P[i, j] * h[j]
     return total

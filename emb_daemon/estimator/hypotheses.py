@@ -1,0 +1,185 @@
+"""Two hypotheses of one brake: as it was, or something has jumped. Each is a Kalman filter over the errors of both paths.
+
+The first believes what it learned and only walks. The second is the first, opened again at every release and every while by
+`unknown.add_jumps`. Both explain the same torque; the ratio of their likelihoods (Magill, Optimal adaptive estimation of
+sampled stochastic processes, IEEE Trans. Automatic Control 10, 1965) says which holds, and the fused force is their mixture,
+so that an unproven change already counts in its standard deviation. A proven one becomes the first hypothesis.
+"""
+
+from math import exp, log, sqrt
+
+import numpy as np
+
+from emb_daemon.estimator.unknown import add_jumps
+from emb_daemon.jit import njit
+from emb_daemon.models.fusion import (
+    CONTACT,
+    COULOMB,
+    FADE,
+    FAST,
+    GAIN,
+    GROWTH,
+    HOUSING,
+    LOAD,
+    NOISE,
+    OFFSET,
+    SCALE,
+    STATES,
+    VISCOUS,
+    force_variance,
+    update_errors,
+    variance_along,
+)
+from emb_daemon.models.stiffness import characteristic_curve, mean_slope
+
+#: Logarithm of the odds that a brake has jumped since it was last looked at: once in a thousand stops. They cannot fall lower,
+#: or a later jump would have to make up for the past.
+PRIOR_ODDS = -7.0
+#: Log odds at which a jump is proven, and at which it is suspected enough to be told.
+_PROVEN, _SUSPECTED = 5.0, -2.0
+#: Time after which an unproven jump is looked for anew, s, and after which a pending one is given up.
+_OPENED_S, _PENDING_S = 1.0, 20.0
+#: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
+GATE = 5.0
+#: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
+DOUBTFUL_RAD = 0.05
+
+#: One hypothesis beside the first. ``slope`` N/rad at its own contact angle; ``shift`` N: its force over the first one's.
+ALTERNATIVE = np.dtype(
+    [
+        ("error", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        ("log_odds", "f8"),
+        ("open_s", "f8"),
+        ("shift", "f8"),
+        ("slope", "f8"),
+    ],
+    align=True,
+)
+
+
+@njit
+def open_again(s, p):
+    """Look for a jump from now on."""
+    a = s.alternative
+    a.error[:] = s.error
+    a.covariance[:, :] = s.covariance
+    add_jumps(a.covariance, p)
+    a.log_odds, a.open_s, a.shift = PRIOR_ODDS, 0.0, 0.0
+
+
+@njit
+def share(s):
+    """Probability of the alternative."""
+    return 1.0 / (1.0 + exp(-s.alternative.log_odds))
+
+
+@njit
+def suspected(s):
+    return s.alternative.log_odds > _SUSPECTED
+
+
+@njit
+def place(s, p, factor, warmth):
+    """Where the alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
+    a, x = s.alternative, s.past_contact
+    moved = a.error[GROWTH] * warmth - a.error[CONTACT]
+    here, _ = characteristic_curve(x, p.curve)
+    there, slope = characteristic_curve(x + moved, p.curve)
+    sigma = sqrt(max(a.covariance[CONTACT, CONTACT], 0.0))
+    if sigma > DOUBTFUL_RAD:
+        slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
+    # The lag is left out of the difference: it settles within a fraction of the time that a jump takes to be proven.
+    scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))
+    a.shift = max(scaled, 0.0) - s.force
+    a.slope = factor * (1.0 + a.error[SCALE]) * slope
+
+
+@njit
+def to_force(h, spread, slope, force, warmth):
+    """Sensitivity of the clamp force to the states."""
+    h[:] = 0.0
+    h[FAST], h[CONTACT], h[SCALE], h[GROWTH] = spread, -slope, force, slope * warmth
+
+
+@njit
+def to_torque(h, leverage, friction_mean, force, speed, motor_torque, winding, housing):
+    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained."""
+    for i in (FAST, CONTACT, SCALE, GROWTH):
+        h[i] *= leverage
+    h[NOISE] = h[OFFSET] = 1.0
+    h[GAIN], h[FADE], h[HOUSING] = -motor_torque, -motor_torque * winding, -motor_torque * housing
+    h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force, friction_mean, speed
+
+
+@njit
+def learn(x, P, gain, h, unexplained, variance):
+    """One hypothesis takes one torque; its own contact angle, stiffness and growth are in ``unexplained`` already.
+
+    Returns (innovation, its variance)."""
+    innovation = unexplained
+    for i in range(STATES):
+        if i not in (CONTACT, SCALE, GROWTH):
+            innovation -= h[i] * x[i]
+    s = variance + variance_along(P, h)
+    if innovation * innovation < GATE * GATE * s:
+        update_errors(x, P, gain, innovation, h, variance)
+    return innovation, s
+
+
+@njit
+def weigh(s, first, first_variance, second, second_variance, dt):
+    """Odds after both hypotheses have seen a torque; a sample far off counts as the gate's edge."""
+    a, edge = s.alternative, GATE * GATE
+    a.log_odds += 0.5 * (min(first * first / first_variance, edge) - min(second * second / second_variance, edge))
+    a.log_odds += 0.5 * log(first_variance / second_variance)
+    a.log_odds = max(a.log_odds, PRIOR_ODDS)
+    a.open_s += dt
+
+
+@njit
+def settle(s, p, released, consistent):
+    """Prove or reopen. Returns whether a jump was taken over."""
+    a = s.alternative
+    if a.log_odds > _PROVEN and consistent:
+        s.error[:] = a.error
+        s.covariance[:, :] = a.covariance
+        s.force += a.shift
+        s.drive += a.shift
+        a.log_odds, a.shift, a.open_s = PRIOR_ODDS, 0.0, 0.0
+        return True
+    unproven = a.log_odds < _SUSPECTED and (a.open_s > _OPENED_S or (released and a.open_s > 0.0))
+    if unproven or a.open_s > _PENDING_S:
+        open_again(s, p)
+    return False
+
+
+@njit
+def fold(s, warmth, linear):
+    """Move what the first hypothesis learned of contact, stiffness and growth into the model itself: the curve is not
+    straight. ``linear``: the force follows by its slope."""
+    x, a = s.error, s.alternative
+    contact, scale, growth = x[CONTACT], x[SCALE], x[GROWTH]
+    s.contact_angle += contact
+    s.scale *= 1.0 + scale
+    s.growth += growth
+    s.past_contact += growth * warmth - contact
+    if linear:
+        change = s.slope * (growth * warmth - contact) + s.force * scale
+        s.force += change
+        a.shift -= change
+    a.error[CONTACT] -= contact
+    a.error[SCALE] = (1.0 + a.error[SCALE]) / (1.0 + scale) - 1.0
+    a.error[GROWTH] -= growth
+    x[CONTACT] = x[SCALE] = x[GROWTH] = 0.0
+
+
+@njit
+def mix(s, h, h_alternative, spread):
+    """Force (N) and standard deviation of both hypotheses together, over their common model of the force."""
+    a, w = s.alternative, share(s)
+    first = spread * s.error[FAST]
+    second = a.shift + spread * a.error[FAST]
+    apart = second - first
+    variance = (1.0 - w) * force_variance(s.covariance, h) + w * force_variance(a.covariance, h_alternative)
+    return s.force + first + w * apart, sqrt(variance + w * (1.0 - w) * apart * apart)

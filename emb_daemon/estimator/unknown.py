@@ -1,0 +1,106 @@
+"""What is not known of a brake, as standard deviations: one table.
+
+Each quantity that the force or the torque rests on has a prior, a walk (how it changes while nothing shows it), and a jump:
+how far it may have changed at once, between two stops or in a workshop. `estimator.hypotheses` holds the brake that is as it
+was against the brake in which something has jumped.
+"""
+
+from math import exp, sqrt
+
+from emb_daemon.jit import njit
+from emb_daemon.models.fusion import (
+    CONTACT,
+    COULOMB,
+    FADE,
+    FAST,
+    GAIN,
+    GROWTH,
+    HOUSING,
+    LOAD,
+    NOISE,
+    OFFSET,
+    SCALE,
+    VISCOUS,
+)
+
+#: Contact angle: knock-back, uneven wear and a disturbed released position move the pads by some tens of micrometres between
+#: two stops (Limpert, Brake Design and Safety, 3rd ed., ch. 5: 0.05 to 0.1 mm of run-out and knock-back), m.
+_CONTACT_JUMP_M = 40e-6
+#: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
+_SCALE_JUMP = 0.2
+#: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
+_SCALE, _SCALE_WALK_PER_SQRT_S = 0.003, 0.01 / 60.0
+#: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
+_GROWTH_JUMP_M_PER_K = 0.26e-6
+#: Torque constant and current gain: datasheets state 2 to 3 %; a calibration's own is known better, and ages.
+_GAIN, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
+#: Offset of the motor torque at power-on: share of the torque that the largest force needs (Hall sensors: 0.5 to 1 % of a
+#: range that is several times that current); and time in which it drifts as far again, s.
+_OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
+#: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
+_FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
+#: Base oil of low-temperature greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law
+#: between -40 and 20 degC), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
+_THICKENS_K, _WARM_C, _VISCOUS = 20.0, 15.0, 0.3
+#: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1 %/K
+#: (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
+#: several hundred kelvin.
+_FADE, _HOUSING = 0.4, 0.4
+#: Heat paths of winding and housing, s.
+WINDING_S, HOUSING_S = 30.0, 300.0
+
+
+@njit
+def torque_offset(p):
+    """Standard deviation of the motor torque's offset at power-on, N m."""
+    return _OFFSET * p.gear_gain * p.maximum_force
+
+
+@njit
+def thickening(p, caliper):
+    """Factor by which friction's prior is wider at ``caliper`` degC than at the calibration's temperature."""
+    return exp(min(max(_WARM_C - caliper, 0.0), 80.0) / _THICKENS_K)
+
+
+@njit
+def set_priors(P, p, caliper):
+    """Covariance at power-on of a brake that is as its calibration says; ``caliper`` degC."""
+    thick = thickening(p, caliper)
+    P[:, :] = 0.0
+    P[FAST, FAST] = 1.0
+    P[CONTACT, CONTACT] = p.clearance_sigma**2
+    P[GAIN, GAIN] = _GAIN**2
+    P[NOISE, NOISE] = (p.torque_constant * p.current_sigma) ** 2
+    P[OFFSET, OFFSET] = torque_offset(p) ** 2
+    P[SCALE, SCALE] = _SCALE**2
+    P[LOAD, LOAD] = (p.torque_relative_sigma * p.gear_gain) ** 2 + (_FRICTION * p.load_friction * thick) ** 2
+    P[COULOMB, COULOMB] = (_FRICTION * p.offset_friction * thick) ** 2
+    P[VISCOUS, VISCOUS] = (_VISCOUS * p.offset_friction / p.maximum_speed * thick) ** 2
+    P[FADE, FADE] = _FADE**2
+    P[HOUSING, HOUSING] = _HOUSING**2
+
+
+@njit
+def set_walks(walked, p, dt):
+    """Variance that each state gains in ``dt`` s while nothing jumps."""
+    walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = 0.0
+    walked[CONTACT] = p.contact_walk * p.contact_walk * dt
+    walked[GAIN] = _GAIN_WALK_PER_SQRT_S**2 * dt
+    walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
+    walked[SCALE] = (0.1 * _SCALE_WALK_PER_SQRT_S) ** 2 * dt
+    walked[LOAD] = (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * dt
+    walked[COULOMB] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction) ** 2 * dt
+    walked[VISCOUS] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction / p.maximum_speed) ** 2 * dt
+
+
+@njit
+def add_jumps(P, p):
+    """What may have changed at once."""
+    P[CONTACT, CONTACT] += (_CONTACT_JUMP_M / p.gear_gain) ** 2
+    P[SCALE, SCALE] += _SCALE_JUMP**2
+    P[GROWTH, GROWTH] += (_GROWTH_JUMP_M_PER_K / p.gear_gain) ** 2
+    P[GAIN, GAIN] += _GAIN_JUMP**2
+    P[OFFSET, OFFSET] += torque_offset(p) ** 2
+    P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
+    P[COULOMB, COULOMB] += (_FRICTION_JUMP * p.offset_friction) ** 2
+    P[VISCOUS, VISCOUS] += (_FRICTION_JUMP * p.offset_friction / p.maximum_speed) ** 2
