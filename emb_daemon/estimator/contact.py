@@ -4,7 +4,8 @@ from math import sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.hypotheses import open_again
+from emb_daemon.estimator.fuse import needed_torque
+from emb_daemon.estimator.hypotheses import learned_torque, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, rest
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
@@ -45,6 +46,7 @@ def follow_zero(s, p, m):
     s.angle_before += jump
     s.slid_angle += jump
     s.contact_angle += jump
+    s.contact_anchor += jump
     s.covariance[1, 1] += reach * reach
     open_again(s, p)
     s.contact.confirmed = False
@@ -61,9 +63,15 @@ def watch_contact(s, p, m, force_before, torque, leverage):
         return
     sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
     limit = threshold(current_share, p.current_correlation_time, CYCLE_S)
-    predicted = leverage * 0.5 * (force_before + s.force)
+    mean_force = 0.5 * (force_before + s.force)
+    predicted = leverage * mean_force
+    h = s.sensitivity[0]
+    needed = needed_torque(s, p, m, mean_force, leverage)
+    to_torque(h, leverage, s.friction_mean, mean_force, 0.5 * (m.speed + s.speed), needed, s.winding, s.housing)
+    learned, learned_sigma = learned_torque(s.error, s.covariance, h)
+    torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
-    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, offset_sigma)
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, sqrt(offset_sigma * offset_sigma + learned_sigma * learned_sigma))
     offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
     seen = predicted + c.excess
     if found != NOTHING:
@@ -110,5 +118,6 @@ def _start_contact(s, p, m, force, sigma, leverage):
         s.covariance[1, i] = s.covariance[i, 1] = misread * s.covariance[OFFSET, i]
     own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
     s.covariance[1, 1] = own + misread * misread * s.covariance[OFFSET, OFFSET]
+    s.contact_anchor = s.contact_angle
     start_anew(s.contact)
     open_again(s, p)

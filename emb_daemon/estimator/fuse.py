@@ -9,7 +9,21 @@ from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, O
 from emb_daemon.estimator.records import INVALID, PATHS_DISAGREE, STIFFNESS_ONLY, STUCK, TORQUE_ONLY
 from emb_daemon.jit import njit
 from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, set_walks, torque_offset
-from emb_daemon.models.fusion import CONTACT, FAST, OFFSET, SCALE, force_variance, predict_errors, variance_along
+from emb_daemon.models.fusion import (
+    CONTACT,
+    COULOMB,
+    FADE,
+    FAST,
+    GAIN,
+    HOUSING,
+    LOAD,
+    OFFSET,
+    SCALE,
+    VISCOUS,
+    force_variance,
+    predict_errors,
+    variance_along,
+)
 from emb_daemon.models.plausibility import (
     AGREE,
     STIFFNESS_WRONG,
@@ -39,6 +53,12 @@ def _clear_acceleration(s, m):
 
 
 @njit
+def needed_torque(s, p, m, mean_force, leverage):
+    """Motor torque (N m) that force, friction and inertia must have taken."""
+    return leverage * mean_force + p.offset_friction * s.friction_mean + p.inertia * _clear_acceleration(s, m)
+
+
+@njit
 def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     """Both hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``."""
     a, factor = s.alternative, s.factor * s.scale
@@ -50,7 +70,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     h, ha, walked = s.sensitivity[0], s.sensitivity[1], s.sensitivity[2]
-    set_walks(walked, p, m.dt)
+    set_walks(walked, p, s.error, s.winding, s.housing, m.dt)
     if known:
         walked[CONTACT] = walked[SCALE] = 0.0
     predict_errors(s.error, s.covariance, decay, noise_decay, current_torque * current_torque, walked)
@@ -80,27 +100,26 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
         speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
-        needed = leverage * mean_force + p.offset_friction * s_mean + p.inertia * _clear_acceleration(s, m)
+        needed = needed_torque(s, p, m, mean_force, leverage)
         to_torque(h, leverage, s_mean, mean_force, speed, needed, s.winding, s.housing)
         to_torque(ha, leverage, s_mean, mean_force + a.shift, speed, needed + leverage * a.shift, s.winding, s.housing)
         h[FAST], ha[FAST] = leverage * spread, leverage * spread
         slow = variance_along(s.covariance, h) - (leverage * spread) ** 2 * s.covariance[FAST, FAST]
         out.torque_sigma = sqrt(white + max(slow, 0.0)) / leverage
-        if s.plausibility.verdict == AGREE:
-            unexplained = torque - leverage * mean_force
-            first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white)
-            second, variance_a = first, variance
-            if not known:
-                second, variance_a = learn(a.error, a.covariance, s.gain, ha, unexplained - leverage * a.shift, white)
-                weigh(s, first, variance, second, variance_a, m.dt)
-            better = first * first / variance <= second * second / variance_a
-            out.innovation = (first if better else second) / leverage
-            out.innovation_sigma = sqrt(variance if better else variance_a) / leverage
-            s.torque_age = 0.0
-        else:
-            s.torque_age += m.dt
-        fold(s, warmth, True)
+        trusted = s.plausibility.verdict == AGREE
+        unexplained = torque - leverage * mean_force
+        first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
+        second, variance_a = first, variance
         if not known:
+            second, variance_a = learn(a.error, a.covariance, s.gain, ha, unexplained - leverage * a.shift, white, trusted)
+            if trusted:
+                weigh(s, first, variance, second, variance_a, m.dt)
+        better = first * first / variance <= second * second / variance_a
+        out.innovation = (first if better else second) / leverage
+        out.innovation_sigma = sqrt(variance if better else variance_a) / leverage
+        s.torque_age = 0.0 if trusted else s.torque_age + m.dt
+        fold(s, warmth, True)
+        if trusted and not known:
             jumped = settle(s, p, s.past_contact < 0.0, True)
             if jumped:
                 fold(s, warmth, False)
@@ -119,13 +138,15 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 @njit
 def take_sides(s, p, m, out):
     """Where the paths contradict each other, go on with the one that can be right; returns the reasons."""
-    c = s.plausibility
-    motor_torque = p.torque_constant * m.current_q - s.error[OFFSET]
-    force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, p.load_friction, p.offset_friction)
+    c, x = s.plausibility, s.error
+    gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
+    motor_torque = p.torque_constant * m.current_q * max(gain, 0.3) - x[OFFSET]
+    load, coulomb = max(p.load_friction + x[LOAD], 0.0), max(p.offset_friction + x[COULOMB], 0.0)
+    force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, load, coulomb)
     if np.isfinite(out.innovation):
-        torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt
+        torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
         doubt = p.gear_gain * sqrt(out.stiffness_sigma * out.stiffness_sigma + out.torque_sigma * out.torque_sigma)
-        beyond = beyond_friction(torque, s.force, doubt, p.gear_gain, p.load_friction, p.offset_friction)
+        beyond = beyond_friction(torque, s.force, doubt, p.gear_gain, load, coulomb)
         count_doubt(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     if s.contact.lost:
         # The contact angle was found wrong and explains what came before.

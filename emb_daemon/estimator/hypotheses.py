@@ -10,7 +10,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.unknown import add_jumps
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_jumps, stay_possible
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -65,6 +65,8 @@ def open_again(s, p):
     a.error[:] = s.error
     a.covariance[:, :] = s.covariance
     add_jumps(a.covariance, p)
+    faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
+    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
     a.log_odds, a.open_s, a.shift = PRIOR_ODDS, 0.0, 0.0
 
 
@@ -113,8 +115,20 @@ def to_torque(h, leverage, friction_mean, force, speed, motor_torque, winding, h
 
 
 @njit
-def learn(x, P, gain, h, unexplained, variance):
-    """One hypothesis takes one torque; its own contact angle, stiffness and growth are in ``unexplained`` already.
+def learned_torque(x, P, h):
+    """Torque (N m) that what was learned of motor and friction explains, its offset apart, and its standard deviation."""
+    total = variance = 0.0
+    for i in (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING):
+        total += h[i] * x[i]
+        for j in (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING):
+            variance += h[i] * P[i, j] * h[j]
+    return total, sqrt(max(variance, 0.0))
+
+
+@njit
+def learn(x, P, gain, h, unexplained, variance, trusted):
+    """One hypothesis takes one torque; its own contact angle, stiffness and growth are in ``unexplained`` already. It learns
+    nothing from a torque that is not ``trusted``.
 
     Returns (innovation, its variance)."""
     innovation = unexplained
@@ -122,7 +136,7 @@ def learn(x, P, gain, h, unexplained, variance):
         if i not in (CONTACT, SCALE, GROWTH):
             innovation -= h[i] * x[i]
     s = variance + variance_along(P, h)
-    if innovation * innovation < GATE * GATE * s:
+    if trusted and innovation * innovation < GATE * GATE * s:
         update_errors(x, P, gain, innovation, h, variance)
     return innovation, s
 
@@ -161,7 +175,7 @@ def fold(s, warmth, linear):
     x, a = s.error, s.alternative
     contact, scale, growth = x[CONTACT], x[SCALE], x[GROWTH]
     s.contact_angle += contact
-    s.scale *= 1.0 + scale
+    s.scale = min(max(s.scale * (1.0 + scale), LEAST_SCALE), MOST_SCALE)
     s.growth += growth
     s.past_contact += growth * warmth - contact
     if linear:

@@ -49,7 +49,7 @@ def _start(s, p, m):
     s.started = True
     s.angle = s.slid_angle = m.angle
     s.speed = m.speed
-    s.contact_angle = m.angle + p.clearance
+    s.contact_angle = s.contact_anchor = m.angle + p.clearance
     s.past_contact = -p.clearance
     s.friction_variance = 1.0
     s.torque_age = 1e9

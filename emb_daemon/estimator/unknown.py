@@ -46,8 +46,14 @@ _THICKENS_K, _WARM_C, _VISCOUS = 20.0, 15.0, 0.3
 #: (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
 #: several hundred kelvin.
 _FADE, _HOUSING = 0.4, 0.4
-#: Heat paths of winding and housing, s.
+#: Heat paths of winding and housing, s; and share by which two lags miss what the motor's heat really does, over a time, s.
 WINDING_S, HOUSING_S = 30.0, 300.0
+_MISSED, _MISSED_S = 0.3, 10.0
+#: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
+#: that moved), m; stiffness (thinnest pads, another compound) and motor torque, shares.
+_CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
+#: Bounds of what can be learned: beyond them it is a fault.
+LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
 
 @njit
@@ -81,16 +87,41 @@ def set_priors(P, p, caliper):
 
 
 @njit
-def set_walks(walked, p, dt):
-    """Variance that each state gains in ``dt`` s while nothing jumps."""
+def set_walks(walked, p, x, winding, housing, dt):
+    """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat."""
+    faded = abs(x[FADE]) * winding + abs(x[HOUSING]) * housing + _FADE * (winding + housing)
     walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = 0.0
     walked[CONTACT] = p.contact_walk * p.contact_walk * dt
-    walked[GAIN] = _GAIN_WALK_PER_SQRT_S**2 * dt
+    walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + (_MISSED * faded) ** 2 / _MISSED_S) * dt
     walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
     walked[SCALE] = (0.1 * _SCALE_WALK_PER_SQRT_S) ** 2 * dt
     walked[LOAD] = (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * dt
     walked[COULOMB] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction) ** 2 * dt
     walked[VISCOUS] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction / p.maximum_speed) ** 2 * dt
+
+
+@njit
+def _draw_near(x, P, gain, state, distance, reach):
+    """Take in that ``state`` is ``distance`` from what the calibration says and cannot be far from it."""
+    s = P[state, state] + reach * reach
+    innovation = -distance
+    for i in range(len(x)):
+        gain[i] = P[i, state] / s
+    for i in range(len(x)):
+        x[i] += gain[i] * innovation
+        for j in range(len(x)):
+            P[i, j] -= gain[i] * gain[j] * s
+
+
+@njit
+def stay_possible(x, P, gain, p, contact_distance, scale, faded):
+    """What a brake can be at all: ``contact_distance`` rad of the contact angle and ``scale`` of the stiffness are from the
+    calibration; ``faded`` share of the motor torque is explained by heat."""
+    _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
+    _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
+    _draw_near(x, P, gain, GAIN, x[GAIN], _GAIN_REACH + faded)
+    _draw_near(x, P, gain, LOAD, x[LOAD], p.load_friction)
+    _draw_near(x, P, gain, COULOMB, x[COULOMB], 2.0 * p.offset_friction)
 
 
 @njit

@@ -127,7 +127,7 @@ def clearance_level(state, sigma, offset, offset_sigma):
     ``sigma``, or else as the filter believes."""
     if state.samples < _SHOWN:
         return offset, offset_sigma
-    return state.level, _CORRELATED * sigma / sqrt(state.samples)
+    return state.level, max(_CORRELATED * sigma / sqrt(state.samples), offset_sigma)
 
 
 @njit
