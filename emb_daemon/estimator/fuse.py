@@ -4,7 +4,19 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.hypotheses import fold, learn, mix, place, settle, suspected, to_force, to_torque, weigh
+from emb_daemon.estimator.hypotheses import (
+    ALTERNATIVES,
+    fold,
+    learn,
+    mix,
+    open_again,
+    place,
+    settle,
+    suspected,
+    to_force,
+    to_torque,
+    weigh,
+)
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
 from emb_daemon.estimator.records import INVALID, PATHS_DISAGREE, STIFFNESS_ONLY, STUCK, TORQUE_ONLY
 from emb_daemon.jit import njit
@@ -61,7 +73,7 @@ def needed_torque(s, p, m, mean_force, leverage):
 @njit
 def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     """Both hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``."""
-    a, factor = s.alternative, s.factor * s.scale
+    factor = s.factor * s.scale
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
     softening = p.thermal.softening * s.temperature_doubt + p.thermal.softening_history * s.history_doubt
@@ -69,16 +81,18 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
-    h, ha, walked = s.sensitivity[0], s.sensitivity[1], s.sensitivity[2]
+    h, walked = s.sensitivity[0], s.sensitivity[1]
     set_walks(walked, p, s.error, s.winding, s.housing, m.dt)
     if known:
         walked[CONTACT] = walked[SCALE] = 0.0
     predict_errors(s.error, s.covariance, decay, noise_decay, current_torque * current_torque, walked)
-    predict_errors(a.error, a.covariance, decay, noise_decay, current_torque * current_torque, walked)
+    for kind in range(ALTERNATIVES):
+        a = s.alternatives[kind]
+        predict_errors(a.error, a.covariance, decay, noise_decay, current_torque * current_torque, walked)
+        place(s, a, p, factor, warmth)
     if m.dt > ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         s.covariance[FAST, FAST] += (lag_error / spread) ** 2
-    place(s, p, factor, warmth)
     share = p.torque_constant * m.current_q / ((p.gear_gain + p.load_friction) * p.maximum_force)
     for_ever = share * share if m.has_current else s.housing
     s.winding += (1.0 - exp(-m.dt / WINDING_S)) * (for_ever - s.winding)
@@ -92,43 +106,39 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance + late * late
     s.current_before, s.had_current = m.current_q, m.has_current
     to_force(h, spread, s.slope, s.force, warmth)
-    to_force(ha, spread, a.slope, s.force + a.shift, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
-    jumped = False
     if np.isfinite(torque):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
         speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
         needed = needed_torque(s, p, m, mean_force, leverage)
         to_torque(h, leverage, s_mean, mean_force, speed, needed, s.winding, s.housing)
-        to_torque(ha, leverage, s_mean, mean_force + a.shift, speed, needed + leverage * a.shift, s.winding, s.housing)
-        h[FAST], ha[FAST] = leverage * spread, leverage * spread
-        slow = variance_along(s.covariance, h) - (leverage * spread) ** 2 * s.covariance[FAST, FAST]
+        h[FAST] = leverage * spread
+        slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         out.torque_sigma = sqrt(white + max(slow, 0.0)) / leverage
         trusted = s.plausibility.verdict == AGREE
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
-        second, variance_a = first, variance
-        if not known:
-            second, variance_a = learn(a.error, a.covariance, s.gain, ha, unexplained - leverage * a.shift, white, trusted)
+        out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
+        for kind in range(ALTERNATIVES if not known else 0):
+            a = s.alternatives[kind]
+            to_force(h, spread, a.slope, s.force + a.shift, warmth)
+            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, needed + leverage * a.shift, s.winding, s.housing)
+            second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
             if trusted:
-                weigh(s, first, variance, second, variance_a, m.dt)
-        better = first * first / variance <= second * second / variance_a
-        out.innovation = (first if better else second) / leverage
-        out.innovation_sigma = sqrt(variance if better else variance_a) / leverage
+                weigh(a, first, variance, second, variance_a)
+            if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
+                out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
         s.torque_age = 0.0 if trusted else s.torque_age + m.dt
         fold(s, warmth, True)
-        if trusted and not known:
-            jumped = settle(s, p, s.past_contact < 0.0, True)
-            if jumped:
-                fold(s, warmth, False)
+        if trusted and not known and settle(s, p, s.past_contact < 0.0, m.dt):
+            fold(s, warmth, False)
+            open_again(s, p)
     else:
         out.torque_sigma = np.inf
         s.torque_age += m.dt
-    to_force(h, spread, s.slope, s.force, warmth)
-    to_force(ha, spread, a.slope, s.force + a.shift, warmth)
-    out.force, out.sigma = mix(s, h, ha, spread)
+    out.force, out.sigma = mix(s, h, spread, warmth)
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0

@@ -1,16 +1,17 @@
-"""Two hypotheses of one brake: as it was, or something has jumped. Each is a Kalman filter over the errors of both paths.
+"""Three hypotheses of one brake: it is as it was, or its stiffness path has jumped, or its torque path.
 
-The first believes what it learned and only walks. The second is the first, opened again at every release and every while by
-`unknown.add_jumps`. Both explain the same torque; the ratio of their likelihoods (Magill, Optimal adaptive estimation of
-sampled stochastic processes, IEEE Trans. Automatic Control 10, 1965) says which holds, and the fused force is their mixture,
-so that an unproven change already counts in its standard deviation. A proven one becomes the first hypothesis.
+Each is a Kalman filter over the errors of both paths. The first believes what it learned and only walks. The others are the
+first, opened again at every release and every while by what `unknown` says may jump. All explain the same torque; the ratios
+of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10,
+1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
+deviation. A proven one becomes the first hypothesis.
 """
 
 from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_jumps, stay_possible
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_stiffness_jumps, add_torque_jumps, stay_possible
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -44,13 +45,17 @@ GATE = 5.0
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
 DOUBTFUL_RAD = 0.05
 
-#: One hypothesis beside the first. ``slope`` N/rad at its own contact angle; ``shift`` N: its force over the first one's.
+#: What may have jumped.
+ALTERNATIVES = 2
+STIFFNESS_JUMP, TORQUE_JUMP = range(ALTERNATIVES)
+
+#: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over
+#: the first one's.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("log_odds", "f8"),
-        ("open_s", "f8"),
         ("shift", "f8"),
         ("slope", "f8"),
     ],
@@ -60,31 +65,39 @@ ALTERNATIVE = np.dtype(
 
 @njit
 def open_again(s, p):
-    """Look for a jump from now on."""
-    a = s.alternative
-    a.error[:] = s.error
-    a.covariance[:, :] = s.covariance
-    add_jumps(a.covariance, p)
+    """Look for jumps from now on."""
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
-    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
-    a.log_odds, a.open_s, a.shift = PRIOR_ODDS, 0.0, 0.0
+    for kind in range(ALTERNATIVES):
+        a = s.alternatives[kind]
+        a.error[:] = s.error
+        a.covariance[:, :] = s.covariance
+        if kind == STIFFNESS_JUMP:
+            add_stiffness_jumps(a.covariance, p)
+        else:
+            add_torque_jumps(a.covariance, p)
+        stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
+        a.log_odds, a.shift = PRIOR_ODDS, 0.0
+    s.open_s = 0.0
 
 
 @njit
-def share(s):
-    """Probability of the alternative."""
-    return 1.0 / (1.0 + exp(-s.alternative.log_odds))
+def share(s, kind):
+    """Probability of an alternative."""
+    total = 1.0
+    for other in range(ALTERNATIVES):
+        total += exp(min(s.alternatives[other].log_odds, 600.0))
+    return exp(min(s.alternatives[kind].log_odds, 600.0)) / total
 
 
 @njit
 def suspected(s):
-    return s.alternative.log_odds > _SUSPECTED
+    return max(s.alternatives[STIFFNESS_JUMP].log_odds, s.alternatives[TORQUE_JUMP].log_odds) > _SUSPECTED
 
 
 @njit
-def place(s, p, factor, warmth):
-    """Where the alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
-    a, x = s.alternative, s.past_contact
+def place(s, a, p, factor, warmth):
+    """Where an alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
+    x = s.past_contact
     moved = a.error[GROWTH] * warmth - a.error[CONTACT]
     here, _ = characteristic_curve(x, p.curve)
     there, slope = characteristic_curve(x + moved, p.curve)
@@ -142,28 +155,28 @@ def learn(x, P, gain, h, unexplained, variance, trusted):
 
 
 @njit
-def weigh(s, first, first_variance, second, second_variance, dt):
-    """Odds after both hypotheses have seen a torque; a sample far off counts as the gate's edge."""
-    a, edge = s.alternative, GATE * GATE
+def weigh(a, first, first_variance, second, second_variance):
+    """Odds of an alternative after it and the first hypothesis have seen a torque; a sample far off counts as the gate's
+    edge."""
+    edge = GATE * GATE
     a.log_odds += 0.5 * (min(first * first / first_variance, edge) - min(second * second / second_variance, edge))
     a.log_odds += 0.5 * log(first_variance / second_variance)
-    a.log_odds = max(a.log_odds, PRIOR_ODDS)
-    a.open_s += dt
+    a.log_odds = min(max(a.log_odds, PRIOR_ODDS), 100.0)
 
 
 @njit
-def settle(s, p, released, consistent):
+def settle(s, p, released, dt):
     """Prove or reopen. Returns whether a jump was taken over."""
-    a = s.alternative
-    if a.log_odds > _PROVEN and consistent:
-        s.error[:] = a.error
-        s.covariance[:, :] = a.covariance
-        s.force += a.shift
-        s.drive += a.shift
-        a.log_odds, a.shift, a.open_s = PRIOR_ODDS, 0.0, 0.0
-        return True
-    unproven = a.log_odds < _SUSPECTED and (a.open_s > _OPENED_S or (released and a.open_s > 0.0))
-    if unproven or a.open_s > _PENDING_S:
+    s.open_s += dt
+    for kind in range(ALTERNATIVES):
+        a, other = s.alternatives[kind], s.alternatives[1 - kind]
+        if a.log_odds > _PROVEN and a.log_odds - other.log_odds > _PROVEN:
+            s.error[:] = a.error
+            s.covariance[:, :] = a.covariance
+            s.force += a.shift
+            s.drive += a.shift
+            return True
+    if s.open_s > _PENDING_S or (not suspected(s) and (s.open_s > _OPENED_S or released)):
         open_again(s, p)
     return False
 
@@ -172,28 +185,38 @@ def settle(s, p, released, consistent):
 def fold(s, warmth, linear):
     """Move what the first hypothesis learned of contact, stiffness and growth into the model itself: the curve is not
     straight. ``linear``: the force follows by its slope."""
-    x, a = s.error, s.alternative
+    x = s.error
     contact, scale, growth = x[CONTACT], x[SCALE], x[GROWTH]
     s.contact_angle += contact
     s.scale = min(max(s.scale * (1.0 + scale), LEAST_SCALE), MOST_SCALE)
     s.growth += growth
     s.past_contact += growth * warmth - contact
-    if linear:
-        change = s.slope * (growth * warmth - contact) + s.force * scale
-        s.force += change
+    change = s.slope * (growth * warmth - contact) + s.force * scale if linear else 0.0
+    s.force += change
+    for kind in range(ALTERNATIVES):
+        a = s.alternatives[kind]
         a.shift -= change
-    a.error[CONTACT] -= contact
-    a.error[SCALE] = (1.0 + a.error[SCALE]) / (1.0 + scale) - 1.0
-    a.error[GROWTH] -= growth
+        a.error[CONTACT] -= contact
+        a.error[SCALE] = (1.0 + a.error[SCALE]) / (1.0 + scale) - 1.0
+        a.error[GROWTH] -= growth
     x[CONTACT] = x[SCALE] = x[GROWTH] = 0.0
 
 
 @njit
-def mix(s, h, h_alternative, spread):
-    """Force (N) and standard deviation of both hypotheses together, over their common model of the force."""
-    a, w = s.alternative, share(s)
+def mix(s, h, spread, warmth):
+    """Force (N) and standard deviation of all hypotheses together, over their common model of the force. ``h``: scratch."""
+    to_force(h, spread, s.slope, s.force, warmth)
+    rest = 1.0
     first = spread * s.error[FAST]
-    second = a.shift + spread * a.error[FAST]
-    apart = second - first
-    variance = (1.0 - w) * force_variance(s.covariance, h) + w * force_variance(a.covariance, h_alternative)
-    return s.force + first + w * apart, sqrt(variance + w * (1.0 - w) * apart * apart)
+    mean = variance = square = 0.0
+    for kind in range(ALTERNATIVES):
+        a, w = s.alternatives[kind], share(s, kind)
+        rest -= w
+        apart = a.shift + spread * a.error[FAST] - first
+        mean += w * apart
+        square += w * apart * apart
+        to_force(h, spread, a.slope, s.force + a.shift, warmth)
+        variance += w * force_variance(a.covariance, h)
+    to_force(h, spread, s.slope, s.force, warmth)
+    variance += rest * force_variance(s.covariance, h)
+    return s.force + first + mean, sqrt(variance + max(square - mean * mean, 0.0))

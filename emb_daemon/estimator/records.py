@@ -4,7 +4,7 @@ import numpy as np
 
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
 from emb_daemon.estimator.consistency import HORIZONS
-from emb_daemon.estimator.hypotheses import ALTERNATIVE
+from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.plausibility import PLAUSIBILITY
@@ -174,8 +174,9 @@ STATE = np.dtype(
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
-        ("alternative", ALTERNATIVE),
-        ("sensitivity", "f8", (3, STATES)),
+        ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
+        ("open_s", "f8"),
+        ("sensitivity", "f8", (2, STATES)),
         # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)
         # takes away, rad/K: learned.
         ("gain", "f8", (STATES,)),

@@ -29,7 +29,7 @@ _CONTACT_JUMP_M = 40e-6
 #: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
-_SCALE, _SCALE_WALK_PER_SQRT_S = 0.003, 0.01 / 60.0
+_SCALE, _SCALE_WALK_PER_SQRT_S = 0.001, 0.01 / 60.0
 #: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
 _GROWTH_JUMP_M_PER_K = 0.26e-6
 #: Torque constant and current gain: datasheets state 2 to 3 %; a calibration's own is known better, and ages.
@@ -125,11 +125,16 @@ def stay_possible(x, P, gain, p, contact_distance, scale, faded):
 
 
 @njit
-def add_jumps(P, p):
-    """What may have changed at once."""
+def add_stiffness_jumps(P, p):
+    """What may have changed at once between motor angle and force."""
     P[CONTACT, CONTACT] += (_CONTACT_JUMP_M / p.gear_gain) ** 2
     P[SCALE, SCALE] += _SCALE_JUMP**2
     P[GROWTH, GROWTH] += (_GROWTH_JUMP_M_PER_K / p.gear_gain) ** 2
+
+
+@njit
+def add_torque_jumps(P, p):
+    """What may have changed at once between motor current and force."""
     P[GAIN, GAIN] += _GAIN_JUMP**2
     P[OFFSET, OFFSET] += torque_offset(p) ** 2
     P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
