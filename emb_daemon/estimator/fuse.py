@@ -9,7 +9,7 @@ from emb_daemon.estimator.hypotheses import (
     fold,
     learn,
     mix,
-    open_again,
+    open_all,
     place,
     settle,
     suspected,
@@ -134,7 +134,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         fold(s, warmth, True)
         if trusted and not known and settle(s, p, s.past_contact < 0.0, m.dt):
             fold(s, warmth, False)
-            open_again(s, p)
+            open_all(s, p)
     else:
         out.torque_sigma = np.inf
         s.torque_age += m.dt

@@ -1,7 +1,8 @@
-"""Three hypotheses of one brake: it is as it was, or its stiffness path has jumped, or its torque path.
+"""Hypotheses of one brake: it is as it was, or something has changed.
 
 Each is a Kalman filter over the errors of both paths. The first believes what it learned and only walks. The others are the
-first, opened again at every release and every while by what `unknown` says may jump. All explain the same torque; the ratios
+first, opened again at every release and every while by what `unknown` says may jump in the stiffness path or in the torque
+path; and a brake whose disc grows with heat, which shows slowly and is opened once. All explain the same torque; the ratios
 of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10,
 1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
 deviation. A proven one becomes the first hypothesis.
@@ -11,7 +12,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_stiffness_jumps, add_torque_jumps, stay_possible
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_growth, add_stiffness_jumps, add_torque_jumps, stay_possible
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -36,8 +37,9 @@ from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 #: Logarithm of the odds that a brake has jumped since it was last looked at: once in a thousand stops. They cannot fall lower,
 #: or a later jump would have to make up for the past.
 PRIOR_ODDS = -7.0
-#: Log odds at which a jump is proven, and at which it is suspected enough to be told.
-_PROVEN, _SUSPECTED = 5.0, -2.0
+#: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
+#: suspected enough to be told.
+_PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
 #: Time after which an unproven jump is looked for anew, s, and after which a pending one is given up.
 _OPENED_S, _PENDING_S = 1.0, 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
@@ -46,8 +48,8 @@ GATE = 5.0
 DOUBTFUL_RAD = 0.05
 
 #: What may have jumped.
-ALTERNATIVES = 2
-STIFFNESS_JUMP, TORQUE_JUMP = range(ALTERNATIVES)
+ALTERNATIVES = 3
+STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH = range(ALTERNATIVES)
 
 #: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over
 #: the first one's.
@@ -64,20 +66,44 @@ ALTERNATIVE = np.dtype(
 
 
 @njit
+def _open(s, p, kind):
+    a = s.alternatives[kind]
+    a.error[:] = s.error
+    a.covariance[:, :] = s.covariance
+    if kind == STIFFNESS_JUMP:
+        add_stiffness_jumps(a.covariance, p)
+    elif kind == TORQUE_JUMP:
+        add_torque_jumps(a.covariance, p)
+    else:
+        add_growth(a.covariance, p)
+    faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
+    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
+    a.log_odds, a.shift = PRIOR_ODDS, 0.0
+
+
+@njit
 def open_again(s, p):
     """Look for jumps from now on."""
-    faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
-    for kind in range(ALTERNATIVES):
-        a = s.alternatives[kind]
-        a.error[:] = s.error
-        a.covariance[:, :] = s.covariance
-        if kind == STIFFNESS_JUMP:
-            add_stiffness_jumps(a.covariance, p)
-        else:
-            add_torque_jumps(a.covariance, p)
-        stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
-        a.log_odds, a.shift = PRIOR_ODDS, 0.0
+    _open(s, p, STIFFNESS_JUMP)
+    _open(s, p, TORQUE_JUMP)
     s.open_s = 0.0
+
+
+@njit
+def open_all(s, p):
+    """After a start, or when another hypothesis has become the first."""
+    open_again(s, p)
+    _open(s, p, DISC_GROWTH)
+
+
+@njit
+def _strongest(s, but):
+    """Log odds of the strongest alternative ``but`` one."""
+    best = PRIOR_ODDS
+    for kind in range(ALTERNATIVES):
+        if kind != but:
+            best = max(best, s.alternatives[kind].log_odds)
+    return best
 
 
 @njit
@@ -91,7 +117,7 @@ def share(s, kind):
 
 @njit
 def suspected(s):
-    return max(s.alternatives[STIFFNESS_JUMP].log_odds, s.alternatives[TORQUE_JUMP].log_odds) > _SUSPECTED
+    return _strongest(s, -1) > _SUSPECTED
 
 
 @njit
@@ -169,8 +195,8 @@ def settle(s, p, released, dt):
     """Prove or reopen. Returns whether a jump was taken over."""
     s.open_s += dt
     for kind in range(ALTERNATIVES):
-        a, other = s.alternatives[kind], s.alternatives[1 - kind]
-        if a.log_odds > _PROVEN and a.log_odds - other.log_odds > _PROVEN:
+        a = s.alternatives[kind]
+        if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) > _CLEARLY:
             s.error[:] = a.error
             s.covariance[:, :] = a.covariance
             s.force += a.shift

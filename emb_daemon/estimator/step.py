@@ -11,7 +11,7 @@ import numpy as np
 from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, watch_contact
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
-from emb_daemon.estimator.hypotheses import open_again
+from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
 from emb_daemon.estimator.records import (
     CONTACT_UNCERTAIN,
@@ -57,7 +57,7 @@ def _start(s, p, m):
     set_priors(s.covariance, p, m.caliper if m.has_thermocouple else m.ambient if m.has_status else 20.0)
     if p.clearance_sigma == 0.0:
         s.covariance[SCALE, SCALE] = 0.0
-    open_again(s, p)
+    open_all(s, p)
     s.balance = np.nan
 
 

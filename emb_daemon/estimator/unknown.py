@@ -129,6 +129,11 @@ def add_stiffness_jumps(P, p):
     """What may have changed at once between motor angle and force."""
     P[CONTACT, CONTACT] += (_CONTACT_JUMP_M / p.gear_gain) ** 2
     P[SCALE, SCALE] += _SCALE_JUMP**2
+
+
+@njit
+def add_growth(P, p):
+    """A disc that grows with heat, which the calibration does not know."""
     P[GROWTH, GROWTH] += (_GROWTH_JUMP_M_PER_K / p.gear_gain) ** 2
 
 
