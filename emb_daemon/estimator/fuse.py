@@ -1,6 +1,6 @@
 """Both paths made one: the filter over their errors, and whom to follow where they contradict each other."""
 
-from math import exp, sqrt
+from math import exp, hypot, sqrt
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     factor = s.factor * s.scale
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
-    softening = p.thermal.softening * s.temperature_doubt + p.thermal.softening_history * s.history_doubt
+    softening = p.thermal.softening * hypot(s.temperature_doubt, p.thermal.sigma) + p.thermal.softening_history * s.history_doubt
     relative = (p.stiffness_relative_sigma + softening) * s.force
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
@@ -109,6 +109,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
     if np.isfinite(torque):
+        out.torque_sigma = sqrt(white) / leverage
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
         speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
@@ -116,7 +117,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         to_torque(h, leverage, s_mean, mean_force, speed, needed, s.winding, s.housing)
         h[FAST] = leverage * spread
         slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
-        out.torque_sigma = sqrt(white + max(slow, 0.0)) / leverage
+        out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + max(slow, 0.0) / (leverage * leverage))
         trusted = s.plausibility.verdict == AGREE
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)

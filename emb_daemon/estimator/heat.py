@@ -6,13 +6,14 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.estimator.wheel import TURNING_RAD_PER_S, disc_speed
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
 
 #: Clamp force from which pads and disc exchange heat by contact, N.
 TOUCHING_N = 200.0
-#: Wheel speed from which pads heat: the sensor's noise at standstill does not.
-TURNING_RAD_PER_S = 0.5
+#: Disc speed that is assumed where nothing tells of it, for what it may have heated, rad/s: 110 km/h.
+_UNSEEN_RAD_PER_S = 100.0
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
 _HEAT_STEP_S = 0.046
 #: Change of a backing plate, K, that no steel makes between two heat steps.
@@ -110,6 +111,7 @@ def heat(s, p, m):
     A conduction step costs more than all the rest: one serves several samples, as long as the pads' contact stays the same.
     """
     t = p.thermal
+    wheel_speed, speed_sigma = disc_speed(s.wheel, m)
     if not s.temperature_known:
         s.factor = 1.0
         if m.has_thermocouple:
@@ -119,7 +121,8 @@ def heat(s, p, m):
     if touching != s.touching and s.heat_time > 0.0:
         _flow(s, t, p.effects, m)
     s.touching = touching
-    wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
+    if not np.isfinite(wheel_speed):
+        wheel_speed, speed_sigma = 0.0, _UNSEEN_RAD_PER_S
     s.heat_time += m.dt
     s.heat_travel += wheel_speed * m.dt
     s.power = 0.0
@@ -130,6 +133,10 @@ def heat(s, p, m):
         else:
             s.power = max(m.brake_torque, 0.0) * wheel_speed
         s.heat_energy += s.power * m.dt
+    if touching and speed_sigma > 0.0:
+        # What cannot be seen to heat may have heated all the same.
+        unseen = friction_power(t, s.fused, speed_sigma, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
+        s.temperature_doubt += unseen * m.dt / t.disc_heat_capacity
     if s.heat_time >= _HEAT_STEP_S:
         _flow(s, t, p.effects, m)
 

@@ -5,6 +5,7 @@ import numpy as np
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
 from emb_daemon.estimator.consistency import HORIZONS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
+from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.plausibility import PLAUSIBILITY
@@ -193,6 +194,7 @@ STATE = np.dtype(
         ("drift", "f8", (HORIZONS,)),
         ("drift_variance", "f8", (HORIZONS,)),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
+        ("wheel", WHEEL),
         ("heat_time", "f8"),
         ("heat_energy", "f8"),
         ("heat_travel", "f8"),

@@ -20,6 +20,7 @@ from emb_daemon.jit import njit
 
 #: ``doubt``: summed squares. ``unlike`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
 #: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: ``flickered``: samples in which the speed changed while the angle stood.
 #: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed.
 PLAUSIBILITY = np.dtype(
@@ -30,6 +31,7 @@ PLAUSIBILITY = np.dtype(
         ("still", "i8"),
         ("idle", "i8"),
         ("alike", "i8"),
+        ("flickered", "i8"),
         ("current", "f8"),
         ("frozen_s", "f8"),
         ("torque_mean", "f8"),
@@ -49,6 +51,9 @@ _TOLERATED, _COUNTED, _RAISE, _CLEAR = 20.0, 144.0, 600.0, 150.0
 _UNCONFIRMED = 5.0
 #: Samples that repeat to the bit although torque should change them, or although the speed is not zero.
 _REPEATED, _NEVER_REPEATED = 8, 50
+#: A speed that has changed in so many samples while the angle stood is noise, and noise does not repeat to the bit so often:
+#: at one repetition in five by chance, once in 1e8.
+_FLICKERED, _FROZEN = 50, 12
 #: Time constant over which angle and integrated speed are compared (s), and their difference that is a fault (rad) beyond what
 #: a signal delay of 10 ms makes. A resolver is believed again after this many samples in each of which the angle moved
 #: and went where the speed says within this angle (rad).
@@ -98,7 +103,10 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
         return c.verdict
     patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
     disagree = c.doubt > (patience * _RAISE if was == AGREE else _CLEAR)
-    repeated = c.still >= _NEVER_REPEATED and m.speed != 0.0
+    if travel == 0.0 and m.speed != speed_before:
+        c.flickered += 1
+    repeated = c.still >= (_FROZEN if c.flickered >= _FLICKERED else _NEVER_REPEATED)
+    repeated = repeated and (m.speed != 0.0 or c.flickered >= _FLICKERED)
     if repeated or abs(c.unlike) > _UNLIKE_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
         c.verdict = STIFFNESS_WRONG
         c.frozen_s = c.still * m.dt

@@ -1,0 +1,71 @@
+"""How fast the disc turns, from whichever of wheel speed, wheel pulses and vehicle speed can be true."""
+
+from math import exp, pi
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+PULSES_PER_TURN, PULSE_MODULO = 96, 4096
+#: Speed above which a wheel turns, rad/s, and a vehicle moves, m/s: sensors' noise at standstill stays below.
+TURNING_RAD_PER_S, _MOVING_M_PER_S = 0.5, 0.5
+#: Time over which pulses are counted into a speed, s.
+_COUNTED_S = 0.25
+#: Time for which a moving vehicle may have a standing wheel: a blocked one, before its anti-lock control lets go, s.
+_BLOCKED_S = 1.0
+#: Rolling radius of car tyres until this car's has been seen, m, its spread, and the time over which it is learned, s.
+_RADIUS_M, _RADIUS_SHARE, _RADIUS_LEARNED_S = 0.31, 0.1, 10.0
+
+WHEEL = np.dtype(
+    [
+        ("started", "?"),
+        ("pulse", "f8"),
+        ("pulse_speed", "f8"),
+        ("radius", "f8"),
+        ("contradicted_s", "f8"),
+        ("contradicted", "?"),
+    ],
+    align=True,
+)
+
+
+@njit
+def disc_speed(w, m):
+    """Speed of the disc (rad/s) and its standard deviation; NaN and infinity where nothing tells.
+
+    Args:
+        w: WHEEL record.
+        m: SAMPLE record.
+    """
+    if not w.started:
+        w.started, w.pulse, w.radius = True, m.wheel_pulse, _RADIUS_M
+    if m.has_wheel_pulse and m.dt > 0.0:
+        steps = (m.wheel_pulse - w.pulse + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
+        share = 1.0 - exp(-m.dt / _COUNTED_S)
+        w.pulse_speed += share * (abs(steps) * 2.0 * pi / PULSES_PER_TURN / m.dt - w.pulse_speed)
+    w.pulse = m.wheel_pulse
+    by_pulses = w.pulse_speed if m.has_wheel_pulse else np.nan
+    by_vehicle = m.vehicle_speed / w.radius if m.has_status else np.nan
+    if not m.has_wheel_speed:
+        w.contradicted, w.contradicted_s = False, 0.0
+        return _without(by_pulses, by_vehicle)
+    turning = m.wheel_speed > TURNING_RAD_PER_S
+    if m.has_status and turning and m.vehicle_speed > 10.0 * _MOVING_M_PER_S:
+        seen = m.vehicle_speed / m.wheel_speed
+        if abs(seen / _RADIUS_M - 1.0) < 3.0 * _RADIUS_SHARE:
+            w.radius += (1.0 - exp(-m.dt / _RADIUS_LEARNED_S)) * (seen - w.radius)
+    others = by_pulses > 2.0 * TURNING_RAD_PER_S or (np.isnan(by_pulses) and by_vehicle * w.radius > _MOVING_M_PER_S)
+    w.contradicted_s = w.contradicted_s + m.dt if others and not turning else 0.0
+    w.contradicted = w.contradicted_s > (_COUNTED_S if m.has_wheel_pulse else _BLOCKED_S)
+    if w.contradicted:
+        return _without(by_pulses, by_vehicle)
+    return m.wheel_speed, 0.0
+
+
+@njit
+def _without(by_pulses, by_vehicle):
+    if np.isfinite(by_pulses):
+        return by_pulses, 0.05 * by_pulses
+    if np.isfinite(by_vehicle):
+        return by_vehicle, _RADIUS_SHARE * by_vehicle
+    return np.nan, np.inf
