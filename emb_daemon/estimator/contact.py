@@ -19,7 +19,7 @@ from emb_daemon.models.contact import (
     torque_sigma,
     watch_closing,
 )
-from emb_daemon.models.fusion import OFFSET, STATES
+from emb_daemon.models.fusion import CONTACT, OFFSET, STATES
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 
 #: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
@@ -27,6 +27,9 @@ SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
 #: Standard deviations of the contact angle, rad: known again below, and unknown.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
+#: Torque that a released brake may seem to need, share of what the largest force needs: the offset of an ordinary current
+#: sensor; time over which a start is looked at, and for which a released motor stands, s.
+_LOOSE, _SEEN_S, _STILL_S = 0.03, 0.1, 0.1
 #: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
 _CLAMPED = 0.1
 
@@ -51,6 +54,41 @@ def follow_zero(s, p, m):
     open_again(s, p)
     s.contact.confirmed = False
     return True
+
+
+@njit
+def seek_release(s, p, m):
+    """Contact is unknown until the brake was seen released: nobody brakes, the park brake is off, the motor stands and needs
+    no torque. From there the clearance counts. A brake that is latched needs no current either."""
+    released = m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
+    s.still_s = s.still_s + m.dt if m.angle == s.angle else 0.0
+    torque = abs(s.plausibility.torque_mean)
+    loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
+    if not s.seen and s.since_start_s < _SEEN_S:
+        # Until some samples have been averaged the torque of the first ones says little.
+        s.since_start_s += m.dt
+        s.unknown = not released
+        return
+    if s.unknown and released and loose and s.still_s >= _STILL_S:
+        place_contact(s, p, m.angle + p.clearance, p.clearance_sigma)
+        s.unknown = False
+    elif not s.seen and not loose and not s.contact.confirmed:
+        s.unknown = True
+    s.seen = True
+
+
+@njit
+def place_contact(s, p, angle, sigma):
+    """Believe the contact angle ``angle`` rad with standard deviation ``sigma``, whatever was believed before."""
+    s.contact_angle = s.contact_anchor = angle
+    rest(s, p, s.angle - angle, s.factor * s.scale)
+    for i in range(STATES):
+        s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
+    s.covariance[CONTACT, CONTACT] = sigma * sigma
+    s.error[CONTACT] = 0.0
+    start_anew(s.contact)
+    s.contact.lost = False
+    open_again(s, p)
 
 
 @njit

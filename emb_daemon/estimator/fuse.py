@@ -118,7 +118,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         h[FAST] = leverage * spread
         slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + max(slow, 0.0) / (leverage * leverage))
-        trusted = s.plausibility.verdict == AGREE
+        trusted = s.plausibility.verdict == AGREE and not s.unknown
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
         out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
@@ -159,6 +159,13 @@ def take_sides(s, p, m, out):
         doubt = p.gear_gain * sqrt(out.stiffness_sigma * out.stiffness_sigma + out.torque_sigma * out.torque_sigma)
         beyond = beyond_friction(torque, s.force, doubt, p.gear_gain, load, coulomb)
         count_doubt(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    if s.unknown:
+        # A latched brake needs no current: the torque then says that nothing is known.
+        latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
+        c.doubt = 0.0
+        out.force, out.sigma = force, sqrt(sigma * sigma + s.covariance[OFFSET, OFFSET] / (p.gear_gain * p.gear_gain) + latched * latched)
+        out.source = TORQUE_ONLY if m.has_current else INVALID
+        return 0
     if s.contact.lost:
         # The contact angle was found wrong and explains what came before.
         c.doubt = 0.0

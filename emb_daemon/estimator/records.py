@@ -151,6 +151,11 @@ SAMPLE = np.dtype(
 STATE = np.dtype(
     [
         ("started", "?"),
+        # Whether the contact angle is unknown since the start, and what the release that ends it is known by.
+        ("unknown", "?"),
+        ("seen", "?"),
+        ("since_start_s", "f8"),
+        ("still_s", "f8"),
         ("angle", "f8"),
         ("speed", "f8"),
         ("angle_before", "f8"),

@@ -8,7 +8,7 @@ from math import sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, watch_contact
+from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
@@ -77,6 +77,8 @@ def step(s, p, m, out):
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
     knew = s.temperature_known
+    if p.clearance_sigma > 0.0:
+        seek_release(s, p, m)
     heat(s, p, m)
     if s.temperature_known and not knew:
         s.growth_start = s.disc
@@ -86,7 +88,7 @@ def step(s, p, m, out):
     if moved_zero:
         torque = np.nan
     # Over a gap the current of its last cycle and the mean acceleration say nothing of each other.
-    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility):
+    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown:
         watch_contact(s, p, m, force_before, torque, leverage)
     fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
@@ -113,9 +115,9 @@ def step(s, p, m, out):
     if s.plate_stuck:
         reasons |= STUCK
     out.engaged = s.contact.engaged
-    if s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD or out.sigma > _UNCERTAIN * p.maximum_force:
+    if s.unknown or s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD or out.sigma > _UNCERTAIN * p.maximum_force:
         reasons |= CONTACT_UNCERTAIN
-        if out.stiffness_sigma > out.torque_sigma and out.source == FUSED:
+        if out.stiffness_sigma > out.torque_sigma and out.source == FUSED and not s.unknown:
             out.source = TORQUE_ONLY
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         reasons |= OUTSIDE_RANGE
