@@ -1,7 +1,9 @@
-"""Consistency with memory: whether what the filter leaves unexplained is noise, from a tenth of a second to minutes.
+"""Consistency with memory: whether what the filter leaves unexplained is noise.
 
 A bias of 1 kN under noise of 0.6 kN a sample is nothing in one sample and certain after a second. The innovation is smoothed
-over several horizons and compared with what white noise would leave of it (the test ratios of PX4's EKF2, with memory).
+over several horizons; the mean square of what is left, over many such horizons, is compared with what white noise of the
+filter's own variance would leave (the test ratios of PX4's EKF2, with memory). What is beyond it is model error: of either
+path, so the force may be wrong by as much.
 """
 
 from math import exp, sqrt
@@ -10,32 +12,54 @@ import numpy as np
 
 from emb_daemon.jit import njit
 
-#: Horizons, s, and their number.
-HORIZONS_S = (0.1, 1.0, 10.0, 60.0)
+#: Horizons over which the innovation is smoothed, s, and time over which its square is averaged, s.
+HORIZONS_S = (0.05, 0.2, 1.0)
 HORIZONS = len(HORIZONS_S)
-#: Standard deviations of a mean beyond which it is no noise: at four horizons and 250 Hz once in 1e4 hours.
-_INCONSISTENT = 6.0
-#: Share of the horizon that must have been seen.
-_EVIDENCE = 0.3
+_AVERAGED_S = (30.0, 60.0, 60.0)
+#: Mean square over the expected one that is no noise: the mean of n squares spreads by sqrt(2 / n), overlapping horizons by half
+#: as much again, and six of those are taken.
+_RATIO = tuple(1.0 + 6.0 * 1.5 * (2.0 * horizon / averaged) ** 0.5 for horizon, averaged in zip(HORIZONS_S, _AVERAGED_S, strict=True))
 #: What a test says.
 UNKNOWN, CONSISTENT, INCONSISTENT = range(3)
 
+CONSISTENCY = np.dtype(
+    [
+        ("mean", "f8", (HORIZONS,)),
+        ("variance", "f8", (HORIZONS,)),
+        ("square", "f8", (HORIZONS,)),
+        ("expected", "f8", (HORIZONS,)),
+        ("seen_s", "f8"),
+    ],
+    align=True,
+)
+
 
 @njit
-def remember(drift, drift_variance, innovation, variance, dt):
-    """Take one innovation and its variance."""
+def remember(c, innovation, sigma, dt):
+    """Take one innovation and its standard deviation."""
+    c.seen_s += dt
     for i in range(HORIZONS):
         share = 1.0 - exp(-dt / HORIZONS_S[i])
-        drift[i] += share * (innovation - drift[i])
-        drift_variance[i] += share * share * variance - (1.0 - (1.0 - share) ** 2) * drift_variance[i]
+        c.mean[i] += share * (innovation - c.mean[i])
+        c.variance[i] = (1.0 - share) ** 2 * c.variance[i] + share * share * sigma * sigma
+        slow = 1.0 - exp(-dt / min(_AVERAGED_S[i], max(c.seen_s, dt)))
+        c.square[i] += slow * (c.mean[i] * c.mean[i] - c.square[i])
+        c.expected[i] += slow * (c.variance[i] - c.expected[i])
 
 
 @njit
-def unexplained(drift, drift_variance):
-    """Bias that no noise explains, in the innovation's unit: the largest smoothed innovation beyond its noise, else 0."""
+def judge(c, horizon):
+    """UNKNOWN before enough evidence, CONSISTENT or INCONSISTENT."""
+    if c.seen_s < 0.5 * _AVERAGED_S[horizon]:
+        return UNKNOWN
+    return INCONSISTENT if c.square[horizon] > _RATIO[horizon] * c.expected[horizon] else CONSISTENT
+
+
+@njit
+def model_error(c):
+    """Standard deviation (the innovation's unit) of what is left beyond noise; 0 where all that can be judged is noise."""
     worst = 0.0
     for i in range(HORIZONS):
-        sigma = sqrt(drift_variance[i])
-        if abs(drift[i]) > _INCONSISTENT * sigma and abs(drift[i]) > abs(worst):
-            worst = drift[i]
-    return worst
+        if judge(c, i) == INCONSISTENT:
+            worst = max(worst, c.square[i] - c.expected[i])
+    return sqrt(worst)

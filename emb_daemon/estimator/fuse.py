@@ -4,6 +4,7 @@ from math import exp, hypot, sqrt
 
 import numpy as np
 
+from emb_daemon.estimator.consistency import model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     fold,
@@ -48,6 +49,10 @@ from emb_daemon.models.plausibility import (
 
 #: Part of a sample by which current and angle may be apart in time.
 _LATE = 0.3
+#: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
+_TELLING = 0.1
+#: Share of the clearance that the motor must have gone back through before a jump is proven.
+_BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
 _CLEAR = 4.0
 
@@ -131,9 +136,11 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
                 weigh(a, first, variance, second, variance_a)
             if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
                 out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
+        if trusted and out.innovation_sigma < _TELLING * p.maximum_force:
+            remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
         s.torque_age = 0.0 if trusted else s.torque_age + m.dt
         fold(s, warmth, True)
-        if trusted and not known and settle(s, p, s.past_contact < 0.0, m.dt):
+        if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
             fold(s, warmth, False)
             open_all(s, p)
     else:
@@ -170,7 +177,9 @@ def take_sides(s, p, m, out):
         # The contact angle was found wrong and explains what came before.
         c.doubt = 0.0
     if c.verdict == AGREE:
-        return PATHS_DISAGREE if suspected(s) or abs(s.error[OFFSET]) > 3.0 * torque_offset(p) else 0
+        error = model_error(s.consistency) if out.force > 0.0 else 0.0
+        out.sigma = hypot(out.sigma, min(error, out.force))
+        return PATHS_DISAGREE if error > 0.0 or suspected(s) or abs(s.error[OFFSET]) > 3.0 * torque_offset(p) else 0
     out.source = STIFFNESS_ONLY
     if c.verdict == STIFFNESS_WRONG:
         out.source = TORQUE_ONLY if m.has_current else INVALID

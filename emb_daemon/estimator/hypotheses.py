@@ -40,8 +40,11 @@ PRIOR_ODDS = -7.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
-#: Time after which an unproven jump is looked for anew, s, and after which a pending one is given up.
-_OPENED_S, _PENDING_S = 1.0, 20.0
+#: Time after which an unproven jump is looked for anew, s.
+_OPENED_S = 1.0
+#: Time after which the stronger of two proven alternatives is taken though they are alike, and a merely suspected one given up
+#: at the next release, s: some stops of ordinary driving.
+_AMBIGUOUS_S = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
 GATE = 5.0
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
@@ -77,7 +80,7 @@ def _open(s, p, kind):
     else:
         add_growth(a.covariance, p)
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
-    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, faded)
+    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.log_odds, a.shift = PRIOR_ODDS, 0.0
 
 
@@ -192,17 +195,22 @@ def weigh(a, first, first_variance, second, second_variance):
 
 @njit
 def settle(s, p, released, dt):
-    """Prove or reopen. Returns whether a jump was taken over."""
+    """Prove or reopen. Returns whether an alternative became the first hypothesis.
+
+    While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
+    them apart, so nothing is proven before. The mixture does not wait."""
     s.open_s += dt
-    for kind in range(ALTERNATIVES):
+    for kind in range(ALTERNATIVES if released else 0):
         a = s.alternatives[kind]
-        if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) > _CLEARLY:
+        margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
+        if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
             s.error[:] = a.error
             s.covariance[:, :] = a.covariance
             s.force += a.shift
             s.drive += a.shift
             return True
-    if s.open_s > _PENDING_S or (not suspected(s) and (s.open_s > _OPENED_S or released)):
+    given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
+    if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
         open_again(s, p)
     return False
 

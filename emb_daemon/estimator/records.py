@@ -3,7 +3,7 @@
 import numpy as np
 
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
-from emb_daemon.estimator.consistency import HORIZONS
+from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.models.contact import CONTACT
@@ -195,9 +195,7 @@ STATE = np.dtype(
         # Heat of winding and housing: share of what the largest force's current would leave for ever.
         ("winding", "f8"),
         ("housing", "f8"),
-        # Innovation (N) smoothed over `consistency.HORIZONS_S`, and the variance of each mean.
-        ("drift", "f8", (HORIZONS,)),
-        ("drift_variance", "f8", (HORIZONS,)),
+        ("consistency", CONSISTENCY),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("wheel", WHEEL),
         ("heat_time", "f8"),

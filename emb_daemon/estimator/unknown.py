@@ -114,11 +114,12 @@ def _draw_near(x, P, gain, state, distance, reach):
 
 
 @njit
-def stay_possible(x, P, gain, p, contact_distance, scale, faded):
+def stay_possible(x, P, gain, p, contact_distance, scale, growth, faded):
     """What a brake can be at all: ``contact_distance`` rad of the contact angle and ``scale`` of the stiffness are from the
-    calibration; ``faded`` share of the motor torque is explained by heat."""
+    calibration, ``growth`` rad/K from none; ``faded`` share of the motor torque is explained by heat."""
     _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
     _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
+    _draw_near(x, P, gain, GROWTH, growth + x[GROWTH], 2.0 * _GROWTH_JUMP_M_PER_K / p.gear_gain)
     _draw_near(x, P, gain, GAIN, x[GAIN], _GAIN_REACH + faded)
     _draw_near(x, P, gain, LOAD, x[LOAD], p.load_friction)
     _draw_near(x, P, gain, COULOMB, x[COULOMB], 2.0 * p.offset_friction)
