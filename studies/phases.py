@@ -92,9 +92,7 @@ def judge(
         "silent_large": _share(large, silent),
         "longest_large_s": _longest(large, time_s),
         "worst_silent_N": float(error[silent].max()) if silent.any() else 0.0,
-        "useful": float(((estimates["mode"] == RUNNING) & (estimates["sigma"] <= USEFUL_SIGMA_N)).mean())
-        if len(silent)
-        else 0.0,
+        "useful": _share((estimates["mode"] == RUNNING) & (estimates["sigma"] <= USEFUL_SIGMA_N), np.ones_like(silent)),
         "rmse_N": rmse,
         "sigma_N": float(np.median(estimates["sigma"][usable])) if usable.any() else np.nan,
     }
@@ -119,15 +117,14 @@ def first_flag_s(time_s: np.ndarray, estimates: np.ndarray, onset_s: float) -> f
     return float(time_s[told[0]] - onset_s) if len(told) else np.nan
 
 
-HEADINGS = f"{'phase':<10}{'silent':>8}{'>3s sil':>9}{'>3s use':>9}{'>1kN':>9}{'longest':>9}{'worst':>9}{'useful':>8}{'RMSE':>9}{'sigma':>8}"
+_COLUMNS = ("silent", ">3s silent", ">3s usable", ">1 kN", "longest", "worst", "useful", "RMSE", "sigma")
+HEADINGS = f"{'phase':<10}" + "".join(f"{column:>11}" for column in _COLUMNS)
 
 
 def line(phase: Phase) -> str:
     """One line under `HEADINGS`."""
-    p = phase
-    worst, rmse = min(p.worst_silent_N, 1e6), min(p.rmse_N, 1e6)
-    return (
-        f"{p.name:<10}{100 * p.silent:7.1f}%{100 * p.silent_beyond:8.2f}%{100 * p.usable_beyond:8.2f}%{100 * p.silent_large:8.2f}%"
-        f"{p.longest_large_s:8.2f}s{worst:8.0f}N{100 * p.useful:7.1f}%{rmse:8.0f}N{min(p.sigma_N, 1e6):7.0f}N  "
-        f"{'ok' if not p.failed else 'FAILS: ' + ', '.join(p.failed)}"
-    )
+    shares = (phase.silent, phase.silent_beyond, phase.usable_beyond, phase.silent_large)
+    cells = [f"{100 * share:.2f} %" for share in shares] + [f"{phase.longest_large_s:.2f} s", f"{phase.worst_silent_N:.3g} N"]
+    cells += [f"{100 * phase.useful:.1f} %", f"{phase.rmse_N:.3g} N", f"{phase.sigma_N:.3g} N"]
+    verdict = "FAILS: " + ", ".join(phase.failed) if phase.failed else "ok"
+    return f"{phase.name:<10}" + "".join(f"{cell:>11}" for cell in cells) + "  " + verdict

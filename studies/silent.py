@@ -2,6 +2,8 @@
 
     python -m studies.silent service ../shared/rig/service [--logs NAME,NAME] [--cut T] [--json]
         logs of a (simulated) rig with reference force: nothing, one thing, changed; training from 242 to 284 s.
+    python -m studies.silent grid [--faults NAME,NAME | --pair NAME,NAME] [--count N] [--seed S] [--drives] [--json]
+        drives of our own simulated car, with one fault or change each, and with pairs of them (`studies.faults`).
 
 Other logs are judged as one phase. Every log is run through the daemon's own pipeline with adaptation, in a folder of its own.
 """
@@ -10,6 +12,7 @@ import argparse
 import json
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,17 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.read import read_frames
 from emb_daemon.replay import Replay
 from emb_daemon.resources import resource
-from studies.phases import HEADINGS, LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, NOMINAL_WORSE, first_flag_s, judge, line
+from studies.phases import (
+    HEADINGS,
+    LEARNED_RMSE_N,
+    LEARNED_USEFUL,
+    NOMINAL_USEFUL,
+    NOMINAL_WORSE,
+    Phase,
+    first_flag_s,
+    judge,
+    line,
+)
 
 #: When the service logs' training begins and ends, s.
 _TRAINING_S = (242.0, 284.0)
@@ -95,6 +108,82 @@ def service(arguments: argparse.Namespace) -> int:
     return failing
 
 
+def _families(reports: list[dict]) -> list[dict]:
+    """Verdicts of drives by family; pairs are one family."""
+    groups: dict[str, list[dict]] = {}
+    for report in reports:
+        groups.setdefault("pairs" if "+" in report["family"] else report["family"], []).append(report)
+    table = []
+    for family, drives in groups.items():
+        phases = [phase for drive in drives for phase in drive["phases"]]
+        after = [phase for phase in phases if phase["name"] == "after"]
+        told = [drive["first_flag_s"] for drive in drives]
+        table.append(
+            {
+                "family": family,
+                "drives": len(drives),
+                "failing_drives": sum(any(phase["failed"] for phase in drive["phases"]) for drive in drives),
+                "phases": len(phases),
+                "failing_phases": sum(bool(phase["failed"]) for phase in phases),
+                "silent_large": sum("silent beyond 1 kN" in phase["failed"] for phase in phases),
+                "worst_silent_N": max(phase["worst_silent_N"] for phase in phases),
+                "flagged": sum(np.isfinite(told)),
+                "first_flag_s": float(np.nanmedian(told)) if np.isfinite(told).any() else np.nan,
+                "latest_flag_s": float(np.nanmax(told)) if np.isfinite(told).any() else np.nan,
+                "after_rmse_N": float(np.median([phase["rmse_N"] for phase in after])) if after else np.nan,
+                "after_useful": float(np.median([phase["useful"] for phase in after])) if after else np.nan,
+            }
+        )
+    return table
+
+
+def _print_families(table: list[dict]) -> None:
+    print(f"{'family':<29}{'drives':>7}{'fail':>6}{'phases':>8}{'fail':>6}{'>1 kN':>6}{'worst':>9}"
+          f"{'flagged':>9}{'median':>8}{'latest':>8}{'RMSE after':>12}{'useful after':>13}")  # fmt: skip
+    for row in table:
+        print(
+            f"{row['family']:<29}{row['drives']:>7}{row['failing_drives']:>6}{row['phases']:>8}{row['failing_phases']:>6}"
+            f"{row['silent_large']:>6}{row['worst_silent_N']:>7.2g} N{row['flagged']:>9}{row['first_flag_s']:>6.1f} s"
+            f"{row['latest_flag_s']:>6.1f} s{row['after_rmse_N']:>10.3g} N{100 * row['after_useful']:>11.1f} %"
+        )
+
+
+def grid(arguments: argparse.Namespace) -> int:
+    """Drives of the simulated car; returns the number of phases that fail."""
+    from studies.faults import FAMILIES
+    from studies.grid import pairs_of, run_grid
+
+    chosen = (arguments.faults or arguments.pair or ",".join(FAMILIES)).split(",")
+    if unknown := sorted(set(chosen) - set(FAMILIES)):
+        raise InputError(f"fault {', '.join(unknown)}: expected {', '.join(FAMILIES)}")
+    if arguments.pair:
+        tasks = [(tuple(chosen), number) for number in range(arguments.first, arguments.first + arguments.count)]
+    else:
+        tasks = [((name,), number) for name in chosen for number in range(arguments.first, arguments.first + arguments.count)]
+        pairs = arguments.pairs if arguments.pairs is not None else 0 if arguments.faults else 100
+        tasks += [(pair, number) for number, pair in enumerate(pairs_of(pairs, arguments.seed, chosen))]
+    begun, reports = time.monotonic(), []
+    for report in run_grid(tasks, arguments.seed, arguments.processes):
+        reports.append(report)
+        if arguments.drives:
+            flag = report["first_flag_s"]
+            told = "never flagged" if np.isnan(flag) else f"first flag after {flag:.2f} s"
+            heading = f"{report['family']} {report['number']}: {report['size']} from {report['onset_s']:.1f} s, {told}"
+            print(heading, *(f"  {line(Phase(**phase))}" for phase in report["phases"]), sep="\n", flush=True)
+    table = _families(reports)
+    failing, total = sum(row["failing_phases"] for row in table), sum(row["phases"] for row in table)
+    if arguments.json:
+        figures = {"seed": arguments.seed, "failing": failing, "phases": total, "families": table, "drives": reports}
+        json.dump(figures, sys.stdout, indent=1)
+        print()
+    else:
+        _print_families(table)
+        drives, seconds = sum(row["failing_drives"] for row in table), time.monotonic() - begun
+        summary = f"{failing} of {total} phases, {drives} of {len(reports)} drives fail"
+        print(f"seed {arguments.seed}: {summary}; {seconds:.0f} s")
+    return failing
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m studies.silent", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(required=True)
@@ -105,6 +194,17 @@ def main(argv: list[str] | None = None) -> int:
     logs.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
     logs.add_argument("--json", action="store_true")
     logs.set_defaults(run=service)
+    drives = commands.add_parser("grid", help="drives of our own simulated car")
+    drives.add_argument("--faults", metavar="NAME,NAME", help="only these families, and no pairs")
+    drives.add_argument("--pair", metavar="NAME,NAME", help="only drives with both of these")
+    drives.add_argument("--count", type=int, default=17, metavar="N", help="drives of each family (default 17)")
+    drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
+    drives.add_argument("--pairs", type=int, metavar="N", help="drives with two faults (default 100, none with --faults)")
+    drives.add_argument("--seed", type=int, default=1, metavar="S")
+    drives.add_argument("--processes", type=int, default=2, metavar="N")
+    drives.add_argument("--drives", action="store_true", help="print every drive")
+    drives.add_argument("--json", action="store_true")
+    drives.set_defaults(run=grid)
     arguments = parser.parse_args(argv)
     try:
         arguments.run(arguments)

@@ -51,6 +51,7 @@ VISIBLE = {
     "caliper_softening": {"per_K": 0.01},
     "spindle_lead_error": {"amplitude_um": 10.0, "order_per_turn": 0.3},
     "cold_grease": {"per_K": 0.05},
+    "current_delay": {"delay_s": 0.004 / 3.0},
 }
 
 
