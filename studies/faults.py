@@ -172,9 +172,9 @@ def _clamped(rng, moments) -> float:
 
 
 def _sometime(rng, moments) -> float:
-    """The start, or a moment of driving or braking, or the training."""
+    """The start, or a moment of driving or braking, or just before the training."""
     choice = rng.integers(4)
-    return (0.0, _driving(rng, moments), _clamped(rng, moments), moments["park"] + 0.5)[choice]
+    return (0.0, _driving(rng, moments), _clamped(rng, moments), moments["park"] - 0.5)[choice]
 
 
 def _once(at_s: float, action: Callable) -> Callable:
@@ -253,7 +253,7 @@ def contact_jump(rng, moments):
 
 @_family
 def contact_slow(rng, moments):
-    um, at, seconds = _signed(rng, 10.0, 150.0), moments["go_1"], 30.0
+    um, at, seconds = _signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
     state = [0.0]
 
     def car(car, time_s):
@@ -261,7 +261,7 @@ def contact_slow(rng, moments):
         car.plants["contact_angle"] += _rad(um) * (share - state[0])
         state[0] = share
 
-    return Fault(f"{um:+.0f} um over 30 s", at, car=car)
+    return Fault(f"{um:+.0f} um over 25 s", at, car=car)
 
 
 @_family

@@ -12,6 +12,7 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.records import RESULT_ACCEPTED
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import PARAMETERS
@@ -24,6 +25,8 @@ from emb_daemon.resources import resource
 from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 
+#: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
+_PARK_S = 34.0
 #: Cycles of a stretch: training ends if the car does not hear the daemon for 25.
 _STRETCH = 20
 #: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet; phases shorter are not judged.
@@ -52,14 +55,17 @@ def _latched(force_N: float) -> sc.Schedule:
 
 
 def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0) -> tuple[sc.Schedule, dict[str, float]]:
-    """A drive of under two minutes and when its parts begin, s: stops, holds, reversals, long drags, park brake with
+    """A drive of two minutes or so and when its parts begin, s: stops, holds, reversals, long drags, park brake with
     time for a training stroke, driving again, random angle."""
 
     def between(low, high):
         return float(rng.uniform(low, high))
 
+    # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
+    cold = (("park_0", sc.park(between(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
     parts = (
         ("stand", _latched(latched_N) if latched_N else sc.rest(2.0)),
+        *cold,
         ("hold_1", sc.stop(between(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
         ("stop_1", sc.stop(between(4e3, 8e3), 4.0)),
@@ -72,13 +78,18 @@ def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0)
         ("stand_2", sc.rest(1.5)),
         ("go_4", sc.accelerate(10.0, 3.0)),
         ("stop_4", sc.stop(between(2e3, 5e3), 4.0)),
-        ("park", sc.park(between(1e4, 1.5e4), 29.0)),
-        ("go_5", sc.accelerate(14.0, 4.0)),
-        ("stop_5", sc.stop(between(5e3, 9e3), 4.0)),
-        ("go_6", sc.accelerate(18.0, 4.5)),
+        ("go_5", sc.accelerate(between(10.0, 18.0), 4.5)),
+        ("stop_5", sc.stop(between(5e3, 12e3), 4.0)),
+        ("stand_3", sc.rest(1.0)),
+        ("park", sc.park(between(1e4, 1.5e4), _PARK_S)),
+        ("go_6", sc.accelerate(14.0, 4.0)),
+        ("stop_6", sc.stop(between(5e3, 9e3), 4.0)),
+        ("go_7", sc.accelerate(18.0, 4.5)),
         ("drag_2", sc.drag(between(2e3, 4e3), 16.0, 6.0)),
-        ("stop_6", sc.stop(between(1e4, 2e4), 3.5)),
+        ("stop_7", sc.stop(between(1e4, 2e4), 3.5)),
         ("hold_2", sc.stop(between(6e3, 11e3), 3.0)),
+        ("go_8", sc.accelerate(between(10.0, 18.0), 4.5)),
+        ("stop_8", sc.stop(between(3e3, 8e3), 4.0)),
         ("random", sc.random_angle(plant, 4.0, rng, high_N=12e3)),
         ("end", sc.rest(1.0)),
     )
@@ -86,7 +97,7 @@ def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0)
     for name, part in parts:
         moments[name] = schedule.seconds if schedule else 0.0
         schedule = schedule + part if schedule else part
-    return schedule, moments | {"after": moments["go_5"], "over": schedule.seconds}
+    return schedule, moments | {"after": moments["go_6"], "over": schedule.seconds}
 
 
 def _joined(faults: list[Fault]) -> Fault:
@@ -158,6 +169,8 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
             msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | fault.effects}, type(calibration)
         )
     plant = plant_from_calibration(calibration, int(rng.integers(1 << 32)), pad_thickness_mm=fault.pads_mm)
+    for name in ("current_noise", "speed_noise", "angle_noise", "temperature_noise"):
+        plant[name] *= rng.uniform(0.8, 1.2)
     fault.brake(plant)
     schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N)
     schedule.drives["ambient"] = fault.ambient_C
@@ -197,14 +210,19 @@ def judged(names: tuple[str, ...], number: int, seed: int) -> dict:
     fault, moments, estimates, force_N = drive(names, number, seed)
     time_s = 1e-9 * estimates["time_ns"]
     begin = max(fault.power_on_s, 0.0)
-    onset = max(fault.onset_s, begin + _POWER_ON_S)
+    onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, begin), *fault.restarts)))
     park, after = moments["park"], moments["after"]
-    edges = {"before": begin, "during": min(fault.onset_s, park), "training": park, "after": after}
-    ends = [*list(edges.values())[1:], moments["over"]]
+    parked = [(moments[name], moments[name] + _PARK_S) for name in ("park_0", "park") if name in moments]
+    training = np.any([(time_s >= since) & (time_s < until) for since, until in parked], axis=0)
+    spans = {
+        "before": ~training & (time_s < min(fault.onset_s, park)),
+        "during": ~training & (time_s >= fault.onset_s) & (time_s < park),
+        "training": training,
+        "after": time_s >= after,
+    }
     phases = []
-    for (phase, start), end in zip(edges.items(), ends, strict=True):
-        rows = (time_s >= max(start, begin)) & (time_s < end)
-        if end - max(start, begin) < _SHORTEST_S or not rows.any():
+    for phase, rows in spans.items():
+        if rows.sum() * CYCLE_S < _SHORTEST_S:
             continue
         useful = rmse_N = None
         if NOMINAL.issuperset(names) and phase != "training":
@@ -217,6 +235,7 @@ def judged(names: tuple[str, ...], number: int, seed: int) -> dict:
         "number": number,
         "size": fault.size,
         "onset_s": fault.onset_s,
+        "trained": int((np.diff((estimates["adapt_result"] == RESULT_ACCEPTED).astype(int)) > 0).sum()),
         "first_flag_s": first_flag_s(time_s, estimates, onset),
         "phases": [phase.as_dict() for phase in phases],
     }

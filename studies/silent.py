@@ -127,6 +127,7 @@ def _families(reports: list[dict]) -> list[dict]:
                 "failing_phases": sum(bool(phase["failed"]) for phase in phases),
                 "silent_large": sum("silent beyond 1 kN" in phase["failed"] for phase in phases),
                 "worst_silent_N": max(phase["worst_silent_N"] for phase in phases),
+                "trained": sum(drive["trained"] for drive in drives),
                 "flagged": sum(np.isfinite(told)),
                 "first_flag_s": float(np.nanmedian(told)) if np.isfinite(told).any() else np.nan,
                 "latest_flag_s": float(np.nanmax(told)) if np.isfinite(told).any() else np.nan,
@@ -138,13 +139,14 @@ def _families(reports: list[dict]) -> list[dict]:
 
 
 def _print_families(table: list[dict]) -> None:
-    print(f"{'family':<29}{'drives':>7}{'fail':>6}{'phases':>8}{'fail':>6}{'>1 kN':>6}{'worst':>9}"
+    print(f"{'family':<29}{'drives':>7}{'fail':>6}{'phases':>8}{'fail':>6}{'>1 kN':>6}{'worst':>10}{'trained':>8}"
           f"{'flagged':>9}{'median':>8}{'latest':>8}{'RMSE after':>12}{'useful after':>13}")  # fmt: skip
     for row in table:
         print(
             f"{row['family']:<29}{row['drives']:>7}{row['failing_drives']:>6}{row['phases']:>8}{row['failing_phases']:>6}"
-            f"{row['silent_large']:>6}{row['worst_silent_N']:>7.2g} N{row['flagged']:>9}{row['first_flag_s']:>6.1f} s"
-            f"{row['latest_flag_s']:>6.1f} s{row['after_rmse_N']:>10.3g} N{100 * row['after_useful']:>11.1f} %"
+            f"{row['silent_large']:>6}{row['worst_silent_N']:>8.3g} N{row['trained']:>8}{row['flagged']:>9}"
+            f"{row['first_flag_s']:>6.1f} s{row['latest_flag_s']:>6.1f} s{row['after_rmse_N']:>10.3g} N"
+            f"{100 * row['after_useful']:>11.1f} %"
         )
 
 
@@ -168,8 +170,9 @@ def grid(arguments: argparse.Namespace) -> int:
         if arguments.drives:
             flag = report["first_flag_s"]
             told = "never flagged" if np.isnan(flag) else f"first flag after {flag:.2f} s"
-            heading = f"{report['family']} {report['number']}: {report['size']} from {report['onset_s']:.1f} s, {told}"
-            print(heading, *(f"  {line(Phase(**phase))}" for phase in report["phases"]), sep="\n", flush=True)
+            told += f", trained {report['trained']} times"
+            print(f"{report['family']} {report['number']}: {report['size']} from {report['onset_s']:.1f} s, {told}")
+            print(*(f"  {line(Phase(**phase))}" for phase in report["phases"]), sep="\n", flush=True)
     table = _families(reports)
     failing, total = sum(row["failing_phases"] for row in table), sum(row["phases"] for row in table)
     if arguments.json:
