@@ -321,11 +321,11 @@ def torque_constant(rng, moments):
 @_family
 def torque_constant_fade(rng, moments):
     """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
-    heating = _size(rng, 0.3, 1.5)
+    heating = _size(rng, 0.5, 3.0)
 
     def brake(plant):
         plant["magnet_heating"], plant["copper_per_K"] = heating, 0.0039
-        plant["winding_time"], plant["magnet_time"] = 10.0, 30.0
+        plant["winding_time"], plant["magnet_time"] = 5.0, 20.0
         plant["effects"]["torque_constant_fade"]["fade_per_K"] = 0.0012
 
     return Fault(f"{heating:.2f} K/A2", brake=brake)

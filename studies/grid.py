@@ -4,6 +4,7 @@ import tempfile
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from emb_daemon.adapt.memory import Memory
 from emb_daemon.adapt.records import RESULT_ACCEPTED
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import CYCLE_S, Car
@@ -93,10 +94,9 @@ def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0)
         ("random", sc.random_angle(plant, 4.0, rng, high_N=12e3)),
         ("end", sc.rest(1.0)),
     )
-    moments, schedule = {}, None
-    for name, part in parts:
-        moments[name] = schedule.seconds if schedule else 0.0
-        schedule = schedule + part if schedule else part
+    ends = np.cumsum([part.seconds for _, part in parts])
+    moments = dict(zip((name for name, _ in parts), (float(end) for end in (0.0, *ends)), strict=False))
+    schedule = sc.Schedule(*(np.concatenate([getattr(part, rows) for _, part in parts]) for rows in ("commands", "drives")))
     return schedule, moments | {"after": moments["go_6"], "over": schedule.seconds}
 
 
@@ -147,18 +147,23 @@ class _Daemon:
         self._pipeline, self._begun = Pipeline(parameters, ("FL",), adaptation=adaptation), False
 
     def answer(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """ESTIMATE rows and sent frames."""
+        """ESTIMATE rows and sent frames, valid until the next call."""
         if not self._begun and len(frames):
             self._pipeline.begin(int(frames["time_ns"][0]))
             self._begun = True
         _, count = self._pipeline.consume(frames)
-        return self._pipeline.estimates[:count].copy(), self._pipeline.broadcast(count)
+        return self._pipeline.estimates[:count], self._pipeline.broadcast(count)
+
+
+@cache
+def _calibration():
+    return load_calibration(resource("config/calibration.yaml"))
 
 
 def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
     """Drive number ``number`` with faults of these families: (fault, moments, ESTIMATE rows, true force at each, N)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = _calibration()
     # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(calibration)
@@ -184,14 +189,15 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
     commands = sc.commands_of(schedule, ("FL",))
     silences = [(0.0, fault.power_on_s)] + [(at, at + off) for at, off in fault.restarts]
     restarts = sorted(at + off for at, off in fault.restarts)
-    estimates, truths = [], []
+    # Predictions can make more rows than there are cycles.
+    force_N, estimates, count = np.zeros(len(schedule)), np.zeros(2 * len(schedule), ESTIMATE), 0
     with tempfile.TemporaryDirectory() as folder:
         daemon = _Daemon(calibration, Path(folder))
         for first in range(0, len(schedule), _STRETCH):
             time_s = first * CYCLE_S
             fault.car(car, time_s)
             frames, truth = car.run(commands[first : first + _STRETCH], schedule.drives[first : first + _STRETCH])
-            truths.append(truth[:, 0])
+            force_N[first : first + len(truth)] = truth["force"][:, 0]
             if restarts and time_s >= restarts[0]:
                 restarts.pop(0)
                 daemon.start()
@@ -199,10 +205,11 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
                 continue
             answers, sent = daemon.answer(fault.bus(frames, time_s))
             car.hear(sent)
-            estimates.append(answers)
-    estimates, truth = np.concatenate(estimates), np.concatenate(truths)
-    row = np.clip(np.rint(estimates["time_ns"] / (1e9 * CYCLE_S)).astype(int) - 1, 0, len(truth) - 1)
-    return fault, moments, estimates, truth["force"][row]
+            estimates[count : count + len(answers)] = answers
+            count += len(answers)
+    estimates = estimates[:count]
+    row = np.clip(np.rint(estimates["time_ns"] / (1e9 * CYCLE_S)).astype(int) - 1, 0, len(force_N) - 1)
+    return fault, moments, estimates, force_N[row]
 
 
 def judged(names: tuple[str, ...], number: int, seed: int) -> dict:

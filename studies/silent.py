@@ -200,7 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     drives = commands.add_parser("grid", help="drives of our own simulated car")
     drives.add_argument("--faults", metavar="NAME,NAME", help="only these families, and no pairs")
     drives.add_argument("--pair", metavar="NAME,NAME", help="only drives with both of these")
-    drives.add_argument("--count", type=int, default=17, metavar="N", help="drives of each family (default 17)")
+    drives.add_argument("--count", type=int, default=18, metavar="N", help="drives of each family (default 18)")
     drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
     drives.add_argument("--pairs", type=int, metavar="N", help="drives with two faults (default 100, none with --faults)")
     drives.add_argument("--seed", type=int, default=1, metavar="S")
