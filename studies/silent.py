@@ -42,6 +42,8 @@ _ONSET_S = {"contact_plus_40um": 80.0, "current_offset_later": 60.0, "resolver_f
 _HEALED = ("pads_6p5mm", "compound_stiffer", "contact_plus_40um", "current_offset_later", "disc_growth")
 #: RMSE of `nominal` by phase, N, by the estimator as it was before this study.
 _NOMINAL_RMSE_N = {"before": 31.5, "training": 35.5, "after": 34.7}
+#: Between these lines of docs/safety.md stands the table that `grid --table` writes.
+_BEGIN, _END = "<!-- detection times: begin -->", "<!-- detection times: end -->"
 #: Flags of the first moments, s, are of power-on: slow inputs have not been heard yet.
 _POWER_ON_S = 0.5
 
@@ -150,6 +152,37 @@ def _print_families(table: list[dict]) -> None:
         )
 
 
+def _write_table(page: Path, table: list[dict], seed: int) -> None:
+    """The section of a page between its two `detection times` comments, anew.
+
+    Raises:
+        InputError: the page has no such comments.
+    """
+    text = page.read_text()
+    head, begin, rest = text.partition(_BEGIN)
+    _, end, tail = rest.partition(_END)
+    if not end:
+        raise InputError(f"{page}: expected the lines {_BEGIN} and {_END}")
+    rows = [
+        f"| {row['family'].replace('_', ' ')} | {row['flagged']} of {row['drives']} | {_seconds(row['first_flag_s'])} | "
+        f"{_seconds(row['latest_flag_s'])} | {row['failing_phases']} of {row['phases']} | {row['silent_large']} | "
+        f"{row['worst_silent_N']:.0f} |"
+        for row in table
+    ]
+    lines = [
+        f"Written by `python -m studies.silent grid --seed {seed} --table {page}`.",
+        "",
+        "| fault or change | flagged | first flag, median s | latest, s | failing phases | beyond 1 kN | worst unflagged, N |",
+        "|---|---|---|---|---|---|---|",
+        *rows,
+    ]
+    page.write_text(head + begin + "\n" + "\n".join(lines) + "\n" + end + tail)
+
+
+def _seconds(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.1f}"
+
+
 def grid(arguments: argparse.Namespace) -> int:
     """Drives of the simulated car; returns the number of phases that fail."""
     from studies.faults import FAMILIES
@@ -175,6 +208,8 @@ def grid(arguments: argparse.Namespace) -> int:
             print(*(f"  {line(Phase(**phase))}" for phase in report["phases"]), sep="\n", flush=True)
     table = _families(reports)
     failing, total = sum(row["failing_phases"] for row in table), sum(row["phases"] for row in table)
+    if arguments.table:
+        _write_table(arguments.table, table, arguments.seed)
     if arguments.json:
         figures = {"seed": arguments.seed, "failing": failing, "phases": total, "families": table, "drives": reports}
         json.dump(figures, sys.stdout, indent=1)
@@ -207,14 +242,17 @@ def main(argv: list[str] | None = None) -> int:
     drives.add_argument("--processes", type=int, default=2, metavar="N")
     drives.add_argument("--drives", action="store_true", help="print every drive")
     drives.add_argument("--json", action="store_true")
+    drives.add_argument("--table", type=Path, metavar="FILE.md", help="write the table of detection times into this page")
     drives.set_defaults(run=grid)
+    for command in (logs, drives):
+        command.add_argument("--strict", action="store_true", help="exit status 1 if a phase fails")
     arguments = parser.parse_args(argv)
     try:
-        arguments.run(arguments)
+        failing = arguments.run(arguments)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
-    return 0
+    return int(arguments.strict and failing > 0)
 
 
 if __name__ == "__main__":
