@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation
+.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation silent
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -50,6 +50,12 @@ soak: $(READY)
 MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
+
+# Is the estimate ever silently wrong? A short form for CI: one drive of each family whose promises are kept; fails if one is not.
+# All of it, 900 drives with one fault and 100 with two: $(VENV)/bin/python -m studies.silent grid
+SILENT ?= nominal
+silent: $(READY)
+	$(VENV)/bin/python -m studies.silent grid --faults $(SILENT) --count 1 --strict
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

@@ -49,7 +49,7 @@ def _reversals(seconds: float, low_N: float, high_N: float, frequency: float = 1
 
 def _latched(force_N: float) -> sc.Schedule:
     """Parked, then held by the latch without current, then released."""
-    clamp = sc.park(force_N, 5.5).first(4.8)
+    clamp = sc.park(force_N, 6.0).first(4.8)
     hold = sc.rest(10.0)
     hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
     return clamp + hold + sc.rest(1.0)

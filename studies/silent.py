@@ -130,7 +130,7 @@ def _families(reports: list[dict]) -> list[dict]:
                 "silent_large": sum("silent beyond 1 kN" in phase["failed"] for phase in phases),
                 "worst_silent_N": max(phase["worst_silent_N"] for phase in phases),
                 "trained": sum(drive["trained"] for drive in drives),
-                "flagged": sum(np.isfinite(told)),
+                "flagged": int(np.isfinite(told).sum()),
                 "first_flag_s": float(np.nanmedian(told)) if np.isfinite(told).any() else np.nan,
                 "latest_flag_s": float(np.nanmax(told)) if np.isfinite(told).any() else np.nan,
                 "after_rmse_N": float(np.median([phase["rmse_N"] for phase in after])) if after else np.nan,
