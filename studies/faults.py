@@ -31,7 +31,8 @@ class Fault:
         car: called as (car, time_s) before every stretch of the drive.
         bus: called as (frames, time_s), returns the frames that reach the daemon.
         effects: effects that both brake and calibration have, so that they are no change.
-        ambient_C, warm_C: of the surroundings, and of pads, plates, disc and caliper at the start.
+        ambient_C: of the surroundings, and of everything at the start but for ``warm_C``.
+        warm_C: of the disc, of plates and caliper, and the share of the pads' rise that their softening remembers.
         power_on_s: when the daemon first hears anything.
         restarts: (time, silence before it, in s) of further starts of the daemon.
         latched_N: the drive begins parked on the latch with this force.
@@ -45,7 +46,7 @@ class Fault:
     bus: Callable = lambda frames, _: frames
     effects: dict = field(default_factory=dict)
     ambient_C: float = 22.0
-    warm_C: tuple[float, float] | None = None
+    warm_C: tuple[float, float, float] | None = None
     power_on_s: float = 0.0
     restarts: tuple[tuple[float, float], ...] = ()
     latched_N: float = 0.0
@@ -596,7 +597,8 @@ def thermocouple_lost(rng, moments):
 def power_on_hot(rng, moments):
     """Power comes on a brake that has just stopped from a long descent: hot disc, pads between it and their plates."""
     disc, plate = float(rng.uniform(200.0, 500.0)), float(rng.uniform(60.0, 140.0))
-    return Fault(f"disc {disc:.0f}, plates {plate:.0f} degC", warm_C=(disc, plate))
+    # Minutes of descent against the half hour and more of the softening's memory.
+    return Fault(f"disc {disc:.0f}, plates {plate:.0f} degC", warm_C=(disc, plate, float(rng.uniform(0.2, 0.6))))
 
 
 @_family

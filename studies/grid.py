@@ -181,7 +181,8 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
     schedule.drives["ambient"] = fault.ambient_C
     car = Car(np.atleast_1d(plant), seed=int(rng.integers(1 << 32)), ambient=fault.ambient_C)
     if fault.warm_C:
-        disc, plate = fault.warm_C
+        disc, plate, remembered = fault.warm_C
+        car.states["softening_memory"] = remembered * (0.5 * (disc + plate) - plant["curve_temperature"])
         car.states["disc"] = disc
         car.states["pads"][:] = np.linspace(disc, plate, car.states["pads"].shape[-1])
         for name in ("plate", "plate_reading", "caliper"):

@@ -9,12 +9,12 @@ Other logs are judged as one phase. Every log is run through the daemon's own pi
 """
 
 import argparse
-import json
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
@@ -80,6 +80,11 @@ def judge_log(name: str, time_s: np.ndarray, estimates: np.ndarray, force_N: np.
     return phases
 
 
+def _print_json(figures: dict) -> None:
+    """What is not finite is null."""
+    print(msgspec.json.format(msgspec.json.encode(figures), indent=1).decode())
+
+
 def service(arguments: argparse.Namespace) -> int:
     """Every log of a folder, or single logs; returns the number of phases that fail."""
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
@@ -103,8 +108,7 @@ def service(arguments: argparse.Namespace) -> int:
     if not total:
         raise InputError(f"{', '.join(map(str, arguments.paths))}: no such logs")
     if arguments.json:
-        json.dump({"failing": failing, "phases": total, "logs": report}, sys.stdout, indent=1)
-        print()
+        _print_json({"failing": failing, "phases": total, "logs": report})
     else:
         print(f"{failing} of {total} phases fail")
     return failing
@@ -212,8 +216,7 @@ def grid(arguments: argparse.Namespace) -> int:
         _write_table(arguments.table, table, arguments.seed)
     if arguments.json:
         figures = {"seed": arguments.seed, "failing": failing, "phases": total, "families": table, "drives": reports}
-        json.dump(figures, sys.stdout, indent=1)
-        print()
+        _print_json(figures)
     else:
         _print_families(table)
         drives, seconds = sum(row["failing_drives"] for row in table), time.monotonic() - begun
