@@ -5,9 +5,9 @@
     python -m studies.silent grid [--faults NAME,NAME | --pair NAME,NAME] [--count N] [--seed S] [--drives] [--json]
         drives of our own simulated car, with one fault or change each, and with pairs of them (`studies.faults`).
 
-Before the estimator was written anew against this study (seed 1): 24 of 33 phases of the service logs failed, and 1317 of 3520
-phases on the simulated car; in 355 of 1000 drives an unflagged error was beyond 1 kN for long or often, in 125 of these nothing was
-ever flagged. The table in docs/safety.md holds the present figures.
+Before the estimator was written anew against this study (seed 1): 24 of 33 phases of the service logs failed, and 1317 of
+3520 phases on the simulated car; in 355 of 1000 drives an unflagged error was beyond 1 kN for long or often, in 125 of these
+nothing was ever flagged. The table in docs/safety.md holds the present figures.
 
 Other logs are judged as one phase. Every log is run through the daemon's own pipeline with adaptation, in a folder of its own.
 """
