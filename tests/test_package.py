@@ -38,7 +38,7 @@ def test_the_wheel_is_complete(built):
         assert "emb_daemon/py.typed" in names
         sources = {str(path.relative_to(_ROOT)) for path in (_ROOT / "emb_daemon").rglob("*.py")}
         assert sources <= names
-        assert not any(name.startswith(("tests", "docs", "examples")) for name in names)
+        assert not any(name.startswith(("tests", "docs", "examples", "studies")) for name in names)
         metadata = wheel.read(f"emb_daemon-{__version__}.dist-info/METADATA").decode()
         assert f"\nVersion: {__version__}\n" in metadata
         assert (

@@ -17,9 +17,9 @@ from emb_daemon.plant import scenarios
 from emb_daemon.plant.brake import move_motor, static_curve
 from emb_daemon.plant.car import CYCLE_S, Car, idle
 from emb_daemon.plant.derive import plant_from_calibration, wear_pads
-from emb_daemon.plant.heat import cell_count
+from emb_daemon.plant.heat import cell_count, heat_cycle
 from emb_daemon.plant.live import LiveCar
-from emb_daemon.plant.records import EFFECTS, FORCE, PARK_APPLIED, PARK_RELEASED, PLANT_STATE, SUBSTEP_S
+from emb_daemon.plant.records import EFFECTS, FORCE, LATCH, PARK_APPLIED, PARK_RELEASED, PLANT_STATE, SUBSTEP_S
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import socket_pair
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -51,6 +51,7 @@ VISIBLE = {
     "caliper_softening": {"per_K": 0.01},
     "spindle_lead_error": {"amplitude_um": 10.0, "order_per_turn": 0.3},
     "cold_grease": {"per_K": 0.05},
+    "current_delay": {"delay_s": 0.004 / 3.0},
 }
 
 
@@ -283,6 +284,74 @@ def test_worn_pads_are_stiffer_and_touch_later(calibration):
     assert scenarios.angle_at(plant, 8000.0) - plant["contact_angle"] < stroke
     # 1.5 mm less on a gear gain of 39.8 um/rad, less what the stiffer pads save.
     assert scenarios.angle_at(plant, 8000.0) - angle == pytest.approx(1.5e-3 / plant["gear_gain"], rel=0.05)
+
+
+def test_the_latch_holds_the_brake_without_current(bare):
+    car = Car(np.atleast_1d(bare))
+    schedule = scenarios.park(9000.0, 5.0).first(3.0) + scenarios.rest(4.0)
+    commands = scenarios.commands_of(schedule, ("FL",))
+    commands["mode"][750:] = LATCH
+    _, truth = car.run(commands, schedule.drives)
+    held = truth[800:, 0]
+    assert np.abs(held["current"]).max() < 1e-9
+    assert np.ptp(held["angle"]) == 0.0
+    assert held["force"][-1] == pytest.approx(truth["force"][749, 0], rel=1e-3)
+    free = scenarios.rest(2.0)
+    _, released = car.run(scenarios.commands_of(free, ("FL",)), free.drives)
+    assert released["force"][-1, 0] < 1.0
+
+
+def test_winding_and_magnets_settle_where_the_current_heats_them_to(bare):
+    plant, current = bare.copy(), 10.0
+    plant["copper_per_K"], plant["winding_time"], plant["magnet_time"] = 0.0039, 5.0, 20.0
+    state = np.zeros(1, PLANT_STATE)[0]
+    for field in ("pads", "surface", "plate", "caliper", "disc"):
+        state[field] = 22.0
+    state["current"] = current
+    magnets = []
+    for _ in range(50_000):
+        heat_cycle(plant, state, 0.0, 22.0)
+        magnets.append(float(state["magnet_rise"]))
+    # Copper loss grows with the winding's own rise: rise = heating I^2 (1 + copper rise).
+    cold = float(plant["magnet_heating"]) * current**2
+    assert magnets[-1] == pytest.approx(cold / (1.0 - 0.0039 * cold), rel=1e-3)
+    # Two masses in a row begin with the square of time.
+    assert magnets[24] == pytest.approx(cold * 0.1**2 / (2.0 * 5.0 * 20.0), rel=0.06)
+
+
+def test_cold_grease_doubles_its_viscosity_every_ten_kelvin(bare):
+    schedule = scenarios.random_angle(bare, 6.0, np.random.default_rng(4), high_N=5000.0)
+    commands = scenarios.commands_of(schedule, ("FL",))
+
+    def loss(ambient, viscous):
+        plant = bare.copy()
+        plant["effects"]["cold_grease"]["viscous_Nms_per_rad"] = viscous
+        car = Car(np.atleast_1d(plant), ambient=ambient)
+        schedule.drives["ambient"] = ambient
+        car.run(commands, schedule.drives)
+        return float(car.states["friction_loss"][0])
+
+    def added(ambient):
+        return loss(ambient, 2e-5) - loss(ambient, 0.0)
+
+    assert added(22.0) == 0.0
+    # 2^4 - 1 over 2^3 - 1; viscous drag slows the motion a little.
+    assert added(-18.0) / added(-8.0) == pytest.approx(15.0 / 7.0, rel=0.05)
+
+
+def test_a_current_a_whole_cycle_late_is_the_one_before(bare):
+    plant = bare.copy()
+    plant["current_noise"] = 0.0
+    schedule = scenarios.random_angle(plant, 2.0, np.random.default_rng(6))
+
+    def currents(delay):
+        plant["effects"]["current_delay"]["delay_s"] = delay
+        frames, _ = scenarios.simulate_log(plant, schedule, seed=8)
+        return Decoder().columns(frames, "EMB_FL_Current")["CurrentQ"]
+
+    # The least count is 0.01 A.
+    assert np.allclose(currents(CYCLE_S)[1:], currents(0.0)[:-1], atol=0.011)
+    assert np.allclose(currents(1.5 * CYCLE_S)[1:], currents(0.5 * CYCLE_S)[:-1], atol=0.011)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))

@@ -3,7 +3,7 @@
 from math import cos, exp, sin
 
 from emb_daemon.jit import njit
-from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S
+from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS
 
 _COLD_C = 22.0
 _MAGNETS_C = 25.0
@@ -71,9 +71,22 @@ def _friction_level(p, s):
 
 
 @njit
+def _cold_viscosity(p, s):
+    """Viscous friction (N m s/rad) of grease below 22 degC: oil doubles its viscosity every 10 K or so (ASTM D341)."""
+    viscous = p.effects.cold_grease.viscous_Nms_per_rad
+    if viscous == 0.0:
+        return 0.0
+    return viscous * (2.0 ** (0.1 * max(_COLD_C - s.caliper, 0.0)) - 1.0)
+
+
+@njit
 def move_motor(p, s, demand):
     """One sub-step of current, motor and gear under a current ``demand`` in A."""
     e, h = p.effects, SUBSTEP_S
+    if s.latched:
+        s.current -= s.current * h / (p.current_time + h)
+        s.speed = s.speed_integral = 0.0
+        return
     # Back-EMF: near the top speed the supply drives no further current in the direction of motion.
     room = p.maximum_current * min(max((1.06 * p.maximum_speed - abs(s.speed)) / (0.1 * p.maximum_speed), 0.0), 1.0)
     if demand * s.speed > 0.0:
@@ -90,6 +103,7 @@ def move_motor(p, s, demand):
         load *= 1.0 + mesh.cosine * cos(phase) + mesh.sine * sin(phase)
     level = _friction_level(p, s)
     turning = p.presliding_damping * (1.0 - s.friction * s.friction) + e.viscous_friction.viscous_Nms_per_rad
+    turning += _cold_viscosity(p, s)
     resistance = level * s.friction + turning * s.speed
     cogging = e.cogging_torque
     if cogging.cosine_Nm != 0.0 or cogging.sine_Nm != 0.0:
@@ -153,10 +167,24 @@ def clamp(p, s):
 
 
 @njit
-def delayed_angle(p, s):
-    """What the resolver is about to measure: the motor angle as it was ``signal_delay`` ago."""
-    steps = min(max(p.effects.signal_delay.delay_s / SUBSTEP_S, 0.0), HISTORY - 2.0)
+def _earlier(s, history, delay, largest):
+    """A recorded value as it was ``delay`` s, at most ``largest`` sub-steps, ago."""
+    steps = min(max(delay / SUBSTEP_S, 0.0), largest)
     whole = int(steps)
     share = steps - whole
-    newer = s.angle_history[(s.history_at - whole) % HISTORY]
-    return (1.0 - share) * newer + share * s.angle_history[(s.history_at - whole - 1) % HISTORY]
+    return (1.0 - share) * history[(s.history_at - whole) % HISTORY] + share * history[(s.history_at - whole - 1) % HISTORY]
+
+
+@njit
+def delayed_angle(p, s):
+    """What the resolver is about to measure: the motor angle as it was ``signal_delay`` ago."""
+    return _earlier(s, s.angle_history, p.effects.signal_delay.delay_s, HISTORY - 2.0)
+
+
+@njit
+def delayed_mean_current(p, s):
+    """What the current sensor is about to measure: the mean over a cycle that ended ``current_delay`` ago."""
+    delay, total = p.effects.current_delay.delay_s, 0.0
+    for step in range(SUBSTEPS):
+        total += _earlier(s, s.current_history, delay + step * SUBSTEP_S, HISTORY - 2.0)
+    return total / SUBSTEPS

@@ -5,7 +5,7 @@ from math import cos, pi
 import numpy as np
 
 from emb_daemon.jit import njit
-from emb_daemon.plant.brake import clamp, delayed_angle, grown, move_motor, static_angle
+from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
 from emb_daemon.plant.records import (
@@ -108,6 +108,7 @@ def _corner_cycle(p, s, mode, target, rate, wheel_speed, wheel_gain, ambient, rn
         current += s.current
         s.history_at = (s.history_at + 1) % HISTORY
         s.angle_history[s.history_at] = s.angle
+        s.current_history[s.history_at] = s.current
     s.mean_current = current / SUBSTEPS
     # Ornstein-Uhlenbeck noise of the current sensor at four points of the cycle, averaged as the sensor does.
     decay = np.exp(-0.25 * CYCLE_S / p.current_noise_time)
@@ -155,7 +156,8 @@ def _fast_frames(car, p, s, corner, wires, ids, rng, frames, count):
     sent = car.time_ns + np.int64(1e9 * car.jitter * rng.random())
     count = _say(car, base + wire.RESOLVER, payload, ids, frames, count, sent)
     slot = base + wire.CURRENT
-    current = s.mean_current + s.mean_current_error - p.effects.current_offset.offset_A
+    mean = s.mean_current if p.effects.current_delay.delay_s == 0.0 else delayed_mean_current(p, s)
+    current = mean + s.mean_current_error - p.effects.current_offset.offset_A
     payload = pack(current, wires.received[slot, 0]) | pack(0.15 * rng.standard_normal(), wires.received[slot, 1])
     payload |= pack(car.supply_voltage, wires.received[slot, 2])
     sent = car.time_ns + np.int64(1e9 * car.jitter * (0.5 + rng.random()))

@@ -6,7 +6,7 @@ daemon is judged on its own.
 
 from emb_daemon.jit import njit
 from emb_daemon.plant.brake import static_angle
-from emb_daemon.plant.records import ANGLE, FORCE, SUBSTEP_S
+from emb_daemon.plant.records import ANGLE, FORCE, LATCH, SUBSTEP_S
 
 _POSITION_GAIN = 40.0
 _SPEED_GAIN = 250.0
@@ -24,6 +24,7 @@ _FORCE_BAND_N, _FORCE_BAND = 20.0, 0.005
 def set_target(p, s, mode, target, rate):
     """Position target for the coming cycle from a command."""
     s.target_rate = 0.0
+    s.latched = mode == LATCH
     if mode == ANGLE:
         s.position_target, s.target_rate, s.force_correction = target, rate, 0.0
     elif mode == FORCE and target > 0.0:

@@ -109,7 +109,10 @@ def heat_cycle(p, s, wheel_speed, ambient):
     caliper_loss = p.caliper_loss * (s.caliper - ambient)
     s.caliper += dt * (into_caliper - caliper_loss) / p.caliper_heat_capacity
     s.heat_lost += dt * (loss + caliper_loss)
-    s.magnet_rise += dt / p.magnet_time * (p.magnet_heating * s.current * s.current - s.magnet_rise)
+    # Two masses in a row, winding and housing with the magnets (Mellor, Roberts and Turner 1991), both over the caliper.
+    copper = p.magnet_heating * s.current * s.current * (1.0 + p.copper_per_K * s.winding_rise)
+    s.winding_rise += dt / (p.winding_time + dt) * (copper - s.winding_rise)
+    s.magnet_rise += dt / p.magnet_time * (s.winding_rise - s.magnet_rise)
     rise = 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1)) - p.curve_temperature
     s.softening_memory += dt / p.history_time * (rise - s.softening_memory)
     factor = 1.0 - p.softening * rise - p.softening_history * s.softening_memory

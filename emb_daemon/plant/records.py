@@ -10,7 +10,7 @@ CYCLE_NS = 4_000_000
 SUBSTEP_S = 1e-9 * CYCLE_NS / SUBSTEPS
 #: Cells through one pad at most.
 CELLS = 30
-#: Sub-steps of motor angle that are kept, for late resolvers.
+#: Sub-steps of motor angle and current that are kept, for late sensors.
 HISTORY = 64
 CURVE_TERMS = 5
 PAD_DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
@@ -84,7 +84,11 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("order_per_turn", "1", "periods per motor turn"),
         Field("phase_rad", "rad", "phase"),
     ),
-    "cold_grease": (Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),),
+    "cold_grease": (
+        Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),
+        Field("viscous_Nms_per_rad", "N m s/rad", "viscous friction at 12 degC, doubling every further 10 K down"),
+    ),
+    "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
 }
 
 EFFECT_VALUES = np.dtype(
@@ -101,6 +105,8 @@ PLANT_FIELDS = (
     Field("current_time", "s", "time constant of the current controller"),
     Field("magnet_heating", "K/A2", "steady rise of the magnets over the caliper per squared current"),
     Field("magnet_time", "s", "its time constant"),
+    Field("winding_time", "s", "time constant of the winding, which heats housing and magnets; 0: at once"),
+    Field("copper_per_K", "1/K", "rise of the winding's resistance with that of its temperature"),
     Field("load_friction", "m/rad", "gear friction torque per clamp force (thesis mu_g)"),
     Field("offset_friction", "N m", "gear friction torque without load (thesis eta_g)"),
     Field("presliding_angle", "rad", "Dahl's transition angle"),
@@ -174,6 +180,7 @@ PLANT_STATE = np.dtype(
         ("static_force", "f8"),
         ("stiffness_factor", "f8"),
         # Controller.
+        ("latched", "?"),
         ("position_target", "f8"),
         ("target_rate", "f8"),
         ("speed_integral", "f8"),
@@ -188,6 +195,7 @@ PLANT_STATE = np.dtype(
         ("plate_reading", "f8", (2,)),
         ("caliper", "f8"),
         ("disc", "f8"),
+        ("winding_rise", "f8"),
         ("magnet_rise", "f8"),
         ("softening_memory", "f8"),
         ("wear", "f8"),
@@ -196,6 +204,7 @@ PLANT_STATE = np.dtype(
         ("mean_current", "f8"),
         ("mean_current_error", "f8"),
         ("angle_history", "f8", (HISTORY,)),
+        ("current_history", "f8", (HISTORY,)),
         ("history_at", "i8"),
         ("angle_reading", "f8"),
         # Books.
@@ -209,8 +218,8 @@ PLANT_STATE = np.dtype(
 )
 
 #: What the brake controller of a corner is told for one cycle: RELEASE, ANGLE (``target`` rad past the released position,
-#: moving at ``rate`` rad/s) or FORCE (``target`` N).
-RELEASE, ANGLE, FORCE = range(3)
+#: moving at ``rate`` rad/s), FORCE (``target`` N) or LATCH (a pawl holds the motor where it is, without current).
+RELEASE, ANGLE, FORCE, LATCH = range(4)
 COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=True)
 
 #: Wire values of ParkBrake.

@@ -1,0 +1,647 @@
+"""Faults and changes that a drive of the simulated car can have, by family, with sizes and onsets drawn at random.
+
+A family is a function of a random generator and of the drive's moments (s, by name); it returns a `Fault`, which acts on the
+brake before the drive, on the running car every 80 ms, or on the frames on their way to the daemon.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from emb_daemon.jit import njit
+from emb_daemon.plant.records import EFFECTS
+from emb_daemon.wire import layout as wire
+from emb_daemon.wire.e2e import protect
+from emb_daemon.wire.layout import default_layout, pack, unpack
+
+
+def _nothing(*_):
+    return None
+
+
+@dataclass
+class Fault:
+    """One fault or change.
+
+    Attributes:
+        size: what was drawn, in words.
+        onset_s: when it begins; 0 where it is there from the start.
+        brake: changes the PLANT record before the drive; ``pads_mm`` mounts other pads first.
+        car: called as (car, time_s) before every stretch of the drive.
+        bus: called as (frames, time_s), returns the frames that reach the daemon.
+        effects: effects that both brake and calibration have, so that they are no change.
+        ambient_C: of the surroundings, and of everything at the start but for ``warm_C``.
+        warm_C: of the disc, of plates and caliper, and the share of the pads' rise that their softening remembers.
+        power_on_s: when the daemon first hears anything.
+        restarts: (time, silence before it, in s) of further starts of the daemon.
+        latched_N: the drive begins parked on the latch with this force.
+    """
+
+    size: str
+    onset_s: float = 0.0
+    brake: Callable = _nothing
+    pads_mm: float | None = None
+    car: Callable = _nothing
+    bus: Callable = lambda frames, _: frames
+    effects: dict = field(default_factory=dict)
+    ambient_C: float = 22.0
+    warm_C: tuple[float, float, float] | None = None
+    power_on_s: float = 0.0
+    restarts: tuple[tuple[float, float], ...] = ()
+    latched_N: float = 0.0
+
+
+FAMILIES: dict[str, Callable] = {}
+#: Families of which a few stops and a training must leave nothing but a small error and a small sigma.
+LEARNED = {
+    "pads_thickness", "pads_compound", "contact_jump", "contact_slow", "knock_back", "current_offset", "current_offset_later",
+    "gear_wear", "disc_growth",
+}  # fmt: skip
+#: Families in which nothing is wrong.
+NOMINAL = {"nominal"}
+
+
+def _family(function: Callable) -> Callable:
+    FAMILIES[function.__name__] = function
+    return function
+
+
+# Frames.
+
+_LAYOUT = default_layout()[0]
+_IDS = {int(_LAYOUT["slot"][can_id]): can_id for can_id in np.flatnonzero(_LAYOUT["slot"] >= 0)}
+
+
+@njit
+def _read(frames, can_id, signal, rows, values):
+    count = 0
+    for row in range(len(frames)):
+        if frames[row].can_id == can_id:
+            rows[count], values[count] = row, unpack(frames[row].data, signal)
+            count += 1
+    return count
+
+
+@njit
+def _write(frames, rows, signal, values):
+    mask = ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)) << np.uint64(signal.start)
+    for index in range(len(rows)):
+        frame = frames[rows[index]]
+        data = np.uint64(frame.data)
+        counter, status = (data >> np.uint64(8)) & np.uint64(15), (data >> np.uint64(12)) & np.uint64(15)
+        payload = (data & ~mask & ~np.uint64(0xFFFF)) | pack(values[index], signal)
+        frame.data = protect(frame.can_id, payload, counter, status)
+
+
+def _altered(slot: int, column: int, change: Callable) -> Callable:
+    """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right."""
+    can_id, signal = _IDS[slot], _LAYOUT["received"][slot, column]
+
+    def bus(frames, time_s):
+        rows, values = np.zeros(len(frames), np.int64), np.zeros(len(frames))
+        count = _read(frames, can_id, signal, rows, values)
+        _write(frames, rows[:count], signal, np.broadcast_to(change(values[:count], time_s), count).astype(float))
+        return frames
+
+    return bus
+
+
+def _both(*buses: Callable) -> Callable:
+    def bus(frames, time_s):
+        for one in buses:
+            frames = one(frames, time_s)
+        return frames
+
+    return bus
+
+
+def _during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
+    return lambda frames, time_s: bus(frames, time_s) if begin_s <= time_s < end_s else frames
+
+
+def _lost(*slots: int) -> Callable:
+    """A bus that loses the messages of some slots."""
+    ids = [_IDS[slot] for slot in slots]
+    return lambda frames, _: frames[~np.isin(frames["can_id"], ids)]
+
+
+def _held(slot: int, column: int) -> Callable:
+    """A bus on which one signal keeps the first value that it sees."""
+    kept = []
+
+    def change(values, _):
+        if not kept and len(values):
+            kept.append(values[0])
+        return kept[0] if kept else values
+
+    return _altered(slot, column, change)
+
+
+def _bits(rng, slot: int, column: int, lsb: float) -> Callable:
+    """As `_held`, moving by a least count up and down."""
+    kept = []
+
+    def change(values, _):
+        if not kept and len(values):
+            kept.append(values[0])
+        return kept[0] + lsb * rng.integers(-1, 2, len(values)) if kept else values
+
+    return _altered(slot, column, change)
+
+
+# Draws.
+
+
+def _size(rng, low: float, high: float) -> float:
+    """Log-uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _signed(rng, low: float, high: float) -> float:
+    return _size(rng, low, high) * float(rng.choice((-1.0, 1.0)))
+
+
+def _driving(rng, moments) -> float:
+    """A moment with the brake released, before parking."""
+    return float(moments[rng.choice(("go_1", "go_2", "go_3"))] + rng.uniform(0.5, 2.5))
+
+
+def _clamped(rng, moments) -> float:
+    """A moment with the brake applied, before parking."""
+    return float(moments[rng.choice(("hold_1", "stop_1", "drag_1", "stop_2", "reversals"))] + rng.uniform(0.8, 2.0))
+
+
+def _sometime(rng, moments) -> float:
+    """The start, or a moment of driving or braking, or just before the training."""
+    choice = rng.integers(4)
+    return (0.0, _driving(rng, moments), _clamped(rng, moments), moments["park"] - 0.5)[choice]
+
+
+def _once(at_s: float, action: Callable) -> Callable:
+    """Does ``action(plants)`` once, at ``at_s``."""
+    done = []
+
+    def car(car, time_s):
+        if time_s >= at_s and not done:
+            done.append(True)
+            action(car.plants)
+
+    return car
+
+
+def _moved(name: str, by: float) -> Callable:
+    def action(plants):
+        plants[name] += by
+
+    return action
+
+
+def _scaled(by: float, *names: str) -> Callable:
+    def action(plants):
+        for name in names:
+            plants[name] *= by
+
+    return action
+
+
+def _effect(name: str, **values) -> Callable:
+    def action(plants):
+        for key, value in values.items():
+            plants["effects"][name][key] = value
+
+    return action
+
+
+#: Clamp travel per motor angle, m/rad, by the datasheet of the simulated rig: what micrometres are in radians.
+_GEAR_GAIN = 3.98e-5
+
+
+def _rad(um: float) -> float:
+    return 1e-6 * um / _GEAR_GAIN
+
+
+# Nothing wrong, and units within the datasheet's tolerances.
+
+
+@_family
+def nominal(rng, moments):
+    return Fault("a well calibrated unit")
+
+
+@_family
+def tolerance(rng, moments):
+    """A unit that nobody calibrated: torque constant within 3 %, what else the datasheet states within 15 %."""
+    drawn = {"torque_constant": 0.03} | dict.fromkeys(
+        ("inertia", "load_friction", "offset_friction", "presliding_angle", "curve", "conductivity", "specific_heat"), 0.15
+    )
+
+    def brake(plant):
+        for name, bound in drawn.items():
+            plant[name] *= 1.0 + rng.uniform(-bound, bound)
+
+    return Fault("torque constant 3 %, others 15 %", brake=brake)
+
+
+# Contact and stiffness.
+
+
+@_family
+def contact_jump(rng, moments):
+    um, at = _signed(rng, 10.0, 150.0), _driving(rng, moments)
+    return Fault(f"{um:+.0f} um", at, car=_once(at, _moved("contact_angle", _rad(um))))
+
+
+@_family
+def contact_slow(rng, moments):
+    um, at, seconds = _signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
+    state = [0.0]
+
+    def car(car, time_s):
+        share = min(max((time_s - at) / seconds, 0.0), 1.0)
+        car.plants["contact_angle"] += _rad(um) * (share - state[0])
+        state[0] = share
+
+    return Fault(f"{um:+.0f} um over 25 s", at, car=car)
+
+
+@_family
+def knock_back(rng, moments):
+    """Between stops the contact moves, as cornering and run-out push pads back."""
+    um, times = _size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
+    state = [0, 0.0]
+
+    def car(car, time_s):
+        if state[0] < len(times) and time_s >= times[state[0]]:
+            shift = _rad(um * rng.standard_normal())
+            car.plants["contact_angle"] += shift - state[1]
+            state[:] = state[0] + 1, shift
+
+    return Fault(f"{um:.0f} um standard deviation", times[0], car=car)
+
+
+@_family
+def disc_growth(rng, moments):
+    growth = _size(rng, 0.1, 0.5)
+    return Fault(f"{growth:.2f} um/K", brake=_effect("disc_thermal_expansion", growth_um_per_K=growth))
+
+
+@_family
+def pads_thickness(rng, moments):
+    thickness = float(rng.uniform(3.0, 11.5))
+    return Fault(f"{thickness:.1f} mm", pads_mm=thickness)
+
+
+@_family
+def pads_compound(rng, moments):
+    factor = float(rng.uniform(0.7, 1.3))
+    return Fault(f"curve x {factor:.2f}", brake=_scaled(factor, "curve"))
+
+
+@_family
+def wear(rng, moments):
+    wear = _size(rng, 10.0, 200.0)
+    return Fault(f"{wear:.0f} um/MJ", brake=_effect("pad_wear", wear_um_per_MJ=wear))
+
+
+@_family
+def thickness_variation(rng, moments):
+    um = _size(rng, 5.0, 20.0)
+    return Fault(f"{um:.0f} um", brake=_effect("disc_thickness_variation", order_1_cosine_um=um, order_2_sine_um=0.3 * um))
+
+
+# Torque.
+
+
+@_family
+def torque_constant(rng, moments):
+    factor, at = 1.0 + _signed(rng, 0.02, 0.15), _sometime(rng, moments)
+    return Fault(f"x {factor:.3f}", at, car=_once(at, _scaled(factor, "torque_constant")))
+
+
+@_family
+def torque_constant_fade(rng, moments):
+    """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
+    heating = _size(rng, 0.5, 3.0)
+
+    def brake(plant):
+        plant["magnet_heating"], plant["copper_per_K"] = heating, 0.0039
+        plant["winding_time"], plant["magnet_time"] = 5.0, 20.0
+        plant["effects"]["torque_constant_fade"]["fade_per_K"] = 0.0012
+
+    return Fault(f"{heating:.2f} K/A2", brake=brake)
+
+
+@_family
+def current_gain(rng, moments):
+    gain, at = 1.0 + _signed(rng, 0.02, 0.15), _sometime(rng, moments)
+    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
+    return Fault(f"x {gain:.3f}", at, bus=_during(change, at))
+
+
+@_family
+def current_offset(rng, moments):
+    offset = _signed(rng, 0.2, 3.0)
+    return Fault(f"{offset:+.2f} A", bus=_altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
+
+
+@_family
+def current_offset_later(rng, moments):
+    offset = _signed(rng, 0.2, 3.0)
+    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
+    return Fault(f"{offset:+.2f} A", at, bus=_during(change, at))
+
+
+@_family
+def current_offset_drift(rng, moments):
+    rate, at = _signed(rng, 0.005, 0.1), moments["go_1"]
+    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
+    return Fault(f"{rate:+.3f} A/s", at, bus=_during(change, at))
+
+
+@_family
+def current_late(rng, moments):
+    return Fault("a third of a cycle", brake=_effect("current_delay", delay_s=0.004 / 3.0))
+
+
+@_family
+def angle_late(rng, moments):
+    delay = float(rng.uniform(0.001, 0.009))
+    return Fault(f"{1e3 * delay:.1f} ms", brake=_effect("signal_delay", delay_s=delay))
+
+
+# Friction.
+
+
+@_family
+def friction_scale(rng, moments):
+    factor, at = _size(rng, 0.5, 2.0), _sometime(rng, moments)
+    return Fault(f"x {factor:.2f}", at, car=_once(at, _scaled(factor, "load_friction", "offset_friction")))
+
+
+@_family
+def cold_grease(rng, moments):
+    ambient, grease, viscous = float(rng.uniform(-30.0, -10.0)), _size(rng, 0.005, 0.03), _size(rng, 1e-5, 1e-4)
+    action = _effect("cold_grease", per_K=grease, viscous_Nms_per_rad=viscous)
+    return Fault(f"{ambient:.0f} degC, {100 * grease:.1f} %/K, {1e6 * viscous:.0f} uNms/rad", brake=action, ambient_C=ambient)
+
+
+@_family
+def stribeck(rng, moments):
+    rise, speed = float(rng.uniform(0.3, 1.0)), _size(rng, 2.0, 15.0)
+    action = _effect("stribeck_friction", rise=rise, speed_rad_per_s=speed)
+    return Fault(f"+{100 * rise:.0f} % below {speed:.0f} rad/s", brake=action)
+
+
+@_family
+def viscous(rng, moments):
+    value = _size(rng, 1e-4, 1e-3)
+    return Fault(f"{1e6 * value:.0f} uNms/rad", brake=_effect("viscous_friction", viscous_Nms_per_rad=value))
+
+
+@_family
+def gear_wear(rng, moments):
+    """A gear that has run in or worn: friction, its presliding and play of another size."""
+    friction, play = float(rng.uniform(0.7, 1.4)), _size(rng, 0.01, 0.15)
+
+    def brake(plant):
+        _scaled(friction, "load_friction", "offset_friction", "presliding_angle")(plant)
+        plant["effects"]["backlash"]["play_rad"] = play
+
+    return Fault(f"friction x {friction:.2f}, play {play:.2f} rad", brake=brake)
+
+
+@_family
+def friction_asymmetry(rng, moments):
+    share = _signed(rng, 0.05, 0.4)
+    return Fault(f"{100 * share:+.0f} %", brake=_effect("friction_asymmetry", asymmetry=share))
+
+
+# Resolver.
+
+
+def _frozen(rng, moments, speed: Callable) -> Fault:
+    at = _driving(rng, moments) if rng.random() < 0.3 else _clamped(rng, moments)
+    end = at + rng.uniform(2.0, 10.0) if rng.random() < 0.5 else np.inf
+    change = _both(_held(wire.RESOLVER, wire.MOTOR_ANGLE), speed)
+    lasts = f"{end - at:.0f} s" if np.isfinite(end) else "for good"
+    return Fault(f"{lasts}", at, bus=_during(change, at, end))
+
+
+@_family
+def resolver_frozen_speed_zero(rng, moments):
+    return _frozen(rng, moments, _altered(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
+
+
+@_family
+def resolver_frozen_speed_noise(rng, moments):
+    """The resolver's rotor has come off its shaft."""
+
+    def noise(values, _):
+        return 0.35 * rng.standard_normal(len(values))
+
+    return _frozen(rng, moments, _altered(wire.RESOLVER, wire.MOTOR_SPEED, noise))
+
+
+@_family
+def resolver_frozen_last(rng, moments):
+    return _frozen(rng, moments, _held(wire.RESOLVER, wire.MOTOR_SPEED))
+
+
+def _angle_fault(size: str, at: float, change: Callable) -> Fault:
+    return Fault(size, at, bus=_during(_altered(wire.RESOLVER, wire.MOTOR_ANGLE, change), at))
+
+
+@_family
+def resolver_jump(rng, moments):
+    jump, at = _signed(rng, 0.2, 20.0), _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    return _angle_fault(f"{jump:+.2f} rad", at, lambda values, _: values + jump)
+
+
+@_family
+def resolver_drift(rng, moments):
+    rate, at = _signed(rng, 0.01, 0.5), moments["go_1"]
+    return _angle_fault(f"{rate:+.3f} rad/s", at, lambda values, time_s: values + rate * (time_s - at))
+
+
+@_family
+def resolver_gain(rng, moments):
+    gain, first = 1.0 + _signed(rng, 0.005, 0.1), []
+
+    def change(values, _):
+        if not first and len(values):
+            first.append(values[0])
+        return first[0] + gain * (values - first[0]) if first else values
+
+    return _angle_fault(f"x {gain:.3f}", 0.0, change)
+
+
+@_family
+def resolver_loses_counts(rng, moments):
+    """A share of the travel in one direction is not counted."""
+    share, at = _size(rng, 0.001, 0.05), moments["go_1"]
+    state = [np.nan, 0.0]
+
+    def change(values, _):
+        if not len(values):
+            return values
+        steps = np.diff(values, prepend=state[0] if np.isfinite(state[0]) else values[0])
+        missing = state[1] + np.cumsum(share * np.maximum(steps, 0.0))
+        state[:] = values[-1], missing[-1]
+        return values - missing
+
+    return _angle_fault(f"{100 * share:.1f} %", at, change)
+
+
+@_family
+def resolver_slips(rng, moments):
+    """The rotor slips a little whenever the motor starts fast."""
+    slip, at, state = _size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
+
+    def change(values, _):
+        if not len(values):
+            return values
+        speed = (values[-1] - state[0]) / 0.08 if np.isfinite(state[0]) else 0.0
+        fast = abs(speed) > 50.0
+        if fast and not state[2]:
+            state[1] -= slip * np.sign(speed)
+        state[0], state[2] = values[-1], fast
+        return values + state[1]
+
+    return _angle_fault(f"{slip:.2f} rad", at, change)
+
+
+# Current sensor.
+
+
+@_family
+def current_frozen(rng, moments):
+    at = _clamped(rng, moments)
+    return Fault("", at, bus=_during(_held(wire.CURRENT, wire.CURRENT_Q), at))
+
+
+@_family
+def current_zero(rng, moments):
+    at = _clamped(rng, moments) if rng.random() < 0.5 else _driving(rng, moments)
+    return Fault("", at, bus=_during(_altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
+
+
+@_family
+def current_lost(rng, moments):
+    at = _clamped(rng, moments) if rng.random() < 0.5 else _driving(rng, moments)
+    return Fault("", at, bus=_during(_lost(wire.CURRENT), at))
+
+
+# Wheel and heat.
+
+
+@_family
+def wheel_speed_lost(rng, moments):
+    at = moments["drag_1"] + 1.0
+    return Fault("", at, bus=_during(_lost(wire.WHEEL_SPEED), at))
+
+
+@_family
+def wheel_speed_zero(rng, moments):
+    at = moments["drag_1"] + 1.0
+    return Fault("", at, bus=_during(_altered(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
+
+
+#: What brake and calibration both have of disc thickness variation where the wheel's phase is the question, um.
+_VARIATION = dict.fromkeys((field.name for field in EFFECTS["disc_thickness_variation"]), 0.0)
+_VARIATION |= {"order_1_cosine_um": 12.0, "order_1_sine_um": 5.0, "order_2_cosine_um": 4.0}
+_KNOWN_VARIATION = {"disc_thickness_variation": _VARIATION}
+
+
+@_family
+def wheel_pulses_pause(rng, moments):
+    at, seconds = moments["go_2"] + 1.0, float(rng.uniform(0.5, 8.0))
+    return Fault(f"{seconds:.1f} s", at, bus=_during(_lost(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
+
+
+@_family
+def wheel_phase_restart(rng, moments):
+    """The daemon restarts on a disc whose thickness variation it knows."""
+    at = _driving(rng, moments)
+    return Fault("", at, restarts=((at, 0.5),), effects=_KNOWN_VARIATION)
+
+
+@_family
+def thermocouple_drifts(rng, moments):
+    rate, at, side = _signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
+    change = _altered(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
+    return Fault(f"{rate:+.1f} K/s", at, bus=_during(change, at))
+
+
+@_family
+def thermocouple_stuck(rng, moments):
+    at = moments["go_1"]
+    return Fault("both", at, bus=_during(_both(_held(wire.THERMOCOUPLE, 0), _held(wire.THERMOCOUPLE, 1)), at))
+
+
+@_family
+def thermocouple_stuck_noise(rng, moments):
+    at = moments["go_1"]
+    change = _both(_bits(rng, wire.THERMOCOUPLE, 0, 0.1), _bits(rng, wire.THERMOCOUPLE, 1, 0.1))
+    return Fault("both, one least count", at, bus=_during(change, at))
+
+
+@_family
+def thermocouple_lost(rng, moments):
+    at = moments["go_1"]
+    return Fault("", at, bus=_during(_lost(wire.THERMOCOUPLE), at))
+
+
+@_family
+def power_on_hot(rng, moments):
+    """Power comes on a brake that has just stopped from a long descent: hot disc, pads between it and their plates."""
+    disc, plate = float(rng.uniform(200.0, 500.0)), float(rng.uniform(60.0, 140.0))
+    # Minutes of descent against the half hour and more of the softening's memory.
+    return Fault(f"disc {disc:.0f}, plates {plate:.0f} degC", warm_C=(disc, plate, float(rng.uniform(0.2, 0.6))))
+
+
+@_family
+def ambient_cold(rng, moments):
+    return Fault("-30 degC", ambient_C=-30.0)
+
+
+# Power, restart, bus.
+
+
+@_family
+def start_clamped(rng, moments):
+    at = _clamped(rng, moments)
+    return Fault(f"at {at:.0f} s", at, power_on_s=at)
+
+
+@_family
+def start_latched(rng, moments):
+    force = float(rng.uniform(3000.0, 25000.0))
+    return Fault(f"{force:.0f} N", 0.0, power_on_s=6.0, latched_N=force)
+
+
+@_family
+def power_cycle(rng, moments):
+    """Everything loses power for a second, and the resolver counts from another zero."""
+    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    shift = float(rng.uniform(-100.0, 100.0))
+    car = _once(at - 0.5, _moved("released_angle", shift))
+    return Fault(f"zero {shift:+.0f} rad", at, car=car, restarts=((at, 1.0),))
+
+
+@_family
+def daemon_restart(rng, moments):
+    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    return Fault("", at, restarts=((at, 0.5),))
+
+
+@_family
+def bursts_lost(rng, moments):
+    """Bursts of up to 100 ms, of one message or all, about two a second."""
+    slots = [(wire.RESOLVER,), (wire.CURRENT,), tuple(_IDS)][rng.integers(3)]
+    share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], _lost(*slots)
+    return Fault(
+        f"{100 * share:.0f} % of {len(slots)} messages", at,
+        bus=_during(lambda frames, time_s: drop(frames, time_s) if rng.random() < share else frames, at),
+    )  # fmt: skip

@@ -1,0 +1,270 @@
+"""Drives of the simulated car, each with a fault or two of `studies.faults`, judged phase by phase."""
+
+import tempfile
+import zlib
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.records import RESULT_ACCEPTED
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.plant import scenarios as sc
+from emb_daemon.plant.car import CYCLE_S, Car
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.records import LATCH, PARK_APPLIED
+from emb_daemon.resources import resource
+from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault
+from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
+
+#: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
+_PARK_S = 34.0
+#: Cycles of a stretch: training ends if the car does not hear the daemon for 25.
+_STRETCH = 20
+#: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet; phases shorter are not judged.
+_POWER_ON_S, _SHORTEST_S = 0.5, 1.0
+#: Time that learning has before the drive's second half, s, for its promises to be asked for.
+_LEARNING_S = 10.0
+#: Two faults of these lists at once are one and the same, or have no common drive.
+_STARTS = {"start_clamped", "start_latched", "power_cycle", "daemon_restart", "wheel_phase_restart"}
+
+
+def _reversals(seconds: float, low_N: float, high_N: float, frequency: float = 1.6) -> sc.Schedule:
+    """Standing, the force goes up and down."""
+    schedule = sc.stop(0.5 * (low_N + high_N), seconds)
+    target = schedule.commands["target"]
+    swing = 0.5 * (high_N - low_N) * np.sin(2.0 * np.pi * frequency * CYCLE_S * np.arange(len(schedule)))
+    target += np.where(target > low_N, swing, 0.0)
+    return schedule
+
+
+def _latched(force_N: float) -> sc.Schedule:
+    """Parked, then held by the latch without current, then released."""
+    clamp = sc.park(force_N, 6.0).first(4.8)
+    hold = sc.rest(10.0)
+    hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
+    return clamp + hold + sc.rest(1.0)
+
+
+def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0) -> tuple[sc.Schedule, dict[str, float]]:
+    """A drive of two minutes or so and when its parts begin, s: stops, holds, reversals, long drags, park brake with
+    time for a training stroke, driving again, random angle."""
+
+    def between(low, high):
+        return float(rng.uniform(low, high))
+
+    # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
+    cold = (("park_0", sc.park(between(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
+    parts = (
+        ("stand", _latched(latched_N) if latched_N else sc.rest(2.0)),
+        *cold,
+        ("hold_1", sc.stop(between(6e3, 11e3), 3.0)),
+        ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
+        ("stop_1", sc.stop(between(4e3, 8e3), 4.0)),
+        ("go_2", sc.accelerate(between(16.0, 20.0), 5.0)),
+        ("drag_1", sc.drag(between(2e3, 4e3), 18.0, 8.0)),
+        ("stop_2", sc.stop(between(8e3, 14e3), 3.5)),
+        ("reversals", _reversals(4.0, 5e3, 8e3)),
+        ("go_3", sc.accelerate(between(20.0, 25.0), 6.0)),
+        ("stop_3", sc.stop(between(14e3, 22e3), 3.5)),
+        ("stand_2", sc.rest(1.5)),
+        ("go_4", sc.accelerate(10.0, 3.0)),
+        ("stop_4", sc.stop(between(2e3, 5e3), 4.0)),
+        ("go_5", sc.accelerate(between(10.0, 18.0), 4.5)),
+        ("stop_5", sc.stop(between(5e3, 12e3), 4.0)),
+        ("stand_3", sc.rest(1.0)),
+        ("park", sc.park(between(1e4, 1.5e4), _PARK_S)),
+        ("go_6", sc.accelerate(14.0, 4.0)),
+        ("stop_6", sc.stop(between(5e3, 9e3), 4.0)),
+        ("go_7", sc.accelerate(18.0, 4.5)),
+        ("drag_2", sc.drag(between(2e3, 4e3), 16.0, 6.0)),
+        ("stop_7", sc.stop(between(1e4, 2e4), 3.5)),
+        ("hold_2", sc.stop(between(6e3, 11e3), 3.0)),
+        ("go_8", sc.accelerate(between(10.0, 18.0), 4.5)),
+        ("stop_8", sc.stop(between(3e3, 8e3), 4.0)),
+        ("random", sc.random_angle(plant, 4.0, rng, high_N=12e3)),
+        ("end", sc.rest(1.0)),
+    )
+    ends = np.cumsum([part.seconds for _, part in parts])
+    moments = dict(zip((name for name, _ in parts), (float(end) for end in (0.0, *ends)), strict=False))
+    schedule = sc.Schedule(*(np.concatenate([getattr(part, rows) for _, part in parts]) for rows in ("commands", "drives")))
+    return schedule, moments | {"after": moments["go_6"], "over": schedule.seconds}
+
+
+def _joined(faults: list[Fault]) -> Fault:
+    """All at once."""
+    if len(faults) == 1:
+        return faults[0]
+
+    def each(name: str) -> Callable:
+        def call(*arguments):
+            for fault in faults:
+                getattr(fault, name)(*arguments)
+
+        return call
+
+    def bus(frames, time_s):
+        for fault in faults:
+            frames = fault.bus(frames, time_s)
+        return frames
+
+    return Fault(
+        size=" + ".join(fault.size for fault in faults),
+        onset_s=min(fault.onset_s for fault in faults),
+        brake=each("brake"),
+        pads_mm=next((fault.pads_mm for fault in faults if fault.pads_mm), None),
+        car=each("car"),
+        bus=bus,
+        effects={name: values for fault in faults for name, values in fault.effects.items()},
+        ambient_C=min(fault.ambient_C for fault in faults),
+        warm_C=next((fault.warm_C for fault in faults if fault.warm_C), None),
+        power_on_s=max(fault.power_on_s for fault in faults),
+        restarts=tuple(restart for fault in faults for restart in fault.restarts),
+        latched_N=max(fault.latched_N for fault in faults),
+    )
+
+
+class _Daemon:
+    """The daemon's own pipeline with adaptation, as often restarted as it takes; what it learned stays in its folder."""
+
+    def __init__(self, calibration, folder: Path):
+        self._calibration, self._folder = calibration, folder
+        self.start()
+
+    def start(self) -> None:
+        parameters = np.zeros(4, PARAMETERS)
+        parameters[0] = to_parameters(self._calibration)
+        adaptation = Adaptation({"FL": self._calibration}, Memory(self._folder), lambda _: "2000-01-01T00:00:00+00:00")
+        self._pipeline, self._begun = Pipeline(parameters, ("FL",), adaptation=adaptation), False
+
+    def answer(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """ESTIMATE rows and sent frames, valid until the next call."""
+        if not self._begun and len(frames):
+            self._pipeline.begin(int(frames["time_ns"][0]))
+            self._begun = True
+        _, count = self._pipeline.consume(frames)
+        return self._pipeline.estimates[:count], self._pipeline.broadcast(count)
+
+
+@cache
+def _calibration():
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
+    """Drive number ``number`` with faults of these families: (fault, moments, ESTIMATE rows, true force at each, N)."""
+    rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
+    calibration = _calibration()
+    # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
+    drive_seed = int(rng.integers(1 << 32))
+    plain = plant_from_calibration(calibration)
+    moments = draw_drive(plain, np.random.default_rng(drive_seed), 1e4 if "start_latched" in names else 0.0)[1]
+    fault = _joined([FAMILIES[name](rng, moments) for name in names])
+    if fault.effects:
+        calibration = msgspec.convert(
+            msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | fault.effects}, type(calibration)
+        )
+    plant = plant_from_calibration(calibration, int(rng.integers(1 << 32)), pad_thickness_mm=fault.pads_mm)
+    for name in ("current_noise", "speed_noise", "angle_noise", "temperature_noise"):
+        plant[name] *= rng.uniform(0.8, 1.2)
+    fault.brake(plant)
+    schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N)
+    schedule.drives["ambient"] = fault.ambient_C
+    car = Car(np.atleast_1d(plant), seed=int(rng.integers(1 << 32)), ambient=fault.ambient_C)
+    if fault.warm_C:
+        disc, plate, remembered = fault.warm_C
+        car.states["softening_memory"] = remembered * (0.5 * (disc + plate) - plant["curve_temperature"])
+        car.states["disc"] = disc
+        car.states["pads"][:] = np.linspace(disc, plate, car.states["pads"].shape[-1])
+        for name in ("plate", "plate_reading", "caliper"):
+            car.states[name] = plate
+    commands = sc.commands_of(schedule, ("FL",))
+    silences = [(0.0, fault.power_on_s)] + [(at, at + off) for at, off in fault.restarts]
+    restarts = sorted(at + off for at, off in fault.restarts)
+    # Predictions can make more rows than there are cycles.
+    force_N, estimates, count = np.zeros(len(schedule)), np.zeros(2 * len(schedule), ESTIMATE), 0
+    with tempfile.TemporaryDirectory() as folder:
+        daemon = _Daemon(calibration, Path(folder))
+        for first in range(0, len(schedule), _STRETCH):
+            time_s = first * CYCLE_S
+            fault.car(car, time_s)
+            frames, truth = car.run(commands[first : first + _STRETCH], schedule.drives[first : first + _STRETCH])
+            force_N[first : first + len(truth)] = truth["force"][:, 0]
+            if restarts and time_s >= restarts[0]:
+                restarts.pop(0)
+                daemon.start()
+            if any(begin <= time_s < end for begin, end in silences):
+                continue
+            answers, sent = daemon.answer(fault.bus(frames, time_s))
+            car.hear(sent)
+            estimates[count : count + len(answers)] = answers
+            count += len(answers)
+    estimates = estimates[:count]
+    row = np.clip(np.rint(estimates["time_ns"] / (1e9 * CYCLE_S)).astype(int) - 1, 0, len(force_N) - 1)
+    return fault, moments, estimates, force_N[row]
+
+
+def judged(names: tuple[str, ...], number: int, seed: int) -> dict:
+    """Verdict of one drive."""
+    fault, moments, estimates, force_N = drive(names, number, seed)
+    time_s = 1e-9 * estimates["time_ns"]
+    begin = max(fault.power_on_s, 0.0)
+    onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, begin), *fault.restarts)))
+    park, after = moments["park"], moments["after"]
+    parked = [(moments[name], moments[name] + _PARK_S) for name in ("park_0", "park") if name in moments]
+    training = np.any([(time_s >= since) & (time_s < until) for since, until in parked], axis=0)
+    spans = {
+        "before": ~training & (time_s < min(fault.onset_s, park)),
+        "during": ~training & (time_s >= fault.onset_s) & (time_s < park),
+        "training": training,
+        "after": time_s >= after,
+    }
+    phases = []
+    for phase, rows in spans.items():
+        if rows.sum() * CYCLE_S < _SHORTEST_S:
+            continue
+        useful = rmse_N = None
+        if NOMINAL.issuperset(names) and phase != "training":
+            useful = NOMINAL_USEFUL
+        elif LEARNED.issuperset(names) and phase == "after" and fault.onset_s < park - _LEARNING_S:
+            useful, rmse_N = LEARNED_USEFUL, LEARNED_RMSE_N
+        phases.append(judge(phase, time_s[rows], estimates[rows], force_N[rows], useful, rmse_N))
+    return {
+        "family": " + ".join(names),
+        "number": number,
+        "size": fault.size,
+        "onset_s": fault.onset_s,
+        "trained": int((np.diff((estimates["adapt_result"] == RESULT_ACCEPTED).astype(int)) > 0).sum()),
+        "first_flag_s": first_flag_s(time_s, estimates, onset),
+        "phases": [phase.as_dict() for phase in phases],
+    }
+
+
+def pairs_of(count: int, seed: int, names: list[str]) -> list[tuple[str, str]]:
+    """Pairs of families, drawn."""
+    rng = np.random.default_rng([seed, 2])
+    candidates = [name for name in names if name not in NOMINAL]
+    pairs: list[tuple[str, str]] = []
+    while len(pairs) < count:
+        one, other = rng.choice(candidates, 2, replace=False)
+        if not {one, other} <= _STARTS:
+            pairs.append((str(one), str(other)))
+    return pairs
+
+
+def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, processes: int):
+    """Verdicts of (families, number) in turn, as they come."""
+    if processes == 1:
+        yield from (judged(names, number, seed) for names, number in tasks)
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(judged, *zip(*tasks, strict=True), [seed] * len(tasks), chunksize=4)

@@ -1,0 +1,146 @@
+"""The judge of the study of silent errors: each promise is kept by an honest estimate and broken by a lie of its own kind."""
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.estimator.records import ADAPTING, DEGRADED, ESTIMATE, FAULT, FUSED, INVALID, RUNNING, STIFFNESS_ONLY
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import rest, simulate_log
+from emb_daemon.resources import resource
+from emb_daemon.wire import layout as wire
+from emb_daemon.wire.e2e import crc
+from emb_daemon.wire.layout import default_layout, unpack
+from studies.faults import FAMILIES, _altered, _lost
+from studies.grid import draw_drive, drive
+from studies.phases import first_flag_s, judge
+
+TIME_S = 0.004 * np.arange(5000)
+FORCE_N = 5000.0 + 4000.0 * np.sin(TIME_S)
+
+
+@pytest.fixture
+def honest():
+    """Running, fused, 30 N of sigma, and errors of that size."""
+    rows = np.zeros(len(TIME_S), ESTIMATE)
+    rows["mode"], rows["source"], rows["sigma"] = RUNNING, FUSED, 30.0
+    rows["force"] = FORCE_N + 30.0 * np.random.default_rng(0).standard_normal(len(rows))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return plant_from_calibration(load_calibration(resource("config/calibration.yaml")))
+
+
+@pytest.fixture
+def frames(plant):
+    return simulate_log(plant, rest(0.1))[0]
+
+
+def failed(rows, **promised):
+    return judge("all", TIME_S, rows, FORCE_N, **promised).failed
+
+
+def test_an_honest_estimate_keeps_every_promise(honest):
+    assert failed(honest, useful=0.99, rmse_N=35.0) == ()
+
+
+def test_errors_beyond_three_sigma_in_over_a_hundredth_of_silent_samples(honest):
+    honest["force"][:60] += 300.0
+    assert failed(honest) == ("silent beyond 3 sigma",)
+    honest["mode"][:60] = ADAPTING
+    assert failed(honest) == ("silent beyond 3 sigma",)
+    honest["mode"][:60] = DEGRADED
+    assert failed(honest) == ()
+
+
+def test_flagged_errors_may_be_two_hundredths_of_usable_samples(honest):
+    honest["force"][:110], honest["mode"][:110] = 0.0, DEGRADED
+    assert failed(honest) == ("usable beyond 3 sigma",)
+    honest["source"][:110] = INVALID
+    assert failed(honest) == ()
+
+
+@pytest.mark.parametrize("rows", [[100, 1000, 2000], slice(100, 130)], ids=["often", "long"])
+def test_a_kilonewton_of_silent_error_often_or_for_long(honest, rows):
+    honest["force"][rows] += 1500.0
+    honest["sigma"][rows] = 600.0
+    assert failed(honest) == ("silent beyond 1 kN",)
+    honest["force"][rows] -= 600.0
+    assert failed(honest) == ()
+
+
+def test_two_large_errors_in_five_thousand_are_pardoned(honest):
+    honest["force"][[100, 3000]] += 1500.0
+    assert failed(honest) == ()
+
+
+def test_what_is_no_number_is_beyond_every_limit(honest):
+    honest["force"][:100] = np.nan
+    assert "silent beyond 1 kN" in failed(honest)
+
+
+def test_a_fat_sigma_and_a_flag_are_no_answer(honest):
+    honest["sigma"][:60] = 301.0
+    assert failed(honest, useful=0.99) == ("useful",)
+    honest["sigma"], honest["mode"][:60] = 30.0, DEGRADED
+    assert failed(honest, useful=0.99) == ("useful",)
+    assert failed(honest, useful=0.90) == ()
+
+
+def test_an_error_that_stays_after_learning(honest):
+    honest["force"] += 100.0
+    honest["sigma"] = 100.0
+    assert failed(honest, rmse_N=100.0) == ("rmse",)
+
+
+def test_samples_without_reference_are_not_judged(honest):
+    reference = np.where(TIME_S < 10.0, FORCE_N, np.nan)
+    honest["force"][TIME_S >= 10.0] = 0.0
+    assert judge("all", TIME_S, honest, reference).failed == ()
+
+
+@pytest.mark.parametrize("told", [("mode", FAULT), ("source", STIFFNESS_ONLY), ("reasons", 1)], ids=lambda told: told[0])
+def test_the_first_flag_is_the_first_after_the_onset(honest, told):
+    field, value = told
+    honest[field][100], honest[field][2000] = value, value
+    assert first_flag_s(TIME_S, honest, 2.0) == pytest.approx(8.0 - 2.0)
+    assert np.isnan(first_flag_s(TIME_S, honest, 9.0))
+
+
+def test_a_changed_signal_leaves_the_frame_whole(frames):
+    """Counter, CRC and the frame's other signals stay right: the daemon cannot tell the change from a sensor's."""
+    before = frames.copy()
+    bus = _altered(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + 3.0)
+    after = bus(frames, 0.0)
+    rows, signals = before["can_id"] == 0x100, default_layout()[0]["received"][wire.RESOLVER]
+    assert rows.any()
+    assert np.array_equal(before[~rows], after[~rows])
+    for old, new in zip(before[rows], after[rows], strict=True):
+        assert unpack(new["data"], signals[wire.MOTOR_ANGLE]) - unpack(
+            old["data"], signals[wire.MOTOR_ANGLE]
+        ) == pytest.approx(3.0)
+        assert unpack(new["data"], signals[wire.MOTOR_SPEED]) == unpack(old["data"], signals[wire.MOTOR_SPEED])
+        assert crc(0x100, new["data"]) == int(new["data"]) & 0xFF
+        assert (int(new["data"]) ^ int(old["data"])) & 0xFF00 == 0
+
+
+def test_a_lost_message_is_lost_alone(frames):
+    left = _lost(wire.CURRENT)(frames, 0.0)
+    assert set(np.unique(frames["can_id"])) - set(np.unique(left["can_id"])) == {0x110}
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+def test_every_family_draws_a_fault_within_the_drive(plant, name):
+    moments = draw_drive(plant, np.random.default_rng(1))[1]
+    for seed in range(5):
+        fault = FAMILIES[name](np.random.default_rng(seed), moments)
+        assert 0.0 <= fault.onset_s <= moments["park"]
+
+
+def test_a_drive_comes_back_from_its_seed():
+    one, other = drive(("contact_jump",), 0, 7), drive(("contact_jump",), 0, 7)
+    assert one[0].size == other[0].size
+    assert np.array_equal(one[2]["force"], other[2]["force"])
+    assert np.array_equal(one[3], other[3])
