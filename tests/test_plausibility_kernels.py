@@ -12,7 +12,7 @@ from emb_daemon.models.plausibility import (
     TORQUE_WRONG,
     UNDECIDED,
     beyond_friction,
-    count_doubt,
+    count_contradiction,
     force_of_torque_alone,
     frozen,
     watch,
@@ -46,10 +46,10 @@ class Watched:
 def test_doubt_gives_away_twenty_a_sample_and_counts_at_most_twelve_sigma():
     c = np.zeros(1, PLAUSIBILITY)
     for ratio, expected in ((5.0, 5.0), (2.0, 0.0), (-5.0, 5.0), (100.0, 129.0), (np.nan, 129.0), (0.0, 109.0)):
-        count_doubt(c[0], ratio)
+        count_contradiction(c[0], ratio)
         assert c["doubt"][0] == expected
     for _ in range(100):
-        count_doubt(c[0], 12.0)
+        count_contradiction(c[0], 12.0)
     assert c["doubt"][0] == 1.5 * 5.0 * 600.0
 
 

@@ -19,7 +19,18 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
-from emb_daemon.estimator.records import INVALID, PATHS_DISAGREE, STIFFNESS_ONLY, STUCK, TORQUE_ONLY
+from emb_daemon.estimator.status import (
+    CONTACT_LOST,
+    CONTACT_UNKNOWN,
+    CURRENT_IMPLAUSIBLE,
+    JUMP_SUSPECTED,
+    MODEL_ERROR,
+    NO_SOURCE,
+    OFFSET_LARGE,
+    PATHS_CONTRADICT,
+    RESOLVER_IMPLAUSIBLE,
+    TORQUE_OLD,
+)
 from emb_daemon.jit import njit
 from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, set_walks, torque_offset
 from emb_daemon.models.fusion import (
@@ -43,10 +54,13 @@ from emb_daemon.models.plausibility import (
     TORQUE_FROZEN,
     UNDECIDED,
     beyond_friction,
-    count_doubt,
+    count_contradiction,
     force_of_torque_alone,
 )
 
+#: Motor torque over what the calibration's torque constant makes of the current, at least; and age of the torque path's last
+#: word, s, from which the force rests on stiffness alone.
+_LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Part of a sample by which current and angle may be apart in time.
 _LATE = 0.3
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
@@ -81,7 +95,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     factor = s.factor * s.scale
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
-    softening = p.thermal.softening * hypot(s.temperature_doubt, p.thermal.sigma) + p.thermal.softening_history * s.history_doubt
+    softening = p.thermal.softening * hypot(s.temperature_sigma, p.thermal.sigma) + p.thermal.softening_history * s.history_sigma
     relative = (p.stiffness_relative_sigma + softening) * s.force
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
@@ -155,36 +169,47 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 
 @njit
 def take_sides(s, p, m, out):
-    """Where the paths contradict each other, go on with the one that can be right; returns the reasons."""
-    c, x = s.plausibility, s.error
+    """Where the paths contradict each other, go on with the one that can be right; returns the facts."""
+    c, x, facts = s.plausibility, s.error, 0
     gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
-    motor_torque = p.torque_constant * m.current_q * max(gain, 0.3) - x[OFFSET]
+    motor_torque = p.torque_constant * m.current_q * max(gain, _LEAST_GAIN) - x[OFFSET]
     load, coulomb = max(p.load_friction + x[LOAD], 0.0), max(p.offset_friction + x[COULOMB], 0.0)
     force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, load, coulomb)
+    sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / p.gear_gain)
     if np.isfinite(out.innovation):
         torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
-        doubt = p.gear_gain * sqrt(out.stiffness_sigma * out.stiffness_sigma + out.torque_sigma * out.torque_sigma)
-        beyond = beyond_friction(torque, s.force, doubt, p.gear_gain, load, coulomb)
-        count_doubt(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+        spread = p.gear_gain * hypot(out.stiffness_sigma, out.torque_sigma)
+        beyond = beyond_friction(torque, s.force, spread, p.gear_gain, load, coulomb)
+        count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    if s.torque_age >= _OLD_S:
+        facts |= TORQUE_OLD
+    if suspected(s):
+        facts |= JUMP_SUSPECTED
+    if abs(x[OFFSET]) > 3.0 * torque_offset(p):
+        facts |= OFFSET_LARGE
     if s.unknown:
         # A latched brake needs no current: the torque then says that nothing is known.
         latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
-        c.doubt = 0.0
-        out.force, out.sigma = force, sqrt(sigma * sigma + s.covariance[OFFSET, OFFSET] / (p.gear_gain * p.gear_gain) + latched * latched)
-        out.source = TORQUE_ONLY if m.has_current else INVALID
-        return 0
+        c.contradiction = 0.0
+        out.force, out.sigma = force, hypot(sigma, latched)
+        return facts | CONTACT_UNKNOWN | (0 if m.has_current else NO_SOURCE)
     if s.contact.lost:
         # The contact angle was found wrong and explains what came before.
-        c.doubt = 0.0
-    if c.verdict == AGREE:
-        error = model_error(s.consistency) if out.force > 0.0 else 0.0
+        c.contradiction = 0.0
+        facts |= CONTACT_LOST
+    error = model_error(s.consistency) if out.force > 0.0 else 0.0
+    if error > 0.0:
         out.sigma = hypot(out.sigma, min(error, out.force))
-        return PATHS_DISAGREE if error > 0.0 or suspected(s) or abs(s.error[OFFSET]) > 3.0 * torque_offset(p) else 0
-    out.source = STIFFNESS_ONLY
+        facts |= MODEL_ERROR
     if c.verdict == STIFFNESS_WRONG:
-        out.source = TORQUE_ONLY if m.has_current else INVALID
-        out.force, out.sigma = force, sqrt(sigma * sigma + s.covariance[OFFSET, OFFSET] / (p.gear_gain * p.gear_gain))
-        return PATHS_DISAGREE | STUCK
+        out.force, out.sigma = force, sigma
+        return facts | RESOLVER_IMPLAUSIBLE | (0 if m.has_current else NO_SOURCE)
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
-        out.sigma = sqrt(out.sigma * out.sigma + out.innovation * out.innovation)
-    return PATHS_DISAGREE | STUCK if c.verdict == TORQUE_FROZEN else PATHS_DISAGREE
+        out.sigma = hypot(out.sigma, out.innovation)
+    if c.verdict == TORQUE_FROZEN:
+        facts |= CURRENT_IMPLAUSIBLE
+    elif c.verdict != AGREE:
+        facts |= PATHS_CONTRADICT
+    elif s.contact.lost and out.stiffness_sigma > out.torque_sigma:
+        out.force, out.sigma = force, sigma
+    return facts

@@ -34,7 +34,7 @@ def _start_heat(s, t, m):
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
     s.ambient = s.disc
-    s.temperature_doubt = s.history_doubt = abs(s.disc - m.caliper)
+    s.temperature_sigma = s.history_sigma = abs(s.disc - m.caliper)
     _tell_temperatures(s, t)
     s.plate[0], s.plate[1] = m.inner_backplate, m.outer_backplate
     s.plate_mean[:] = s.mean
@@ -69,12 +69,12 @@ def _watch_plates(s, t, m, dt):
         else:
             s.unanswered[side], s.plate_mean[side] = 0.0, s.mean[side]
         if step > _JUMP_K:
-            s.temperature_doubt = max(s.temperature_doubt, step)
+            s.temperature_sigma = max(s.temperature_sigma, step)
         stuck = stuck or abs(s.unanswered[side]) > _SHOWN_K * conducting
         s.plate[side] = reading
     s.plate_stuck = stuck
     if stuck:
-        s.temperature_doubt = max(s.temperature_doubt, _SHOWN_K)
+        s.temperature_sigma = max(s.temperature_sigma, _SHOWN_K)
 
 
 @njit
@@ -99,8 +99,8 @@ def _flow(s, t, e, m):
     s.history = forgotten * s.history + (1.0 - forgotten) * rise
     s.factor = stiffness_factor(t, rise, s.history)
     # A wrong start dies out as the disc, which stores most of it, cools.
-    s.temperature_doubt *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed) / t.disc_heat_capacity)
-    s.history_doubt *= forgotten
+    s.temperature_sigma *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed) / t.disc_heat_capacity)
+    s.history_sigma *= forgotten
     s.heat_time = s.heat_energy = s.heat_travel = 0.0
 
 
@@ -136,7 +136,7 @@ def heat(s, p, m):
     if touching and speed_sigma > 0.0:
         # What cannot be seen to heat may have heated all the same.
         unseen = friction_power(t, s.fused, speed_sigma, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
-        s.temperature_doubt += unseen * m.dt / t.disc_heat_capacity
+        s.temperature_sigma += unseen * m.dt / t.disc_heat_capacity
     if s.heat_time >= _HEAT_STEP_S:
         _flow(s, t, p.effects, m)
 

@@ -5,6 +5,7 @@ import numpy as np
 from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
 from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
+from emb_daemon.estimator.monitor import MONITOR
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
@@ -197,6 +198,7 @@ STATE = np.dtype(
         ("housing", "f8"),
         ("consistency", CONSISTENCY),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
+        ("monitor", MONITOR),
         ("wheel", WHEEL),
         ("heat_time", "f8"),
         ("heat_energy", "f8"),
@@ -212,8 +214,8 @@ STATE = np.dtype(
         ("ambient", "f8"),
         ("factor", "f8"),
         # Standard deviations, K, left from a start with hot pads.
-        ("temperature_doubt", "f8"),
-        ("history_doubt", "f8"),
+        ("temperature_sigma", "f8"),
+        ("history_sigma", "f8"),
         ("temperature_known", "?"),
         # Backing plates: last readings, degC, the pads' mean temperatures when they last moved, what these have gained
         # since over time, K s, and whether a reading is stuck.

@@ -13,21 +13,22 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
-from emb_daemon.estimator.records import (
-    CONTACT_UNCERTAIN,
-    FUSED,
-    INIT,
-    INVALID,
-    OUT_OF_RANGE,
-    OUTSIDE_RANGE,
-    PREDICTED,
-    RUNNING,
-    STIFFNESS_ONLY,
-    STUCK,
-    TEMPERATURE_UNCERTAIN,
-    TORQUE_ONLY,
+from emb_daemon.estimator.monitor import bound, contradicts
+from emb_daemon.estimator.records import INIT, INVALID, PREDICTED, RUNNING
+from emb_daemon.estimator.status import (
+    BEYOND_RANGE,
+    BOUND_REACHED,
+    BOUNDS_CONTRADICT,
+    FORCE_UNCERTAIN,
+    NOT_A_NUMBER,
+    TEMPERATURE_VAGUE,
+    TEMPERATURE_UNKNOWN,
+    THERMOCOUPLE_STUCK,
+    WHEEL_CONTRADICTED,
+    ZERO_MOVED,
+    tell_status,
 )
-from emb_daemon.estimator.unknown import set_priors
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, set_priors
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import frozen, watch
@@ -36,8 +37,10 @@ from emb_daemon.models.torque import torque_balance
 
 #: Without a resolver sample for this long the last force is no estimate any more: the brake may have opened and closed, s.
 SILENCE_S = 0.1
-#: Doubt of the pads' temperature, after a start with hot pads, that is reported.
-_DOUBTED_K = 10.0
+#: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
+_TEMPERATURE_UNCERTAIN_K = 10.0
+#: Clamp force over the largest of the calibration that no brake makes.
+_POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
 _UNCERTAIN_RAD = 0.5
 #: Standard deviation of the force, share of the largest, from which it is reported as uncertain.
@@ -99,31 +102,46 @@ def step(s, p, m, out):
         force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
-    out.source = FUSED if s.torque_age < 0.05 else STIFFNESS_ONLY
-    reasons = take_sides(s, p, m, out)
+    facts = take_sides(s, p, m, out)
+    bound(s.monitor, p, m)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
-    s.fused, s.fused_sigma = out.force, out.sigma
     out.contact_angle = s.contact_angle
     out.stiffness_factor = s.factor * s.scale
+    out.engaged = s.contact.engaged
     tell(s, out)
     out.mode = RUNNING
-    if moved_zero:
-        reasons |= OUT_OF_RANGE
-    if not s.temperature_known or s.temperature_doubt > _DOUBTED_K:
-        reasons |= TEMPERATURE_UNCERTAIN
+    tell_status(facts | _look(s, p, m, out) | (ZERO_MOVED if moved_zero else 0), out)
+    s.fused, s.fused_sigma = out.force, out.sigma
+
+
+@njit
+def _look(s, p, m, out):
+    """Facts beside the paths' own; keeps force and sigma within what the brake can do."""
+    facts = 0
+    if not s.temperature_known:
+        facts |= TEMPERATURE_UNKNOWN
+    elif s.temperature_sigma > _TEMPERATURE_UNCERTAIN_K:
+        facts |= TEMPERATURE_VAGUE
     if s.plate_stuck:
-        reasons |= STUCK
-    out.engaged = s.contact.engaged
-    if s.unknown or s.contact.lost or out.contact_sigma > _UNCERTAIN_RAD or out.sigma > _UNCERTAIN * p.maximum_force:
-        reasons |= CONTACT_UNCERTAIN
-        if out.stiffness_sigma > out.torque_sigma and out.source == FUSED and not s.unknown:
-            out.source = TORQUE_ONLY
+        facts |= THERMOCOUPLE_STUCK
+    if s.wheel.contradicted:
+        facts |= WHEEL_CONTRADICTED
+    if not LEAST_SCALE < s.scale < MOST_SCALE:
+        facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
-        reasons |= OUTSIDE_RANGE
-    out.reasons = reasons
-    if not (np.isfinite(out.force) and np.isfinite(out.sigma)):
-        out.source = INVALID
+        facts |= BEYOND_RANGE
+    if contradicts(s.monitor, out.force, out.sigma, m.dt):
+        facts |= BOUNDS_CONTRADICT
+        low, high = s.monitor.low, s.monitor.high
+        out.force, out.sigma = 0.5 * (low + high), max(0.5 * (high - low), out.sigma)
+    if not (np.isfinite(out.force) and np.isfinite(out.sigma)) or out.force > _POSSIBLE * p.maximum_force:
+        facts |= NOT_A_NUMBER
+        out.force, out.sigma = 0.0, p.maximum_force
+    out.sigma = min(out.sigma, p.maximum_force)
+    if out.sigma > _UNCERTAIN * p.maximum_force or out.contact_sigma > _UNCERTAIN_RAD:
+        facts |= FORCE_UNCERTAIN
+    return facts
 
 
 @njit

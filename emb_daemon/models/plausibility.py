@@ -18,16 +18,16 @@ import numpy as np
 
 from emb_daemon.jit import njit
 
-#: ``doubt``: summed squares. ``unlike`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
+#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
 #: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood.
 #: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed.
 PLAUSIBILITY = np.dtype(
     [
-        ("doubt", "f8"),
+        ("contradiction", "f8"),
         ("verdict", "i8"),
-        ("unlike", "f8"),
+        ("apart", "f8"),
         ("still", "i8"),
         ("idle", "i8"),
         ("alike", "i8"),
@@ -57,7 +57,7 @@ _FLICKERED, _FROZEN = 50, 12
 #: Time constant over which angle and integrated speed are compared (s), and their difference that is a fault (rad) beyond what
 #: a signal delay of 10 ms makes. A resolver is believed again after this many samples in each of which the angle moved
 #: and went where the speed says within this angle (rad).
-_COMPARED_S, _UNLIKE_RAD, _DELAY_S = 0.1, 0.6, 0.01
+_COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
 _STICTION = 0.3
@@ -69,7 +69,7 @@ _AVERAGED_S = 0.04
 
 @njit
 def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
-    """Judge one sample that came within a cycle of the last, before it is fused; ``c.doubt`` is that of the samples before.
+    """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is that of the samples before.
 
     Args:
         c: PLAUSIBILITY record.
@@ -84,7 +84,7 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
     travel = m.angle - angle_before
     step = travel - 0.5 * (m.speed + speed_before) * m.dt
     delay = _DELAY_S * abs(m.speed)
-    c.unlike = c.unlike * exp(-m.dt / _COMPARED_S) + step
+    c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
     if abs(step) > _ALIKE_RAD + delay:
         c.alike = 0
     elif travel != 0.0:
@@ -98,16 +98,16 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
         c.frozen_s += m.dt
         if c.alike >= _RETURNED:
             # What was summed against the resolver is not held against the current.
-            c.doubt = c.unlike = c.frozen_s = 0.0
+            c.contradiction = c.apart = c.frozen_s = 0.0
             c.verdict = AGREE
         return c.verdict
     patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
-    disagree = c.doubt > (patience * _RAISE if was == AGREE else _CLEAR)
+    disagree = c.contradiction > (patience * _RAISE if was == AGREE else _CLEAR)
     if travel == 0.0 and m.speed != speed_before:
         c.flickered += 1
     repeated = c.still >= (_FROZEN if c.flickered >= _FLICKERED else _NEVER_REPEATED)
     repeated = repeated and (m.speed != 0.0 or c.flickered >= _FLICKERED)
-    if repeated or abs(c.unlike) > _UNLIKE_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
+    if repeated or abs(c.apart) > _APART_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
         c.verdict = STIFFNESS_WRONG
         c.frozen_s = c.still * m.dt
         c.alike = 0
@@ -138,10 +138,10 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 
 @njit
-def count_doubt(c, ratio):
-    """Add one contradiction, in standard deviations, to the doubt; NaN says nothing."""
+def count_contradiction(c, ratio):
+    """Add one contradiction, in standard deviations, to the sum; NaN says nothing."""
     if np.isfinite(ratio):
-        c.doubt = min(max(c.doubt + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 1.5 * _UNCONFIRMED * _RAISE)
+        c.contradiction = min(max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 1.5 * _UNCONFIRMED * _RAISE)
 
 
 @njit

@@ -1,0 +1,69 @@
+"""An independent monitor: bounds on the clamp force from motor current and direction of motion alone.
+
+It shares no state and nothing learned with the filter, and of the calibration it takes what a datasheet states: torque constant,
+gear, friction, largest force. Each is allowed to be wrong by the bounds below. Over torque smoothed for `SMOOTHED_S`, less what
+accelerates the motor,
+
+    lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
+
+where friction counts against the motion if the motor turns and either way if it stands. A force that stays outside for
+`TOLERATED_S` is contradicted. A latched brake needs no current, so with the park brake on there is no upper bound.
+"""
+
+from math import exp
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+#: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
+#: outside, s: a whole stroke of acceleration and braking.
+SMOOTHED_S, TOLERATED_S = 0.1, 0.4
+#: Motor torque per current over the datasheet's: magnets of a motor at its limit lose a third, tolerance adds 5 %.
+LEAST_GAIN, MOST_GAIN = 0.6, 1.1
+#: Friction over the calibration's: a dry or worn gear.
+MOST_FRICTION = 2.0
+#: Offset of the current sensor as torque, share of what the largest force needs.
+OFFSET_SHARE = 0.05
+#: Gear gain that must be left over friction for a torque to bound the force from above: below it the gear holds by itself.
+_NOT_LOCKED = 0.2
+#: Motor speed from which the motor turns, rad/s.
+_TURNING_RAD_PER_S = 2.0
+
+MONITOR = np.dtype(
+    [("started", "?"), ("torque", "f8"), ("speed", "f8"), ("low", "f8"), ("high", "f8"), ("outside_s", "f8")], align=True
+)
+
+
+@njit
+def bound(w, p, m):
+    """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``."""
+    if not m.has_current:
+        w.started, w.low, w.high = False, 0.0, p.maximum_force
+        return
+    accelerating = p.inertia * (m.speed - w.speed) / m.dt if w.started and m.dt > 0.0 else 0.0
+    share = 1.0 - exp(-m.dt / SMOOTHED_S) if w.started else 1.0
+    w.torque += share * (p.torque_constant * m.current_q - accelerating - w.torque)
+    w.speed, w.started = m.speed, True
+    offset = OFFSET_SHARE * p.gear_gain * p.maximum_force
+    dry, load = MOST_FRICTION * p.offset_friction, MOST_FRICTION * p.load_friction
+    least, most = (LEAST_GAIN, MOST_GAIN) if w.torque > 0.0 else (MOST_GAIN, LEAST_GAIN)
+    # Friction holds the force up unless the motor closes, and takes torque unless it opens.
+    closing, opening = m.speed > _TURNING_RAD_PER_S, m.speed < -_TURNING_RAD_PER_S
+    taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
+    held, held_by_load = (0.0, 0.0) if closing else (dry, load)
+    w.low = max((least * w.torque - offset - taken) / (p.gear_gain + taken_by_load), 0.0)
+    leverage = p.gear_gain - held_by_load
+    latched = not m.has_status or m.park_brake != 0.0
+    w.high = p.maximum_force
+    if not latched and leverage > _NOT_LOCKED * p.gear_gain:
+        w.high = min(max((most * w.torque + offset + held) / leverage, 0.0), p.maximum_force)
+    w.low = min(w.low, w.high)
+
+
+@njit
+def contradicts(w, force, sigma, dt):
+    """Whether ``force`` (N) has lain outside the bounds by more than three of its ``sigma`` for longer than tolerated."""
+    outside = force > w.high + 3.0 * sigma or force < w.low - 3.0 * sigma
+    w.outside_s = w.outside_s + dt if outside else 0.0
+    return w.outside_s > TOLERATED_S

@@ -1,0 +1,81 @@
+"""What the estimator says of itself: one table of named facts, from which reasons, source, and with them mode and Status follow.
+
+docs/safety.md's table is generated from `TABLE`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_daemon.estimator.records import (
+    CONTACT_UNCERTAIN,
+    FUSED,
+    INVALID,
+    OUT_OF_RANGE,
+    OUTSIDE_RANGE,
+    PATHS_DISAGREE,
+    STIFFNESS_ONLY,
+    STUCK,
+    TEMPERATURE_UNCERTAIN,
+    TORQUE_ONLY,
+)
+from emb_daemon.jit import njit
+
+
+class Fact(NamedTuple):
+    """Something true of one estimate: the sentence that says it, the reasons it gives, and the source that is left."""
+
+    sentence: str
+    reasons: int
+    source: int
+
+
+TABLE = {
+    "zero_moved": Fact("the motor angle jumped as no motor can", OUT_OF_RANGE, FUSED),
+    "resolver_implausible": Fact("the resolver is frozen, or angle and speed contradict each other", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
+    "current_implausible": Fact("the current is frozen while the motor must turn", PATHS_DISAGREE | STUCK, STIFFNESS_ONLY),
+    "paths_contradict": Fact("the paths contradict each other and nothing tells which is wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
+    "torque_old": Fact("the torque path has said nothing for a while", 0, STIFFNESS_ONLY),
+    "jump_suspected": Fact("contact, stiffness, friction or current may have changed at once", PATHS_DISAGREE, FUSED),
+    "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
+    "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
+    "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
+    "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
+    "force_uncertain": Fact("the force is known to no better than a hundredth of the largest", CONTACT_UNCERTAIN, FUSED),
+    "temperature_unknown": Fact("pad temperatures are unknown", TEMPERATURE_UNCERTAIN, FUSED),
+    "temperature_uncertain": Fact("pad temperatures are known to no better than 10 K", TEMPERATURE_UNCERTAIN, FUSED),
+    "thermocouple_stuck": Fact("a backing plate's temperature does not follow its pad", STUCK, FUSED),
+    "wheel_contradicted": Fact("the wheel speed is zero while wheel pulses or the vehicle move", OUT_OF_RANGE, FUSED),
+    "bounds_contradict": Fact("the independent monitor rules the force out", PATHS_DISAGREE, TORQUE_ONLY),
+    "bound_reached": Fact("a learned value is at the bound of what is physical", OUTSIDE_RANGE, FUSED),
+    "beyond_range": Fact("force or motor speed is beyond what the calibration covers", OUTSIDE_RANGE, FUSED),
+    "no_source": Fact("neither path can be used", PATHS_DISAGREE, INVALID),
+    "not_a_number": Fact("an input or the estimate is no number or beyond what the brake can do", OUTSIDE_RANGE, INVALID),
+}  # fmt: skip
+
+#: Bit of each fact.
+(
+    ZERO_MOVED, RESOLVER_IMPLAUSIBLE, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
+    CONTACT_UNKNOWN, CONTACT_LOST, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK,
+    WHEEL_CONTRADICTED, BOUNDS_CONTRADICT, BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
+) = (1 << bit for bit in range(len(TABLE)))  # fmt: skip
+
+_REASONS = np.array([fact.reasons for fact in TABLE.values()])
+_SOURCES = np.array([fact.source for fact in TABLE.values()])
+
+
+@njit
+def tell_status(facts, out):
+    """Reasons and source of an ESTIMATE from its facts: the last fact in the table that leaves less than both paths decides."""
+    out.reasons = 0
+    out.source = FUSED
+    for bit in range(len(_REASONS)):
+        if facts >> bit & 1:
+            out.reasons |= _REASONS[bit]
+            if _SOURCES[bit] != FUSED:
+                out.source = _SOURCES[bit]
+
+
+def names(facts: int) -> tuple[str, ...]:
+    """Names of the facts in a bit mask."""
+    return tuple(name for bit, name in enumerate(TABLE) if facts >> bit & 1)
