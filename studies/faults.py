@@ -84,24 +84,28 @@ def _read(frames, can_id, signal, rows, values):
 
 
 @njit
-def _write(frames, rows, signal, values):
+def _write(frames, rows, signal, values, degraded):
     mask = ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)) << np.uint64(signal.start)
     for index in range(len(rows)):
         frame = frames[rows[index]]
         data = np.uint64(frame.data)
-        counter, status = (data >> np.uint64(8)) & np.uint64(15), (data >> np.uint64(12)) & np.uint64(15)
+        counter = (data >> np.uint64(8)) & np.uint64(15)
+        status = np.uint64(1) if degraded else (data >> np.uint64(12)) & np.uint64(15)
         payload = (data & ~mask & ~np.uint64(0xFFFF)) | pack(values[index], signal)
         frame.data = protect(frame.can_id, payload, counter, status)
 
 
-def _altered(slot: int, column: int, change: Callable) -> Callable:
-    """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right."""
+def _altered(slot: int, column: int, change: Callable, degraded: bool = False) -> Callable:
+    """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right.
+
+    ``degraded``: the sender says so in its status.
+    """
     can_id, signal = _IDS[slot], _LAYOUT["received"][slot, column]
 
     def bus(frames, time_s):
         rows, values = np.zeros(len(frames), np.int64), np.zeros(len(frames))
         count = _read(frames, can_id, signal, rows, values)
-        _write(frames, rows[:count], signal, np.broadcast_to(change(values[:count], time_s), count).astype(float))
+        _write(frames, rows[:count], signal, np.broadcast_to(change(values[:count], time_s), count).astype(float), degraded)
         return frames
 
     return bus
@@ -531,6 +535,14 @@ def current_zero(rng, moments):
 def current_lost(rng, moments):
     at = _clamped(rng, moments) if rng.random() < 0.5 else _driving(rng, moments)
     return Fault("", at, bus=_during(_lost(wire.CURRENT), at))
+
+
+@_family
+def current_degraded(rng, moments):
+    """The current sensor reads wrong and its sender's status says Degraded."""
+    gain, at = float(rng.uniform(0.3, 0.8)), _driving(rng, moments)
+    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
+    return Fault(f"x {gain:.2f}", at, bus=_during(change, at))
 
 
 # Wheel and heat.
