@@ -11,7 +11,7 @@ from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies.faults import FAMILIES, _altered, _lost
+from studies.faults import FAMILIES, _alter, _lose
 from studies.grid import draw_drive, drive
 from studies.phases import first_flag_s, judge
 
@@ -114,7 +114,7 @@ def test_the_first_flag_is_the_first_after_the_onset(honest, told):
 def test_a_changed_signal_leaves_the_frame_whole(frames):
     """Counter, CRC and the frame's other signals stay right: the daemon cannot tell the change from a sensor's."""
     before = frames.copy()
-    bus = _altered(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + 3.0)
+    bus = _alter(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + 3.0)
     after = bus(frames, 0.0)
     rows, signals = before["can_id"] == 0x100, default_layout()[0]["received"][wire.RESOLVER]
     assert rows.any()
@@ -129,7 +129,7 @@ def test_a_changed_signal_leaves_the_frame_whole(frames):
 
 
 def test_a_lost_message_is_lost_alone(frames):
-    left = _lost(wire.CURRENT)(frames, 0.0)
+    left = _lose(wire.CURRENT)(frames, 0.0)
     assert set(np.unique(frames["can_id"])) - set(np.unique(left["can_id"])) == {0x110}
 
 
