@@ -206,6 +206,8 @@ def grid(arguments: argparse.Namespace) -> int:
         pairs = arguments.pairs if arguments.pairs is not None else 0 if arguments.faults else 100
         tasks += [(pair, number) for number, pair in enumerate(pairs_of(pairs, arguments.seed, chosen))]
     begun, reports = time.monotonic(), []
+    if arguments.drives:
+        print(f"  {HEADINGS}")
     for report in run_grid(tasks, arguments.seed, arguments.processes):
         reports.append(report)
         if arguments.drives:

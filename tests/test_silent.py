@@ -97,6 +97,13 @@ def test_an_error_that_stays_after_learning(honest):
     assert failed(honest, rmse_N=100.0) == ("rmse",)
 
 
+def test_the_better_path_is_the_one_that_is_known_and_nearer(honest):
+    honest["stiffness_force"], honest["torque_force"] = FORCE_N + 200.0, FORCE_N - 90.0
+    assert judge("all", TIME_S, honest, FORCE_N).better_path_N == pytest.approx(90.0)
+    honest["torque_force"][:9] = np.nan
+    assert judge("all", TIME_S, honest, FORCE_N).better_path_N == pytest.approx(200.0)
+
+
 def test_samples_without_reference_are_not_judged(honest):
     reference = np.where(TIME_S < 10.0, FORCE_N, np.nan)
     honest["force"][TIME_S >= 10.0] = 0.0
