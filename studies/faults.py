@@ -84,30 +84,34 @@ def _read(frames, can_id, signal, rows, values):
 
 
 @njit
-def _write(frames, rows, signal, values):
+def _write(frames, rows, signal, values, degraded):
     mask = ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)) << np.uint64(signal.start)
     for index in range(len(rows)):
         frame = frames[rows[index]]
         data = np.uint64(frame.data)
-        counter, status = (data >> np.uint64(8)) & np.uint64(15), (data >> np.uint64(12)) & np.uint64(15)
+        counter = (data >> np.uint64(8)) & np.uint64(15)
+        status = np.uint64(1) if degraded else (data >> np.uint64(12)) & np.uint64(15)
         payload = (data & ~mask & ~np.uint64(0xFFFF)) | pack(values[index], signal)
         frame.data = protect(frame.can_id, payload, counter, status)
 
 
-def _altered(slot: int, column: int, change: Callable) -> Callable:
-    """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right."""
+def _alter(slot: int, column: int, change: Callable, degraded: bool = False) -> Callable:
+    """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right.
+
+    ``degraded``: the sender says so in its status.
+    """
     can_id, signal = _IDS[slot], _LAYOUT["received"][slot, column]
 
     def bus(frames, time_s):
         rows, values = np.zeros(len(frames), np.int64), np.zeros(len(frames))
         count = _read(frames, can_id, signal, rows, values)
-        _write(frames, rows[:count], signal, np.broadcast_to(change(values[:count], time_s), count).astype(float))
+        _write(frames, rows[:count], signal, np.broadcast_to(change(values[:count], time_s), count).astype(float), degraded)
         return frames
 
     return bus
 
 
-def _both(*buses: Callable) -> Callable:
+def _chain(*buses: Callable) -> Callable:
     def bus(frames, time_s):
         for one in buses:
             frames = one(frames, time_s)
@@ -120,13 +124,13 @@ def _during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
     return lambda frames, time_s: bus(frames, time_s) if begin_s <= time_s < end_s else frames
 
 
-def _lost(*slots: int) -> Callable:
+def _lose(*slots: int) -> Callable:
     """A bus that loses the messages of some slots."""
     ids = [_IDS[slot] for slot in slots]
     return lambda frames, _: frames[~np.isin(frames["can_id"], ids)]
 
 
-def _held(slot: int, column: int) -> Callable:
+def _hold(slot: int, column: int) -> Callable:
     """A bus on which one signal keeps the first value that it sees."""
     kept = []
 
@@ -135,11 +139,11 @@ def _held(slot: int, column: int) -> Callable:
             kept.append(values[0])
         return kept[0] if kept else values
 
-    return _altered(slot, column, change)
+    return _alter(slot, column, change)
 
 
-def _bits(rng, slot: int, column: int, lsb: float) -> Callable:
-    """As `_held`, moving by a least count up and down."""
+def _toggle(rng, slot: int, column: int, lsb: float) -> Callable:
+    """As `_hold`, moving by a least count up and down."""
     kept = []
 
     def change(values, _):
@@ -147,35 +151,35 @@ def _bits(rng, slot: int, column: int, lsb: float) -> Callable:
             kept.append(values[0])
         return kept[0] + lsb * rng.integers(-1, 2, len(values)) if kept else values
 
-    return _altered(slot, column, change)
+    return _alter(slot, column, change)
 
 
 # Draws.
 
 
-def _size(rng, low: float, high: float) -> float:
+def _draw_size(rng, low: float, high: float) -> float:
     """Log-uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _signed(rng, low: float, high: float) -> float:
-    return _size(rng, low, high) * float(rng.choice((-1.0, 1.0)))
+def _draw_signed(rng, low: float, high: float) -> float:
+    return _draw_size(rng, low, high) * float(rng.choice((-1.0, 1.0)))
 
 
-def _driving(rng, moments) -> float:
+def _pick_driving(rng, moments) -> float:
     """A moment with the brake released, before parking."""
     return float(moments[rng.choice(("go_1", "go_2", "go_3"))] + rng.uniform(0.5, 2.5))
 
 
-def _clamped(rng, moments) -> float:
+def _pick_clamped(rng, moments) -> float:
     """A moment with the brake applied, before parking."""
     return float(moments[rng.choice(("hold_1", "stop_1", "drag_1", "stop_2", "reversals"))] + rng.uniform(0.8, 2.0))
 
 
-def _sometime(rng, moments) -> float:
+def _pick_sometime(rng, moments) -> float:
     """The start, or a moment of driving or braking, or just before the training."""
     choice = rng.integers(4)
-    return (0.0, _driving(rng, moments), _clamped(rng, moments), moments["park"] - 0.5)[choice]
+    return (0.0, _pick_driving(rng, moments), _pick_clamped(rng, moments), moments["park"] - 0.5)[choice]
 
 
 def _once(at_s: float, action: Callable) -> Callable:
@@ -190,14 +194,14 @@ def _once(at_s: float, action: Callable) -> Callable:
     return car
 
 
-def _moved(name: str, by: float) -> Callable:
+def _move(name: str, by: float) -> Callable:
     def action(plants):
         plants[name] += by
 
     return action
 
 
-def _scaled(by: float, *names: str) -> Callable:
+def _scale(by: float, *names: str) -> Callable:
     def action(plants):
         for name in names:
             plants[name] *= by
@@ -248,13 +252,13 @@ def tolerance(rng, moments):
 
 @_family
 def contact_jump(rng, moments):
-    um, at = _signed(rng, 10.0, 150.0), _driving(rng, moments)
-    return Fault(f"{um:+.0f} um", at, car=_once(at, _moved("contact_angle", _rad(um))))
+    um, at = _draw_signed(rng, 10.0, 150.0), _pick_driving(rng, moments)
+    return Fault(f"{um:+.0f} um", at, car=_once(at, _move("contact_angle", _rad(um))))
 
 
 @_family
 def contact_slow(rng, moments):
-    um, at, seconds = _signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
+    um, at, seconds = _draw_signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
     state = [0.0]
 
     def car(car, time_s):
@@ -268,7 +272,7 @@ def contact_slow(rng, moments):
 @_family
 def knock_back(rng, moments):
     """Between stops the contact moves, as cornering and run-out push pads back."""
-    um, times = _size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
+    um, times = _draw_size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
     state = [0, 0.0]
 
     def car(car, time_s):
@@ -282,7 +286,7 @@ def knock_back(rng, moments):
 
 @_family
 def disc_growth(rng, moments):
-    growth = _size(rng, 0.1, 0.5)
+    growth = _draw_size(rng, 0.1, 0.5)
     return Fault(f"{growth:.2f} um/K", brake=_effect("disc_thermal_expansion", growth_um_per_K=growth))
 
 
@@ -295,18 +299,18 @@ def pads_thickness(rng, moments):
 @_family
 def pads_compound(rng, moments):
     factor = float(rng.uniform(0.7, 1.3))
-    return Fault(f"curve x {factor:.2f}", brake=_scaled(factor, "curve"))
+    return Fault(f"curve x {factor:.2f}", brake=_scale(factor, "curve"))
 
 
 @_family
 def wear(rng, moments):
-    wear = _size(rng, 10.0, 200.0)
+    wear = _draw_size(rng, 10.0, 200.0)
     return Fault(f"{wear:.0f} um/MJ", brake=_effect("pad_wear", wear_um_per_MJ=wear))
 
 
 @_family
 def thickness_variation(rng, moments):
-    um = _size(rng, 5.0, 20.0)
+    um = _draw_size(rng, 5.0, 20.0)
     return Fault(f"{um:.0f} um", brake=_effect("disc_thickness_variation", order_1_cosine_um=um, order_2_sine_um=0.3 * um))
 
 
@@ -315,14 +319,14 @@ def thickness_variation(rng, moments):
 
 @_family
 def torque_constant(rng, moments):
-    factor, at = 1.0 + _signed(rng, 0.02, 0.15), _sometime(rng, moments)
-    return Fault(f"x {factor:.3f}", at, car=_once(at, _scaled(factor, "torque_constant")))
+    factor, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
+    return Fault(f"x {factor:.3f}", at, car=_once(at, _scale(factor, "torque_constant")))
 
 
 @_family
 def torque_constant_fade(rng, moments):
     """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
-    heating = _size(rng, 0.5, 3.0)
+    heating = _draw_size(rng, 0.5, 3.0)
 
     def brake(plant):
         plant["magnet_heating"], plant["copper_per_K"] = heating, 0.0039
@@ -334,29 +338,29 @@ def torque_constant_fade(rng, moments):
 
 @_family
 def current_gain(rng, moments):
-    gain, at = 1.0 + _signed(rng, 0.02, 0.15), _sometime(rng, moments)
-    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
+    gain, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
+    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
     return Fault(f"x {gain:.3f}", at, bus=_during(change, at))
 
 
 @_family
 def current_offset(rng, moments):
-    offset = _signed(rng, 0.2, 3.0)
-    return Fault(f"{offset:+.2f} A", bus=_altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
+    offset = _draw_signed(rng, 0.2, 3.0)
+    return Fault(f"{offset:+.2f} A", bus=_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
 
 
 @_family
 def current_offset_later(rng, moments):
-    offset = _signed(rng, 0.2, 3.0)
-    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
-    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
+    offset = _draw_signed(rng, 0.2, 3.0)
+    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
+    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
     return Fault(f"{offset:+.2f} A", at, bus=_during(change, at))
 
 
 @_family
 def current_offset_drift(rng, moments):
-    rate, at = _signed(rng, 0.005, 0.1), moments["go_1"]
-    change = _altered(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
+    rate, at = _draw_signed(rng, 0.005, 0.1), moments["go_1"]
+    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
     return Fault(f"{rate:+.3f} A/s", at, bus=_during(change, at))
 
 
@@ -376,37 +380,37 @@ def angle_late(rng, moments):
 
 @_family
 def friction_scale(rng, moments):
-    factor, at = _size(rng, 0.5, 2.0), _sometime(rng, moments)
-    return Fault(f"x {factor:.2f}", at, car=_once(at, _scaled(factor, "load_friction", "offset_friction")))
+    factor, at = _draw_size(rng, 0.5, 2.0), _pick_sometime(rng, moments)
+    return Fault(f"x {factor:.2f}", at, car=_once(at, _scale(factor, "load_friction", "offset_friction")))
 
 
 @_family
 def cold_grease(rng, moments):
-    ambient, grease, viscous = float(rng.uniform(-30.0, -10.0)), _size(rng, 0.005, 0.03), _size(rng, 1e-5, 1e-4)
+    ambient, grease, viscous = float(rng.uniform(-30.0, -10.0)), _draw_size(rng, 0.005, 0.03), _draw_size(rng, 1e-5, 1e-4)
     action = _effect("cold_grease", per_K=grease, viscous_Nms_per_rad=viscous)
     return Fault(f"{ambient:.0f} degC, {100 * grease:.1f} %/K, {1e6 * viscous:.0f} uNms/rad", brake=action, ambient_C=ambient)
 
 
 @_family
 def stribeck(rng, moments):
-    rise, speed = float(rng.uniform(0.3, 1.0)), _size(rng, 2.0, 15.0)
+    rise, speed = float(rng.uniform(0.3, 1.0)), _draw_size(rng, 2.0, 15.0)
     action = _effect("stribeck_friction", rise=rise, speed_rad_per_s=speed)
     return Fault(f"+{100 * rise:.0f} % below {speed:.0f} rad/s", brake=action)
 
 
 @_family
 def viscous(rng, moments):
-    value = _size(rng, 1e-4, 1e-3)
+    value = _draw_size(rng, 1e-4, 1e-3)
     return Fault(f"{1e6 * value:.0f} uNms/rad", brake=_effect("viscous_friction", viscous_Nms_per_rad=value))
 
 
 @_family
 def gear_wear(rng, moments):
     """A gear that has run in or worn: friction, its presliding and play of another size."""
-    friction, play = float(rng.uniform(0.7, 1.4)), _size(rng, 0.01, 0.15)
+    friction, play = float(rng.uniform(0.7, 1.4)), _draw_size(rng, 0.01, 0.15)
 
     def brake(plant):
-        _scaled(friction, "load_friction", "offset_friction", "presliding_angle")(plant)
+        _scale(friction, "load_friction", "offset_friction", "presliding_angle")(plant)
         plant["effects"]["backlash"]["play_rad"] = play
 
     return Fault(f"friction x {friction:.2f}, play {play:.2f} rad", brake=brake)
@@ -414,24 +418,24 @@ def gear_wear(rng, moments):
 
 @_family
 def friction_asymmetry(rng, moments):
-    share = _signed(rng, 0.05, 0.4)
+    share = _draw_signed(rng, 0.05, 0.4)
     return Fault(f"{100 * share:+.0f} %", brake=_effect("friction_asymmetry", asymmetry=share))
 
 
 # Resolver.
 
 
-def _frozen(rng, moments, speed: Callable) -> Fault:
-    at = _driving(rng, moments) if rng.random() < 0.3 else _clamped(rng, moments)
+def _freeze(rng, moments, speed: Callable) -> Fault:
+    at = _pick_driving(rng, moments) if rng.random() < 0.3 else _pick_clamped(rng, moments)
     end = at + rng.uniform(2.0, 10.0) if rng.random() < 0.5 else np.inf
-    change = _both(_held(wire.RESOLVER, wire.MOTOR_ANGLE), speed)
+    change = _chain(_hold(wire.RESOLVER, wire.MOTOR_ANGLE), speed)
     lasts = f"{end - at:.0f} s" if np.isfinite(end) else "for good"
     return Fault(f"{lasts}", at, bus=_during(change, at, end))
 
 
 @_family
 def resolver_frozen_speed_zero(rng, moments):
-    return _frozen(rng, moments, _altered(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
+    return _freeze(rng, moments, _alter(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
 
 
 @_family
@@ -441,33 +445,33 @@ def resolver_frozen_speed_noise(rng, moments):
     def noise(values, _):
         return 0.35 * rng.standard_normal(len(values))
 
-    return _frozen(rng, moments, _altered(wire.RESOLVER, wire.MOTOR_SPEED, noise))
+    return _freeze(rng, moments, _alter(wire.RESOLVER, wire.MOTOR_SPEED, noise))
 
 
 @_family
 def resolver_frozen_last(rng, moments):
-    return _frozen(rng, moments, _held(wire.RESOLVER, wire.MOTOR_SPEED))
+    return _freeze(rng, moments, _hold(wire.RESOLVER, wire.MOTOR_SPEED))
 
 
 def _angle_fault(size: str, at: float, change: Callable) -> Fault:
-    return Fault(size, at, bus=_during(_altered(wire.RESOLVER, wire.MOTOR_ANGLE, change), at))
+    return Fault(size, at, bus=_during(_alter(wire.RESOLVER, wire.MOTOR_ANGLE, change), at))
 
 
 @_family
 def resolver_jump(rng, moments):
-    jump, at = _signed(rng, 0.2, 20.0), _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    jump, at = _draw_signed(rng, 0.2, 20.0), _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     return _angle_fault(f"{jump:+.2f} rad", at, lambda values, _: values + jump)
 
 
 @_family
 def resolver_drift(rng, moments):
-    rate, at = _signed(rng, 0.01, 0.5), moments["go_1"]
+    rate, at = _draw_signed(rng, 0.01, 0.5), moments["go_1"]
     return _angle_fault(f"{rate:+.3f} rad/s", at, lambda values, time_s: values + rate * (time_s - at))
 
 
 @_family
 def resolver_gain(rng, moments):
-    gain, first = 1.0 + _signed(rng, 0.005, 0.1), []
+    gain, first = 1.0 + _draw_signed(rng, 0.005, 0.1), []
 
     def change(values, _):
         if not first and len(values):
@@ -480,7 +484,7 @@ def resolver_gain(rng, moments):
 @_family
 def resolver_loses_counts(rng, moments):
     """A share of the travel in one direction is not counted."""
-    share, at = _size(rng, 0.001, 0.05), moments["go_1"]
+    share, at = _draw_size(rng, 0.001, 0.05), moments["go_1"]
     state = [np.nan, 0.0]
 
     def change(values, _):
@@ -497,7 +501,7 @@ def resolver_loses_counts(rng, moments):
 @_family
 def resolver_slips(rng, moments):
     """The rotor slips a little whenever the motor starts fast."""
-    slip, at, state = _size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
+    slip, at, state = _draw_size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
 
     def change(values, _):
         if not len(values):
@@ -517,20 +521,28 @@ def resolver_slips(rng, moments):
 
 @_family
 def current_frozen(rng, moments):
-    at = _clamped(rng, moments)
-    return Fault("", at, bus=_during(_held(wire.CURRENT, wire.CURRENT_Q), at))
+    at = _pick_clamped(rng, moments)
+    return Fault("", at, bus=_during(_hold(wire.CURRENT, wire.CURRENT_Q), at))
 
 
 @_family
 def current_zero(rng, moments):
-    at = _clamped(rng, moments) if rng.random() < 0.5 else _driving(rng, moments)
-    return Fault("", at, bus=_during(_altered(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
+    at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
+    return Fault("", at, bus=_during(_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
 
 
 @_family
 def current_lost(rng, moments):
-    at = _clamped(rng, moments) if rng.random() < 0.5 else _driving(rng, moments)
-    return Fault("", at, bus=_during(_lost(wire.CURRENT), at))
+    at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
+    return Fault("", at, bus=_during(_lose(wire.CURRENT), at))
+
+
+@_family
+def current_degraded(rng, moments):
+    """The current sensor reads wrong and its sender's status says Degraded."""
+    gain, at = float(rng.uniform(0.3, 0.8)), _pick_driving(rng, moments)
+    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
+    return Fault(f"x {gain:.2f}", at, bus=_during(change, at))
 
 
 # Wheel and heat.
@@ -539,13 +551,13 @@ def current_lost(rng, moments):
 @_family
 def wheel_speed_lost(rng, moments):
     at = moments["drag_1"] + 1.0
-    return Fault("", at, bus=_during(_lost(wire.WHEEL_SPEED), at))
+    return Fault("", at, bus=_during(_lose(wire.WHEEL_SPEED), at))
 
 
 @_family
 def wheel_speed_zero(rng, moments):
     at = moments["drag_1"] + 1.0
-    return Fault("", at, bus=_during(_altered(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
+    return Fault("", at, bus=_during(_alter(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
 
 
 #: What brake and calibration both have of disc thickness variation where the wheel's phase is the question, um.
@@ -557,40 +569,40 @@ _KNOWN_VARIATION = {"disc_thickness_variation": _VARIATION}
 @_family
 def wheel_pulses_pause(rng, moments):
     at, seconds = moments["go_2"] + 1.0, float(rng.uniform(0.5, 8.0))
-    return Fault(f"{seconds:.1f} s", at, bus=_during(_lost(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
+    return Fault(f"{seconds:.1f} s", at, bus=_during(_lose(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
 
 
 @_family
 def wheel_phase_restart(rng, moments):
     """The daemon restarts on a disc whose thickness variation it knows."""
-    at = _driving(rng, moments)
+    at = _pick_driving(rng, moments)
     return Fault("", at, restarts=((at, 0.5),), effects=_KNOWN_VARIATION)
 
 
 @_family
 def thermocouple_drifts(rng, moments):
-    rate, at, side = _signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
-    change = _altered(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
+    rate, at, side = _draw_signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
+    change = _alter(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
     return Fault(f"{rate:+.1f} K/s", at, bus=_during(change, at))
 
 
 @_family
 def thermocouple_stuck(rng, moments):
     at = moments["go_1"]
-    return Fault("both", at, bus=_during(_both(_held(wire.THERMOCOUPLE, 0), _held(wire.THERMOCOUPLE, 1)), at))
+    return Fault("both", at, bus=_during(_chain(_hold(wire.THERMOCOUPLE, 0), _hold(wire.THERMOCOUPLE, 1)), at))
 
 
 @_family
 def thermocouple_stuck_noise(rng, moments):
     at = moments["go_1"]
-    change = _both(_bits(rng, wire.THERMOCOUPLE, 0, 0.1), _bits(rng, wire.THERMOCOUPLE, 1, 0.1))
+    change = _chain(_toggle(rng, wire.THERMOCOUPLE, 0, 0.1), _toggle(rng, wire.THERMOCOUPLE, 1, 0.1))
     return Fault("both, one least count", at, bus=_during(change, at))
 
 
 @_family
 def thermocouple_lost(rng, moments):
     at = moments["go_1"]
-    return Fault("", at, bus=_during(_lost(wire.THERMOCOUPLE), at))
+    return Fault("", at, bus=_during(_lose(wire.THERMOCOUPLE), at))
 
 
 @_family
@@ -611,7 +623,7 @@ def ambient_cold(rng, moments):
 
 @_family
 def start_clamped(rng, moments):
-    at = _clamped(rng, moments)
+    at = _pick_clamped(rng, moments)
     return Fault(f"at {at:.0f} s", at, power_on_s=at)
 
 
@@ -624,15 +636,15 @@ def start_latched(rng, moments):
 @_family
 def power_cycle(rng, moments):
     """Everything loses power for a second, and the resolver counts from another zero."""
-    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     shift = float(rng.uniform(-100.0, 100.0))
-    car = _once(at - 0.5, _moved("released_angle", shift))
+    car = _once(at - 0.5, _move("released_angle", shift))
     return Fault(f"zero {shift:+.0f} rad", at, car=car, restarts=((at, 1.0),))
 
 
 @_family
 def daemon_restart(rng, moments):
-    at = _driving(rng, moments) if rng.random() < 0.5 else _clamped(rng, moments)
+    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     return Fault("", at, restarts=((at, 0.5),))
 
 
@@ -640,7 +652,7 @@ def daemon_restart(rng, moments):
 def bursts_lost(rng, moments):
     """Bursts of up to 100 ms, of one message or all, about two a second."""
     slots = [(wire.RESOLVER,), (wire.CURRENT,), tuple(_IDS)][rng.integers(3)]
-    share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], _lost(*slots)
+    share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], _lose(*slots)
     return Fault(
         f"{100 * share:.0f} % of {len(slots)} messages", at,
         bus=_during(lambda frames, time_s: drop(frames, time_s) if rng.random() < share else frames, at),

@@ -30,11 +30,13 @@ from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first
 _PARK_S = 34.0
 #: Cycles of a stretch: training ends if the car does not hear the daemon for 25.
 _STRETCH = 20
-#: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet; phases shorter are not judged.
-_POWER_ON_S, _SHORTEST_S = 0.5, 1.0
+#: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
+_POWER_ON_S = 0.5
+#: Phases shorter than this, s, are not judged.
+_SHORTEST_S = 1.0
 #: Time that learning has before the drive's second half, s, for its promises to be asked for.
 _LEARNING_S = 10.0
-#: Two faults of these lists at once are one and the same, or have no common drive.
+#: Of these, two at once have no common drive.
 _STARTS = {"start_clamped", "start_latched", "power_cycle", "daemon_restart", "wheel_phase_restart"}
 
 
@@ -47,7 +49,7 @@ def _reversals(seconds: float, low_N: float, high_N: float, frequency: float = 1
     return schedule
 
 
-def _latched(force_N: float) -> sc.Schedule:
+def _park_on_latch(force_N: float) -> sc.Schedule:
     """Parked, then held by the latch without current, then released."""
     clamp = sc.park(force_N, 6.0).first(4.8)
     hold = sc.rest(10.0)
@@ -65,7 +67,7 @@ def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0)
     # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
     cold = (("park_0", sc.park(between(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
     parts = (
-        ("stand", _latched(latched_N) if latched_N else sc.rest(2.0)),
+        ("stand", _park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
         *cold,
         ("hold_1", sc.stop(between(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
@@ -100,7 +102,7 @@ def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0)
     return schedule, moments | {"after": moments["go_6"], "over": schedule.seconds}
 
 
-def _joined(faults: list[Fault]) -> Fault:
+def _join(faults: list[Fault]) -> Fault:
     """All at once."""
     if len(faults) == 1:
         return faults[0]
@@ -168,7 +170,7 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(calibration)
     moments = draw_drive(plain, np.random.default_rng(drive_seed), 1e4 if "start_latched" in names else 0.0)[1]
-    fault = _joined([FAMILIES[name](rng, moments) for name in names])
+    fault = _join([FAMILIES[name](rng, moments) for name in names])
     if fault.effects:
         calibration = msgspec.convert(
             msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | fault.effects}, type(calibration)
@@ -213,19 +215,19 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
     return fault, moments, estimates, force_N[row]
 
 
-def judged(names: tuple[str, ...], number: int, seed: int) -> dict:
+def judge_drive(names: tuple[str, ...], number: int, seed: int) -> dict:
     """Verdict of one drive."""
     fault, moments, estimates, force_N = drive(names, number, seed)
     time_s = 1e-9 * estimates["time_ns"]
-    begin = max(fault.power_on_s, 0.0)
-    onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, begin), *fault.restarts)))
+    onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, fault.power_on_s), *fault.restarts)))
     park, after = moments["park"], moments["after"]
     parked = [(moments[name], moments[name] + _PARK_S) for name in ("park_0", "park") if name in moments]
+    begun = time_s >= min(fault.onset_s, park)
     training = np.any([(time_s >= since) & (time_s < until) for since, until in parked], axis=0)
     spans = {
-        "before": ~training & (time_s < min(fault.onset_s, park)),
-        "during": ~training & (time_s >= fault.onset_s) & (time_s < park),
-        "training": training,
+        "before": ~begun,
+        "during": begun & ~training & (time_s < park),
+        "training": begun & training,
         "after": time_s >= after,
     }
     phases = []
@@ -264,7 +266,7 @@ def pairs_of(count: int, seed: int, names: list[str]) -> list[tuple[str, str]]:
 def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, processes: int):
     """Verdicts of (families, number) in turn, as they come."""
     if processes == 1:
-        yield from (judged(names, number, seed) for names, number in tasks)
+        yield from (judge_drive(names, number, seed) for names, number in tasks)
         return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(judged, *zip(*tasks, strict=True), [seed] * len(tasks), chunksize=4)
+        yield from pool.map(judge_drive, *zip(*tasks, strict=True), [seed] * len(tasks), chunksize=4)

@@ -31,6 +31,7 @@ class Phase:
         worst_silent_N: largest error of a silent sample.
         useful: share with mode running and sigma up to 300 N.
         rmse_N, sigma_N: of usable samples; sigma is their median.
+        better_path_N: RMSE of the better of both paths on these samples, which the fused force should keep to.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Phase:
     useful: float
     rmse_N: float
     sigma_N: float
+    better_path_N: float
     failed: tuple[str, ...]
 
     def as_dict(self) -> dict:
@@ -84,7 +86,10 @@ def judge(
         # Not a number is beyond everything.
         beyond = ~(error <= 3.0 * np.hypot(estimates["sigma"], REFERENCE_SIGMA_N))
         large = ~(error <= LARGE_N) & silent
-        rmse = float(np.sqrt(np.mean(error[usable] ** 2))) if usable.any() else np.nan
+        rmse = [
+            float(np.sqrt(np.mean((estimates[path] - reference_N)[usable] ** 2))) if usable.any() else np.nan
+            for path in ("force", "stiffness_force", "torque_force")
+        ]
     figures = {
         "silent": float(silent.mean()) if len(silent) else 0.0,
         "silent_beyond": _share(beyond, silent),
@@ -93,8 +98,9 @@ def judge(
         "longest_large_s": _longest(large, time_s),
         "worst_silent_N": float(error[silent].max()) if silent.any() else 0.0,
         "useful": _share((estimates["mode"] == RUNNING) & (estimates["sigma"] <= USEFUL_SIGMA_N), np.ones_like(silent)),
-        "rmse_N": rmse,
+        "rmse_N": rmse[0],
         "sigma_N": float(np.median(estimates["sigma"][usable])) if usable.any() else np.nan,
+        "better_path_N": float(np.fmin(*rmse[1:])),
     }
     criteria = {
         "silent beyond 3 sigma": figures["silent_beyond"] <= SILENT_BEYOND,
@@ -117,14 +123,14 @@ def first_flag_s(time_s: np.ndarray, estimates: np.ndarray, onset_s: float) -> f
     return float(time_s[told[0]] - onset_s) if len(told) else np.nan
 
 
-_COLUMNS = ("silent", ">3s silent", ">3s usable", ">1 kN", "longest", "worst", "useful", "RMSE", "sigma")
-HEADINGS = f"{'phase':<10}" + "".join(f"{column:>11}" for column in _COLUMNS)
+_COLUMNS = ("silent", ">3s silent", ">3s usable", ">1 kN", "longest", "worst", "useful", "RMSE", "better path", "sigma")
+HEADINGS = f"{'phase':<10}" + "".join(f"{column:>13}" for column in _COLUMNS)
 
 
 def line(phase: Phase) -> str:
     """One line under `HEADINGS`."""
     shares = (phase.silent, phase.silent_beyond, phase.usable_beyond, phase.silent_large)
     cells = [f"{100 * share:.2f} %" for share in shares] + [f"{phase.longest_large_s:.2f} s", f"{phase.worst_silent_N:.3g} N"]
-    cells += [f"{100 * phase.useful:.1f} %", f"{phase.rmse_N:.3g} N", f"{phase.sigma_N:.3g} N"]
+    cells += [f"{100 * phase.useful:.1f} %", f"{phase.rmse_N:.3g} N", f"{phase.better_path_N:.3g} N", f"{phase.sigma_N:.3g} N"]
     verdict = "FAILS: " + ", ".join(phase.failed) if phase.failed else "ok"
-    return f"{phase.name:<10}" + "".join(f"{cell:>11}" for cell in cells) + "  " + verdict
+    return f"{phase.name:<10}" + "".join(f"{cell:>13}" for cell in cells) + "  " + verdict

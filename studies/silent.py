@@ -118,7 +118,7 @@ def service(arguments: argparse.Namespace) -> int:
     return failing
 
 
-def _families(reports: list[dict]) -> list[dict]:
+def _tabulate(reports: list[dict]) -> list[dict]:
     """Verdicts of drives by family; pairs are one family."""
     groups: dict[str, list[dict]] = {}
     for report in reports:
@@ -206,6 +206,8 @@ def grid(arguments: argparse.Namespace) -> int:
         pairs = arguments.pairs if arguments.pairs is not None else 0 if arguments.faults else 100
         tasks += [(pair, number) for number, pair in enumerate(pairs_of(pairs, arguments.seed, chosen))]
     begun, reports = time.monotonic(), []
+    if arguments.drives:
+        print(f"  {HEADINGS}")
     for report in run_grid(tasks, arguments.seed, arguments.processes):
         reports.append(report)
         if arguments.drives:
@@ -214,7 +216,7 @@ def grid(arguments: argparse.Namespace) -> int:
             told += f", trained {report['trained']} times"
             print(f"{report['family']} {report['number']}: {report['size']} from {report['onset_s']:.1f} s, {told}")
             print(*(f"  {line(Phase(**phase))}" for phase in report["phases"]), sep="\n", flush=True)
-    table = _families(reports)
+    table = _tabulate(reports)
     failing, total = sum(row["failing_phases"] for row in table), sum(row["phases"] for row in table)
     if arguments.table:
         _write_table(arguments.table, table, arguments.seed)
