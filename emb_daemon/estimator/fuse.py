@@ -21,6 +21,7 @@ from emb_daemon.estimator.hypotheses import (
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
 from emb_daemon.estimator.status import (
     CONTACT_LOST,
+    CONTACT_SOUGHT,
     CONTACT_UNKNOWN,
     CURRENT_IMPLAUSIBLE,
     JUMP_SUSPECTED,
@@ -212,4 +213,5 @@ def take_sides(s, p, m, out):
         facts |= PATHS_CONTRADICT
     elif s.contact.lost and out.stiffness_sigma > out.torque_sigma:
         out.force, out.sigma = force, sigma
+        facts |= CONTACT_SOUGHT
     return facts

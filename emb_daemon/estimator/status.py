@@ -1,5 +1,7 @@
 """What the estimator says of itself: one table of named facts, from which reasons, source, and with them mode and Status follow.
 
+The order counts: the torque alone goes on without stiffness, whatever was said of the torque while both were compared.
+
 docs/safety.md's table is generated from `TABLE`.
 """
 
@@ -32,15 +34,16 @@ class Fact(NamedTuple):
 
 TABLE = {
     "zero_moved": Fact("the motor angle jumped as no motor can", OUT_OF_RANGE, FUSED),
-    "resolver_implausible": Fact("the resolver is frozen, or angle and speed contradict each other", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "current_implausible": Fact("the current is frozen while the motor must turn", PATHS_DISAGREE | STUCK, STIFFNESS_ONLY),
     "paths_contradict": Fact("the paths contradict each other and nothing tells which is wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
     "torque_old": Fact("the torque path has said nothing for a while", 0, STIFFNESS_ONLY),
     "jump_suspected": Fact("contact, stiffness, friction or current may have changed at once", PATHS_DISAGREE, FUSED),
     "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
+    "resolver_implausible": Fact("the resolver is frozen, or angle and speed contradict each other", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
+    "contact_sought": Fact("meanwhile the torque knows the force better", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "force_uncertain": Fact("the force is known to no better than a hundredth of the largest", CONTACT_UNCERTAIN, FUSED),
     "temperature_unknown": Fact("pad temperatures are unknown", TEMPERATURE_UNCERTAIN, FUSED),
     "temperature_uncertain": Fact("pad temperatures are known to no better than 10 K", TEMPERATURE_UNCERTAIN, FUSED),
@@ -55,8 +58,8 @@ TABLE = {
 
 #: Bit of each fact.
 (
-    ZERO_MOVED, RESOLVER_IMPLAUSIBLE, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
-    CONTACT_UNKNOWN, CONTACT_LOST, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK,
+    ZERO_MOVED, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE, RESOLVER_IMPLAUSIBLE,
+    CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK,
     WHEEL_CONTRADICTED, BOUNDS_CONTRADICT, BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
 ) = (1 << bit for bit in range(len(TABLE)))  # fmt: skip
 
