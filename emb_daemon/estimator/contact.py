@@ -70,7 +70,8 @@ def seek_release(s, p, m):
         s.unknown = not released
         return
     if s.unknown and released and loose and s.still_s >= _STILL_S:
-        place_contact(s, p, m.angle + p.clearance, p.clearance_sigma)
+        place_contact(s, p, m.angle + s.clearance, s.clearance_sigma)
+        s.contact_anchor = m.angle + p.clearance
         s.unknown = False
     elif not s.seen and not loose and not s.contact.confirmed:
         s.unknown = True
@@ -104,8 +105,9 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     mean_force = 0.5 * (force_before + s.force)
     predicted = leverage * mean_force
     h = s.sensitivity[0]
-    needed = needed_torque(s, p, m, mean_force, leverage)
-    to_torque(h, leverage, s.friction_mean, mean_force, 0.5 * (m.speed + s.speed), needed, s.winding, s.housing)
+    accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
+    speed = 0.5 * (m.speed + s.speed)
+    to_torque(h, leverage, s.friction_mean, mean_force, speed, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])

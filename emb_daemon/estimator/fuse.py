@@ -9,13 +9,14 @@ from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     fold,
     learn,
+    least_odds,
     mix,
     open_all,
     place,
     settle,
-    suspected,
     to_force,
     to_torque,
+    unproven,
     weigh,
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
@@ -62,6 +63,8 @@ from emb_daemon.models.plausibility import (
 #: Motor torque over what the calibration's torque constant makes of the current, at least; and age of the torque path's last
 #: word, s, from which the force rests on stiffness alone.
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
+#: Share of the largest force by which an unproven jump must move the force to be told.
+_NOTED = 0.003
 #: Part of a sample by which current and angle may be apart in time.
 _LATE = 0.3
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
@@ -86,8 +89,9 @@ def _clear_acceleration(s, m):
 
 @njit
 def needed_torque(s, p, m, mean_force, leverage):
-    """Motor torque (N m) that force, friction and inertia must have taken."""
-    return leverage * mean_force + p.offset_friction * s.friction_mean + p.inertia * _clear_acceleration(s, m)
+    """Torque (N m) that inertia took, and that force, friction and inertia must have taken together."""
+    accelerating = p.inertia * _clear_acceleration(s, m)
+    return accelerating, leverage * mean_force + p.offset_friction * s.friction_mean + accelerating
 
 
 @njit
@@ -133,8 +137,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
         speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
-        needed = needed_torque(s, p, m, mean_force, leverage)
-        to_torque(h, leverage, s_mean, mean_force, speed, needed, s.winding, s.housing)
+        accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
+        to_torque(h, leverage, s_mean, mean_force, speed, accelerating, needed, s.winding, s.housing)
         h[FAST] = leverage * spread
         slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + max(slow, 0.0) / (leverage * leverage))
@@ -145,10 +149,11 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         for kind in range(ALTERNATIVES if not known else 0):
             a = s.alternatives[kind]
             to_force(h, spread, a.slope, s.force + a.shift, warmth)
-            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, needed + leverage * a.shift, s.winding, s.housing)
+            taken = needed + leverage * a.shift
+            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, accelerating, taken, s.winding, s.housing)
             second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
             if trusted:
-                weigh(a, first, variance, second, variance_a)
+                weigh(a, least_odds(kind), first, variance, second, variance_a)
             if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
                 out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
         if trusted and out.innovation_sigma < _TELLING * p.maximum_force:
@@ -184,7 +189,7 @@ def take_sides(s, p, m, out):
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     if s.torque_age >= _OLD_S:
         facts |= TORQUE_OLD
-    if suspected(s):
+    if unproven(s) > _NOTED * p.maximum_force:
         facts |= JUMP_SUSPECTED
     if abs(x[OFFSET]) > 3.0 * torque_offset(p):
         facts |= OFFSET_LARGE

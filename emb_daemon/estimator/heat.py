@@ -6,6 +6,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import TURNING_RAD_PER_S, disc_speed
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
@@ -28,18 +29,30 @@ def _start_heat(s, t, m):
 
     The disc takes the plates' mean and the pads lie between.
     """
+    if s.rested_s > 0.0:
+        _tell_temperatures(s, t)
+        follow_heat(s, t, m)
+        _tell_temperatures(s, t)
+        _begin_watch(s, m)
+        s.factor = stiffness_factor(t, 0.5 * (s.mean[0] + s.mean[1]) - t.reference, s.history)
+        return
     s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
     for node in range(NODES):
         share = t.node_position[node] / t.thickness
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-    s.ambient = s.disc
     s.temperature_sigma = s.history_sigma = abs(s.disc - m.caliper)
     _tell_temperatures(s, t)
-    s.plate[0], s.plate[1] = m.inner_backplate, m.outer_backplate
-    s.plate_mean[:] = s.mean
+    _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     s.factor = stiffness_factor(t, s.history, s.history)
+
+
+@njit
+def _begin_watch(s, m):
+    s.plate[0], s.plate[1] = m.inner_backplate, m.outer_backplate
+    s.plate_mean[:] = s.mean
+    s.ambient = m.ambient if m.has_status else s.disc
     s.temperature_known = True
 
 

@@ -22,6 +22,7 @@ from emb_daemon.models.fusion import (
     GAIN,
     GROWTH,
     HOUSING,
+    INERTIA,
     LOAD,
     NOISE,
     OFFSET,
@@ -37,6 +38,8 @@ from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 #: Logarithm of the odds that a brake has jumped since it was last looked at: once in a thousand stops. They cannot fall lower,
 #: or a later jump would have to make up for the past.
 PRIOR_ODDS = -7.0
+#: The same of a disc that grows though its calibration, which saw heat, does not know it.
+_GROWTH_ODDS = -10.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
@@ -53,6 +56,9 @@ DOUBTFUL_RAD = 0.05
 #: What may have jumped.
 ALTERNATIVES = 3
 STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH = range(ALTERNATIVES)
+
+#: States of motor and friction.
+_OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA)
 
 #: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over
 #: the first one's.
@@ -81,7 +87,7 @@ def _open(s, p, kind):
         add_growth(a.covariance, p)
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
-    a.log_odds, a.shift = PRIOR_ODDS, 0.0
+    a.log_odds, a.shift = least_odds(kind), 0.0
 
 
 @njit
@@ -119,8 +125,24 @@ def share(s, kind):
 
 
 @njit
+def least_odds(kind):
+    """Log odds below which an alternative cannot fall, or a later change would have to make up for the past."""
+    return _GROWTH_ODDS if kind == DISC_GROWTH else PRIOR_ODDS
+
+
+@njit
 def suspected(s):
+    """Whether an alternative is likely enough to be waited for."""
     return _strongest(s, -1) > _SUSPECTED
+
+
+@njit
+def unproven(s):
+    """How far unproven alternatives may move the force, N: the largest of probability times difference."""
+    most = 0.0
+    for kind in range(ALTERNATIVES):
+        most = max(most, share(s, kind) * abs(s.alternatives[kind].shift))
+    return most
 
 
 @njit
@@ -147,22 +169,24 @@ def to_force(h, spread, slope, force, warmth):
 
 
 @njit
-def to_torque(h, leverage, friction_mean, force, speed, motor_torque, winding, housing):
-    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained."""
+def to_torque(h, leverage, friction_mean, force, speed, accelerating, motor_torque, winding, housing):
+    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained; ``accelerating`` and ``motor_torque``
+    N m, what inertia and what everything took."""
     for i in (FAST, CONTACT, SCALE, GROWTH):
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
     h[GAIN], h[FADE], h[HOUSING] = -motor_torque, -motor_torque * winding, -motor_torque * housing
     h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force, friction_mean, speed
+    h[INERTIA] = accelerating
 
 
 @njit
 def learned_torque(x, P, h):
     """Torque (N m) that what was learned of motor and friction explains, its offset apart, and its standard deviation."""
     total = variance = 0.0
-    for i in (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING):
+    for i in _OF_THE_TORQUE:
         total += h[i] * x[i]
-        for j in (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING):
+        for j in _OF_THE_TORQUE:
             variance += h[i] * P[i, j] * h[j]
     return total, sqrt(max(variance, 0.0))
 
@@ -184,13 +208,13 @@ def learn(x, P, gain, h, unexplained, variance, trusted):
 
 
 @njit
-def weigh(a, first, first_variance, second, second_variance):
+def weigh(a, least, first, first_variance, second, second_variance):
     """Odds of an alternative after it and the first hypothesis have seen a torque; a sample far off counts as the gate's
-    edge."""
+    edge. They fall no lower than ``least``."""
     edge = GATE * GATE
     a.log_odds += 0.5 * (min(first * first / first_variance, edge) - min(second * second / second_variance, edge))
     a.log_odds += 0.5 * log(first_variance / second_variance)
-    a.log_odds = min(max(a.log_odds, PRIOR_ODDS), 100.0)
+    a.log_odds = min(max(a.log_odds, least), 100.0)
 
 
 @njit

@@ -155,6 +155,11 @@ STATE = np.dtype(
         # Whether the contact angle is unknown since the start, and what the release that ends it is known by.
         ("unknown", "?"),
         ("seen", "?"),
+        # Whether it goes on from a snapshot, whose heat is ``rested_s`` s old; clearance that counts from the released position.
+        ("resumed", "?"),
+        ("rested_s", "f8"),
+        ("clearance", "f8"),
+        ("clearance_sigma", "f8"),
         ("since_start_s", "f8"),
         ("still_s", "f8"),
         ("angle", "f8"),

@@ -39,6 +39,8 @@ from emb_daemon.models.torque import torque_balance
 SILENCE_S = 0.1
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
+#: Temperature of a brake that tells none, degC.
+_ROOM_C = 20.0
 #: Clamp force over the largest of the calibration that no brake makes.
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
@@ -52,14 +54,15 @@ def _start(s, p, m):
     s.started = True
     s.angle = s.slid_angle = m.angle
     s.speed = m.speed
-    s.contact_angle = s.contact_anchor = m.angle + p.clearance
-    s.past_contact = -p.clearance
+    if not s.resumed:
+        s.clearance, s.clearance_sigma, s.scale = p.clearance, p.clearance_sigma, 1.0
+        set_priors(s.covariance, p, m.caliper if m.has_thermocouple else m.ambient if m.has_status else _ROOM_C)
+        if p.clearance_sigma == 0.0:
+            s.covariance[SCALE, SCALE] = 0.0
+    s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
+    s.past_contact = -s.clearance
     s.friction_variance = 1.0
     s.torque_age = 1e9
-    s.scale = 1.0
-    set_priors(s.covariance, p, m.caliper if m.has_thermocouple else m.ambient if m.has_status else 20.0)
-    if p.clearance_sigma == 0.0:
-        s.covariance[SCALE, SCALE] = 0.0
     open_all(s, p)
     s.balance = np.nan
 
@@ -83,7 +86,7 @@ def step(s, p, m, out):
     if p.clearance_sigma > 0.0:
         seek_release(s, p, m)
     heat(s, p, m)
-    if s.temperature_known and not knew:
+    if s.temperature_known and not knew and not s.resumed:
         s.growth_start = s.disc
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)

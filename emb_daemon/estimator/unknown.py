@@ -16,6 +16,7 @@ from emb_daemon.models.fusion import (
     GAIN,
     GROWTH,
     HOUSING,
+    INERTIA,
     LOAD,
     NOISE,
     OFFSET,
@@ -26,6 +27,8 @@ from emb_daemon.models.fusion import (
 #: Contact angle: knock-back, uneven wear and a disturbed released position move the pads by some tens of micrometres between
 #: two stops (Limpert, Brake Design and Safety, 3rd ed., ch. 5: 0.05 to 0.1 mm of run-out and knock-back), m.
 _CONTACT_JUMP_M = 40e-6
+#: Contact angle from one parking to the next start: pads settle by some micrometres, m.
+_SETTLED_M = 5e-6
 #: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
@@ -37,11 +40,13 @@ _GAIN, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
 #: Offset of the motor torque at power-on: share of the torque that the largest force needs (Hall sensors: 0.5 to 1 % of a
 #: range that is several times that current); and time in which it drifts as far again, s.
 _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
+#: Inertia: rotor and screw do not change, but what a calibration makes of them is no better than this, share.
+_INERTIA = 0.02
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
 _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
-#: Base oil of low-temperature greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law
-#: between -40 and 20 degC), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
-_THICKENS_K, _WARM_C, _VISCOUS = 20.0, 15.0, 0.3
+#: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
+#: 20 degC: it doubles in ten), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
+_THICKENS_K, _WARM_C, _VISCOUS = 15.0, 15.0, 0.3
 #: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1 %/K
 #: (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
 #: several hundred kelvin.
@@ -82,6 +87,7 @@ def set_priors(P, p, caliper):
     P[LOAD, LOAD] = (p.torque_relative_sigma * p.gear_gain) ** 2 + (_FRICTION * p.load_friction * thick) ** 2
     P[COULOMB, COULOMB] = (_FRICTION * p.offset_friction * thick) ** 2
     P[VISCOUS, VISCOUS] = (_VISCOUS * p.offset_friction / p.maximum_speed * thick) ** 2
+    P[INERTIA, INERTIA] = _INERTIA**2
     P[FADE, FADE] = _FADE**2
     P[HOUSING, HOUSING] = _HOUSING**2
 
@@ -90,7 +96,7 @@ def set_priors(P, p, caliper):
 def set_walks(walked, p, x, winding, housing, dt):
     """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat."""
     faded = abs(x[FADE]) * winding + abs(x[HOUSING]) * housing + _FADE * (winding + housing)
-    walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = 0.0
+    walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = 0.0
     walked[CONTACT] = p.contact_walk * p.contact_walk * dt
     walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + (_MISSED * faded) ** 2 / _MISSED_S) * dt
     walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
@@ -98,6 +104,18 @@ def set_walks(walked, p, x, winding, housing, dt):
     walked[LOAD] = (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * dt
     walked[COULOMB] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction) ** 2 * dt
     walked[VISCOUS] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction / p.maximum_speed) ** 2 * dt
+
+
+@njit
+def add_rest(P, p, elapsed_s):
+    """What a brake may have changed by while it was not watched for ``elapsed_s`` s: an hour's walk at least, and a settling of
+    the pads."""
+    hour = max(elapsed_s, 3600.0)
+    P[CONTACT, CONTACT] += (_SETTLED_M / p.gear_gain) ** 2
+    P[GAIN, GAIN] += _GAIN_WALK_PER_SQRT_S**2 * hour
+    P[OFFSET, OFFSET] += torque_offset(p) ** 2 * min(hour / _OFFSET_DRIFTS_S, 1.0)
+    P[LOAD, LOAD] += (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * hour
+    P[COULOMB, COULOMB] += (_FRICTION_WALK_PER_SQRT_S * p.offset_friction) ** 2 * hour
 
 
 @njit

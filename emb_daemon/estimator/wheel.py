@@ -11,6 +11,8 @@ PULSES_PER_TURN, PULSE_MODULO = 96, 4096
 TURNING_RAD_PER_S, _MOVING_M_PER_S = 0.5, 0.5
 #: Time over which pulses are counted into a speed, s.
 _COUNTED_S = 0.25
+#: Pulses that a wheel which is said to stand may still give: it comes to rest.
+_TURNED_PULSES = 12.0
 #: Time for which a moving vehicle may have a standing wheel: a blocked one, before its anti-lock control lets go, s.
 _BLOCKED_S = 1.0
 #: Rolling radius of car tyres until this car's has been seen, m, its spread, and the time over which it is learned, s.
@@ -22,6 +24,7 @@ WHEEL = np.dtype(
         ("pulse", "f8"),
         ("pulse_speed", "f8"),
         ("radius", "f8"),
+        ("turned", "f8"),
         ("contradicted_s", "f8"),
         ("contradicted", "?"),
     ],
@@ -43,7 +46,7 @@ def disc_speed(w, m):
     if m.has_wheel_pulse and np.isfinite(w.pulse) and m.dt > 0.0:
         steps = (m.wheel_pulse - w.pulse + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
         share = 1.0 - exp(-m.dt / _COUNTED_S)
-        w.pulse_speed += share * (abs(steps) * 2.0 * pi / PULSES_PER_TURN / m.dt - w.pulse_speed)
+        w.pulse_speed += share * (steps * 2.0 * pi / PULSES_PER_TURN / m.dt - w.pulse_speed)
     w.pulse = m.wheel_pulse if m.has_wheel_pulse else np.nan
     by_pulses = w.pulse_speed if m.has_wheel_pulse else np.nan
     by_vehicle = m.vehicle_speed / w.radius if m.has_status else np.nan
@@ -55,9 +58,10 @@ def disc_speed(w, m):
         seen = m.vehicle_speed / m.wheel_speed
         if abs(seen / _RADIUS_M - 1.0) < 3.0 * _RADIUS_SHARE:
             w.radius += (1.0 - exp(-m.dt / _RADIUS_LEARNED_S)) * (seen - w.radius)
-    others = by_pulses > 2.0 * TURNING_RAD_PER_S or (np.isnan(by_pulses) and by_vehicle * w.radius > _MOVING_M_PER_S)
-    w.contradicted_s = w.contradicted_s + m.dt if others and not turning else 0.0
-    w.contradicted = w.contradicted_s > (_COUNTED_S if m.has_wheel_pulse else _BLOCKED_S)
+    moving = np.isnan(by_pulses) and by_vehicle * w.radius > _MOVING_M_PER_S
+    w.contradicted_s = w.contradicted_s + m.dt if moving and not turning else 0.0
+    w.turned = 0.0 if turning or w.pulse_speed < TURNING_RAD_PER_S else w.turned + steps
+    w.contradicted = w.contradicted_s > _BLOCKED_S or w.turned > _TURNED_PULSES
     if w.contradicted:
         return _without(by_pulses, by_vehicle)
     return m.wheel_speed, 0.0

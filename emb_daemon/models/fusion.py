@@ -15,10 +15,12 @@ for noise, which takes slow model error for white noise. Here the filter estimat
     VISCOUS   error of the friction torque per motor speed, N m s/rad
     FADE      relative loss of motor torque per heat that the motor's own current left in the winding
     HOUSING   the same for the heat left in the motor's housing
+    INERTIA   relative error of the inertia
 
     F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH
     torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS
-                                          - T_m (GAIN + u FADE + v HOUSING) + NOISE + OFFSET + white noise,  D = gamma + mu s
+                                          - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
+                                          + white noise,  D = gamma + mu s
 
 so that what is slow stays correlated and the standard deviation means what it says.
 """
@@ -27,8 +29,8 @@ from math import sqrt
 
 from emb_daemon.jit import njit
 
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING) = range(12)
-STATES = 12
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA) = range(13)
+STATES = 13
 #: States that the clamp force itself rests on.
 OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
 

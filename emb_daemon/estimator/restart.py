@@ -1,0 +1,104 @@
+"""What an estimator takes over a restart, and how much less certain it is afterwards.
+
+The resolver's zero is another after every power-on, so the contact angle survives as the clearance from the released position.
+What friction, motor and stiffness were found to be stays; heat flows on while nobody looks.
+"""
+
+from math import exp
+
+import numpy as np
+
+from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, add_rest
+from emb_daemon.jit import njit
+from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES
+from emb_daemon.models.thermal import NODES, heat_step
+
+#: Kelvin per second by which a disc may have heated while nobody looked, and at most: hard braking from motorway speed.
+_UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
+#: Longest step of the heat that flowed meanwhile, s, and longest time that is followed, s.
+_STEP_S, _FOLLOWED_S = 5.0, 6 * 3600.0
+
+SNAPSHOT = np.dtype(
+    [
+        ("clearance", "f8"),
+        ("clearance_sigma", "f8"),
+        ("scale", "f8"),
+        ("growth", "f8"),
+        ("growth_start", "f8"),
+        ("error", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        ("winding", "f8"),
+        ("housing", "f8"),
+        ("temperature_known", "?"),
+        ("pads", "f8", (2, NODES)),
+        ("disc", "f8"),
+        ("history", "f8"),
+        ("temperature_sigma", "f8"),
+        ("history_sigma", "f8"),
+    ],
+    align=True,
+)
+
+
+@njit
+def take_snapshot(s, p, snapshot):
+    """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or doubted."""
+    if not s.started or s.unknown or s.contact.lost:
+        return False
+    snapshot.clearance = p.clearance + s.contact_angle - s.contact_anchor
+    snapshot.clearance_sigma = s.covariance[CONTACT, CONTACT] ** 0.5
+    snapshot.scale, snapshot.growth, snapshot.growth_start = s.scale, s.growth, s.growth_start
+    snapshot.error[:] = s.error
+    snapshot.covariance[:, :] = s.covariance
+    snapshot.winding, snapshot.housing = s.winding, s.housing
+    snapshot.temperature_known = s.temperature_known
+    snapshot.pads[:, :] = s.pads
+    snapshot.disc, snapshot.history = s.disc, s.history
+    snapshot.temperature_sigma, snapshot.history_sigma = s.temperature_sigma, s.history_sigma
+    return True
+
+
+@njit
+def resume(s, p, snapshot, elapsed_s):
+    """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
+
+    Its first sample then starts it as ever, but from these values."""
+    s.resumed = True
+    s.clearance, s.clearance_sigma = snapshot.clearance, snapshot.clearance_sigma
+    s.scale, s.growth, s.growth_start = snapshot.scale, snapshot.growth, snapshot.growth_start
+    s.error[:] = snapshot.error
+    s.covariance[:, :] = snapshot.covariance
+    for i in range(STATES):
+        for own in (FAST, NOISE):
+            s.covariance[own, i] = s.covariance[i, own] = 0.0
+    s.error[FAST] = s.error[NOISE] = 0.0
+    s.covariance[FAST, FAST] = 1.0
+    s.covariance[NOISE, NOISE] = (p.torque_constant * p.current_sigma) ** 2
+    add_rest(s.covariance, p, elapsed_s)
+    s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
+    s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
+    if snapshot.temperature_known:
+        s.pads[:, :] = snapshot.pads
+        s.disc, s.history = snapshot.disc, snapshot.history
+        s.temperature_sigma = snapshot.temperature_sigma + min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
+        s.history_sigma = snapshot.history_sigma
+        s.rested_s = min(elapsed_s, _FOLLOWED_S)
+
+
+@njit
+def follow_heat(s, t, m):
+    """Let the heat of a snapshot flow for the time that has passed since, between the plates as they are now."""
+    ambient = m.ambient if m.has_status else m.caliper
+    if s.rested_s > 0.0:
+        before = s.disc
+        s.disc = heat_step(
+            t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S
+        )
+        # How much air passed is as unknown as what braked; both die out as the disc cools.
+        s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
+        s.temperature_sigma += 0.3 * abs(before - s.disc)
+        forgotten = exp(-s.rested_s / t.history_time)
+        rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+        s.history = forgotten * s.history + (1.0 - forgotten) * rise
+        s.history_sigma *= forgotten
+        s.rested_s = 0.0
