@@ -1,15 +1,17 @@
 """The calibration as parameter space: every number has a key, and moving a key moves that number alone."""
 
 import math
+import re
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_daemon.adapt.limits import to_limits
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import keys, moved, parameter, value_of
-from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.calibration.types import Adaptation, Calibration, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.resources import resource
@@ -34,7 +36,7 @@ def test_every_number_of_the_file_has_a_key():
     # Defaults are left out of the file, but have keys.
     assert count(plain) <= len(_KEYS) == len(set(_KEYS))
     assert {"motor.inertia_kg_m2", "stiffness.curves[4].coefficients[2]", "thermal.softening.per_K"} <= set(_KEYS)
-    assert "thermal.friction.coefficient[5][5][7]" in _KEYS and "adaptation.high_force_N" in _KEYS
+    assert "thermal.friction.coefficient[5][5][7]" in _KEYS
 
 
 @given(st.sampled_from(_KEYS), st.floats(allow_nan=False, allow_infinity=False))
@@ -141,3 +143,35 @@ def test_checked_lists_every_fault_of_learned_values(values, faults):
 def test_checked_gives_the_same_as_unchecked():
     values = {"contact.clearance_rad": 7.0, "effects.current_offset.offset_A": 0.5, "friction.offset_Nm": 0.0}
     assert moved(_CALIBRATION, values, checked=True) == moved(_CALIBRATION, values)
+
+
+def _derived(calibration: Calibration) -> tuple[bytes, bytes]:
+    return to_parameters(calibration).tobytes(), to_limits(calibration).tobytes()
+
+
+@pytest.mark.parametrize("key", [*_KEYS, *_EFFECT_KEYS, "adaptation.enabled", "adaptation.samples_per_range"])
+def test_every_key_of_the_file_acts(key):
+    """A key that changes neither the estimator's parameters nor the limits of adaptation is read by nobody."""
+    calibration = _CALIBRATION
+    if curve := re.match(r"stiffness\.curves\[(\d)\]", key):
+        # A curve acts on pads of about its thickness.
+        thickness = calibration.stiffness.curves[int(curve[1])].pad_thickness_mm
+        calibration = moved(calibration, {"pad_thickness_mm": thickness + 0.1})
+    if key.startswith("adaptation.") and key not in _KEYS:
+        name = key.partition(".")[2]
+        other = {"enabled": False, "samples_per_range": 51}[name]
+        changed = msgspec.structs.replace(
+            calibration, adaptation=msgspec.structs.replace(calibration.adaptation, **{name: other})
+        )
+    else:
+        found = parameter(calibration, key)
+        changed = moved(calibration, {key: found.value + found.step})
+    assert _derived(changed) != _derived(calibration)
+
+
+def test_what_is_no_number_is_declared():
+    """Fields that are neither parameters nor switches of adaptation: identity and documentation."""
+    plain = {name.partition(".")[0].partition("[")[0] for name in _KEYS}
+    assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "provenance"}
+    assert {field for field in Adaptation.__struct_fields__ if f"adaptation.{field}" not in _KEYS} == {
+        "enabled", "samples_per_range", "high_force_N"}  # fmt: skip

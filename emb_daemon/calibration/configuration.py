@@ -97,14 +97,10 @@ class Setup:
                 loaded[file] = None
                 try:
                     loaded[file] = load_calibration(file)
-                    to_parameters(loaded[file])
                 except InputErrors as error:
                     faults += error.faults
-                except InputError as error:
-                    faults.append(f"{file}: {error}")
             if loaded[file] is not None:
                 self.calibrations[name] = loaded[file]
-                if not faults:
-                    self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
+                self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
         if faults:
             raise InputErrors(faults)

@@ -86,6 +86,14 @@ class Stiffness(Struct, kw_only=True):
         thicknesses = [curve.pad_thickness_mm for curve in self.curves]
         if thicknesses != sorted(set(thicknesses)):
             raise ValueError("curves: expected ascending, distinct pad thicknesses")
+        between = np.linspace(*thickness_range(self.curves), 8 * len(thicknesses)) if len(thicknesses) > 1 else ()
+        for thickness in np.union1d(thicknesses, between):
+            reached = rising_force(curve_at(self.curves, thickness))
+            if reached < self.maximum_force_N:
+                raise ValueError(
+                    f"curves: with pads of {thickness:g} mm the force stops rising at {reached:.0f} N, "
+                    f"below maximum_force_N ({self.maximum_force_N:g})"
+                )
 
 
 class Contact(Struct, kw_only=True):
@@ -230,8 +238,8 @@ class Adaptation(Struct, kw_only=True):
     maximum_ambient_C: Annotated[float, usual(100.0)] = 45.0
     #: Largest rise of the pads over ambient at which training teaches something.
     maximum_rise_K: Positive = 25.0
-    #: Clamp force up to which training motion is asked for.
-    high_force_N: Positive = 18000.0
+    #: Clamp force up to which training motion is asked for; left out, 18 kN or 60 % of the largest force, what is less.
+    high_force_N: Positive | None = None
     #: Share of that force that must be reached.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
     #: Amplitude of the small fast sinusoid on top.
@@ -262,6 +270,10 @@ class Adaptation(Struct, kw_only=True):
     pairs_difference: Positive = 0.04
     #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
     torque_constant_relative: Annotated[NonNegative, usual(0.002)] = 0.002
+
+    def __post_init__(self):
+        if self.minimum_ambient_C >= self.maximum_ambient_C:
+            raise ValueError("maximum_ambient_C: expected more than minimum_ambient_C")
 
 
 class Source(Struct, kw_only=True):
@@ -327,8 +339,54 @@ class Calibration(Struct, kw_only=True):
                     )
             if missing := bounds.keys() - values.keys():
                 faults.append(f"effects.{name}: missing {', '.join(sorted(missing))}")
+        try:
+            curve_at(self.stiffness.curves, self.pad_thickness_mm)
+        except InputError as error:
+            faults.append(str(error))
+        if self.training_force_N > self.stiffness.maximum_force_N:
+            faults.append(
+                f"adaptation.high_force_N: {self.training_force_N:g} exceeds stiffness.maximum_force_N "
+                f"({self.stiffness.maximum_force_N:g})"
+            )
         if faults:
             raise ValueError("\n".join(faults))
+
+    @property
+    def training_force_N(self) -> float:
+        """Clamp force up to which training motion is asked for."""
+        share_of_maximum = _TRAINING_SHARE * self.stiffness.maximum_force_N
+        return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
+
+
+#: Training reaches the forces that hold a parked car, 18 kN in the thesis (3.4) on a brake of 30 kN, and on weaker brakes the
+#: same share.
+_TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
+#: How far curves are carried on beyond the measured thicknesses, as a share of the nearest interval, and to what share of the
+#: nearest measured one a coefficient's compliance may fall there: a straight line would lead it through zero.
+_CARRIED_ON, _LEAST_COMPLIANCE = 0.5, 0.5
+
+
+def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
+    """Thinnest and thickest pads in mm that `curve_at` tells a curve of."""
+    thicknesses = [curve.pad_thickness_mm for curve in curves]
+    if len(curves) == 1:
+        # One curve is taken for the pads that are mounted, whatever their thickness.
+        return 0.0, np.inf
+    below, above = (_CARRIED_ON * (thicknesses[k + 1] - thicknesses[k]) for k in (0, -2))
+    return thicknesses[0] - below, thicknesses[-1] + above
+
+
+def rising_force(coefficients: np.ndarray) -> float:
+    """Force in N up to which a characteristic curve rises from contact; infinite if it never falls."""
+    if coefficients[0] <= 0.0:
+        return 0.0
+    if np.all(coefficients >= 0.0):
+        return np.inf
+    turns = np.roots((coefficients * np.arange(1, len(coefficients) + 1))[::-1])
+    turns = turns.real[(np.abs(turns.imag) <= 1e-9 * np.abs(turns)) & (turns.real > 0.0)]
+    if not len(turns):
+        return np.inf
+    return float(np.polyval([*coefficients[::-1], 0.0], turns.min()))
 
 
 def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
@@ -336,6 +394,7 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
 
     The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
     nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
+    A coefficient whose sign changes between the two thicknesses runs straight itself, and all others with it.
 
     Raises:
         InputError: the thickness is too far outside of what was measured.
@@ -343,21 +402,23 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
     table = np.zeros((len(curves), CURVE_TERMS))
     for row, curve in enumerate(curves):
         table[row, : len(curve.coefficients)] = curve.coefficients
-    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
     if len(curves) == 1:
         return table[0]
-    low, high = thicknesses[0], thicknesses[-1]
-    margin = 0.5 * np.diff(thicknesses)[[0, -1]]
-    if not low - margin[0] <= pad_thickness_mm <= high + margin[1]:
-        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured {low} to {high} mm")
+    low, high = thickness_range(curves)
+    if not low <= pad_thickness_mm <= high:
+        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured; expected {low:g} to {high:g}")
+    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
     upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
     share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
     below, above = table[upper - 1], table[upper]
-    if np.all(below * above > 0.0) or np.all((below * above > 0.0) | ((below == 0.0) & (above == 0.0))):
-        inverse = np.divide(1.0, below, out=np.zeros_like(below), where=below != 0.0) * (1.0 - share)
-        inverse += np.divide(1.0, above, out=np.zeros_like(above), where=above != 0.0) * share
-        return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse != 0.0)
-    return below + share * (above - below)
+    used = (below != 0.0) | (above != 0.0)
+    if np.any(below[used] * above[used] <= 0.0):
+        return below + share * (above - below)
+    compliance = 1.0 / below[used] * (1.0 - share) + 1.0 / above[used] * share
+    nearest = 1.0 / (below if share < 0.5 else above)[used]
+    curve = np.zeros(CURVE_TERMS)
+    curve[used] = 1.0 / np.where(compliance / nearest < _LEAST_COMPLIANCE, _LEAST_COMPLIANCE * nearest, compliance)
+    return curve
 
 
 def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
