@@ -1,6 +1,5 @@
 """Calibration and configuration files: every fault found at once, with its line; what is saved is what is loaded."""
 
-import math
 import re
 
 import msgspec
@@ -383,23 +382,31 @@ def test_setup_lists_the_faults_of_all_files(tmp_path):
 
 
 def test_configuration_faults(tmp_path):
+    """All at once, unknown corner and interface included, each with its line."""
     path = tmp_path / "emb.yaml"
     path.write_text(
         "format: 1\ncorners: {XX: {calibration: c}, FL: {calibraton: c}}\n"
-        "realtime: {fifo_priority: 100, cpu: on}\nlog_level: loud\n"
+        "realtime: {fifo_priority: 100, cpu: on}\nlog_level: loud\nbus: {interface: sockcan}\n"
     )
     with pytest.raises(InputErrors) as caught:
         Setup(path)
-    faults = "\n".join(caught.value.faults)
-    for expected in (
+    expected = (
+        ":2: corners.XX: Expected `str` matching regex '^(FL|FR|RL|RR)$'",
         ":2: corners.FL.calibraton: unknown key",
+        ":2: corners.FL.calibration: missing",
         ":3: realtime.fifo_priority",
         ":3: realtime.cpu",
         ":4: log_level",
-    ):
-        assert expected in faults
-    path.write_text("format: 1\ncorners: {XX: {calibration: c}, YY: {calibration: c}}\n")
-    with pytest.raises(InputErrors) as caught:
+        ":5: bus.interface: python-can knows no sockcan; near are ",
+    )
+    for text in expected:
+        assert sum(text in fault for fault in caught.value.faults) == 1, text
+    assert len(caught.value.faults) == len(expected) and "socketcan" in caught.value.faults[-1]
+
+
+@pytest.mark.parametrize("corners", ["{}", "[FL]", "FL"])
+def test_a_configuration_without_corners(tmp_path, corners):
+    path = tmp_path / "emb.yaml"
+    path.write_text(f"format: 1\ncorners: {corners}\n")
+    with pytest.raises(InputErrors, match=r":2: corners: expected at least 1 key"):
         Setup(path)
-    assert [fault.split(": ", 2)[1] for fault in caught.value.faults] == ["corners.XX", "corners.YY"]
-    assert math.prod(fault.count(":2: ") for fault in caught.value.faults) == 1
