@@ -1,7 +1,7 @@
 """emb-daemon: dispatch to one module per command, imported only when called."""
 
 import argparse
-import importlib
+import importlib.util
 import os
 import sys
 
@@ -21,6 +21,11 @@ COMMANDS = {
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
+
+#: Libraries of the extra of the same name.
+_OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
+#: Commands that end in one of them and begin with long work.
+_NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
@@ -49,9 +54,17 @@ def main(argv: list[str] | None = None) -> int:
     module.add_arguments(parser)
     arguments = parser.parse_args(argv[1:])
     try:
+        for library in _NEED.get(chosen.command, ()):
+            if importlib.util.find_spec(library) is None:
+                raise ModuleNotFoundError(name=library)
         return module.run(arguments)
     except InputError as error:
         print(error, file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _OFFLINE:
+            raise
+        print(f"emb-daemon {chosen.command} needs {error.name}: pip install 'emb_daemon[offline]'", file=sys.stderr)
         return 2
     except Unavailable as error:
         print(error, file=sys.stderr)
@@ -60,6 +73,10 @@ def main(argv: list[str] | None = None) -> int:
         # The reader of our output has gone; leave nothing for the interpreter to flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        # A file that cannot be used is the user's; a full disk or a device that is gone may be better later.
+        print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
+        return 2 if error.filename else 1
     except KeyboardInterrupt:
         return 130
 
