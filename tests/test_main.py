@@ -2,6 +2,9 @@
 
 import errno
 import importlib.util
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -62,3 +65,17 @@ def test_a_reader_that_has_gone_is_no_error(monkeypatch):
     monkeypatch.setattr(check, "run", fail)
     monkeypatch.setattr("emb_daemon.cli.main.os.dup2", lambda *_: None)
     assert main(["check", "--config", "emb.yaml"]) == 0
+
+
+def test_a_terminal_without_our_characters_is_no_reason_to_end():
+    code = "from emb_daemon.cli import check, main; check.run = lambda _: print('3 ± 1 kN') or 0; "
+    code += "raise SystemExit(main.main(['check', '--config', 'x']))"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "3 ? 1 kN\n", "")
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan"])
+def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
+    assert main(["bench", "--seconds", seconds]) == 2
+    assert "expected at least 2" in capsys.readouterr().err

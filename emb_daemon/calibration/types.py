@@ -26,8 +26,8 @@ Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
-#: Training reaches the forces that hold a parked car, 18 kN in the thesis (3.4) on a brake of 30 kN, and on weaker brakes the
-#: same share.
+#: Training reaches the forces that hold a parked car: 18 kN, 60 % of what the brake of the shipped calibration can do, and on
+#: weaker brakes the same share.
 _TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import io
 import os
 import sys
 
@@ -43,6 +44,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if what it needs is not
     there now."""
     argv = sys.argv[1:] if argv is None else argv
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without our characters shows others; it is no reason to end.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
     module = importlib.import_module(f"emb_daemon.cli.{chosen.command}")
     parser = argparse.ArgumentParser(
