@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, new_state
 from emb_daemon.logs.columns import References
 from emb_daemon.logs.read import read_frames
-from emb_daemon.pipeline import Pipeline, answer
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.layout import CORNERS
 
 

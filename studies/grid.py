@@ -19,10 +19,11 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
-from emb_daemon.plant.car import CYCLE_S, Car
+from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.records import LATCH, PARK_APPLIED
+from emb_daemon.plant.records import LATCH
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED
 from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from emb_daemon.estimator.records import FUSED, INIT, INVALID, RUNNING
+from emb_daemon.wire.contract import ADAPTING, FUSED, INIT, INVALID, RUNNING
 
 #: Noise of the reference force sensor, N, that a stated sigma need not cover.
 REFERENCE_SIGMA_N = 25.0
@@ -18,7 +18,7 @@ LARGE_N, LONGEST_LARGE_S, SILENT_LARGE = 1000.0, 0.1, 1 / 2000
 #: What keeps the estimator useful: share of samples with mode running and sigma up to this, with nothing wrong and after a
 #: change was learned; RMSE after it was learned, and with nothing wrong over what it was before.
 USEFUL_SIGMA_N, NOMINAL_USEFUL, LEARNED_USEFUL, LEARNED_RMSE_N, NOMINAL_WORSE = 300.0, 0.99, 0.90, 100.0, 1.10
-_RUNNING_MODES = (RUNNING, RUNNING + 1)
+_RUNNING_MODES = (RUNNING, ADAPTING)
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.estimator.records import ADAPTING, DEGRADED, ESTIMATE, FAULT, FUSED, INVALID, RUNNING, STIFFNESS_ONLY
+from emb_daemon.estimator.records import ESTIMATE
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import rest, simulate_log
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
 from studies.faults import FAMILIES, _alter, _lose
