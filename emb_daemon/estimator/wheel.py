@@ -43,12 +43,15 @@ def disc_speed(w, m):
     if not w.started:
         w.started, w.pulse, w.radius = True, np.nan, _RADIUS_M
     # What was counted while no message came is not a speed.
+    steps = 0.0
     if m.has_wheel_pulse and np.isfinite(w.pulse) and m.dt > 0.0:
         steps = (m.wheel_pulse - w.pulse + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
         share = 1.0 - exp(-m.dt / _COUNTED_S)
         w.pulse_speed += share * (steps * 2.0 * pi / PULSES_PER_TURN / m.dt - w.pulse_speed)
+    elif not m.has_wheel_pulse:
+        w.pulse_speed = 0.0
     w.pulse = m.wheel_pulse if m.has_wheel_pulse else np.nan
-    by_pulses = w.pulse_speed if m.has_wheel_pulse else np.nan
+    by_pulses = abs(w.pulse_speed) if m.has_wheel_pulse else np.nan
     by_vehicle = m.vehicle_speed / w.radius if m.has_status else np.nan
     if not m.has_wheel_speed:
         w.contradicted, w.contradicted_s = False, 0.0
