@@ -22,7 +22,7 @@ from emb_daemon.jit import njit
 #: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood.
 #: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
-#: ``torque_variance``: motor torque (N m), smoothed.
+#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -34,6 +34,7 @@ PLAUSIBILITY = np.dtype(
         ("flickered", "i8"),
         ("current", "f8"),
         ("frozen_s", "f8"),
+        ("averaged", "?"),
         ("torque_mean", "f8"),
         ("torque_variance", "f8"),
     ],
@@ -152,7 +153,9 @@ def force_of_torque_alone(c, torque, has_current, dt, gear_gain, load_friction, 
     own variation over `_AVERAGED_S`, which is kept up to date here and so must be called with every sample.
     """
     if has_current:
-        share = 1.0 - exp(-dt / _AVERAGED_S)
+        # The first torque counts in full: a start may be clamped.
+        share = 1.0 - exp(-dt / _AVERAGED_S) if c.averaged else 1.0
+        c.averaged = True
         off = torque - c.torque_mean
         c.torque_mean += share * off
         c.torque_variance = (1.0 - share) * (c.torque_variance + share * off * off)
