@@ -31,7 +31,8 @@ _NOT_LOCKED = 0.2
 _TURNING_RAD_PER_S = 2.0
 
 MONITOR = np.dtype(
-    [("started", "?"), ("torque", "f8"), ("speed", "f8"), ("low", "f8"), ("high", "f8"), ("outside_s", "f8")], align=True
+    [("started", "?"), ("torque", "f8"), ("speed", "f8"), ("low", "f8"), ("high", "f8"), ("force", "f8"), ("outside_s", "f8")],
+    align=True,
 )
 
 
@@ -63,7 +64,12 @@ def bound(w, p, m):
 
 @njit
 def contradicts(w, force, sigma, dt):
-    """Whether ``force`` (N) has lain outside the bounds by more than three of its ``sigma`` for longer than tolerated."""
-    outside = force > w.high + 3.0 * sigma or force < w.low - 3.0 * sigma
+    """Whether ``force`` (N) has lain outside the bounds by more than three of its ``sigma`` for longer than tolerated.
+
+    It is smoothed as the torque is, which lags behind in a long stroke."""
+    if not np.isfinite(force):
+        return False
+    w.force += (1.0 - exp(-dt / SMOOTHED_S)) * (force - w.force)
+    outside = w.force > w.high + 3.0 * sigma or w.force < w.low - 3.0 * sigma
     w.outside_s = w.outside_s + dt if outside else 0.0
     return w.outside_s > TOLERATED_S
