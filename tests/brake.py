@@ -2,6 +2,7 @@
 
 import naive
 import numpy as np
+from scipy.signal import lfilter
 
 from emb_daemon.estimator.records import SAMPLE
 
@@ -14,10 +15,11 @@ def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.
     """
     angle = np.asarray(angle, float)
     speed = np.gradient(angle, dt)
-    static = np.array([naive.characteristic_curve(x, p["curve"])[0] for x in angle - p["clearance"]])
-    force = np.zeros_like(angle)
-    for i in range(1, len(angle)):
-        force[i] = naive.first_order_lag(force[i - 1], static[i - 1], static[i], dt, p["relaxation_time"])
+    travel = np.maximum(angle - p["clearance"], 0.0)
+    static = np.polynomial.Polynomial([0.0, *p["curve"]])(travel)
+    # The lag is linear and the step constant: its answers to single ones are its coefficients.
+    kept, before, now = (naive.first_order_lag(*ones, dt, p["relaxation_time"]) for ones in np.eye(3))
+    force = lfilter([now, before], [1.0, -kept], static)
     mean = 0.5 * (force + np.concatenate([force[:1], force[:-1]]))
     s = np.zeros_like(angle) if friction is None else np.broadcast_to(friction, angle.shape)
     state = 0.0
@@ -42,3 +44,34 @@ def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.
 def clamp(p, to_rad: float, seconds: float, dt: float = 0.004) -> np.ndarray:
     """Angles of a steady approach from the released position to ``to_rad`` past contact."""
     return np.linspace(0.0, p["clearance"] + to_rad, round(seconds / dt) + 1)
+
+
+def ideal(parameters) -> np.ndarray:
+    """Parameters of a brake of the thesis's models alone, with a clearance known to 0.02 rad."""
+    p = parameters[0].copy()
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    return p
+
+
+def noisy(rows: np.ndarray, p, seed: int = 1) -> np.ndarray:
+    """SAMPLE rows with the noise of current and speed that the parameters name."""
+    rng = np.random.default_rng(seed)
+    rho = np.exp(-0.004 / p["current_correlation_time"])
+    noise = lfilter([np.sqrt(1.0 - rho * rho)], [1.0, -rho], rng.normal(size=len(rows)))
+    rows = rows.copy()
+    rows["current_q"] += p["current_sigma"] * noise
+    rows["speed"] += p["speed_sigma"] * rng.normal(size=len(rows))
+    return rows
+
+
+def stops(p, count: int, seed: int = 1, dt: float = 0.004) -> np.ndarray:
+    """Angles of ``count`` stops of ordinary driving, three seconds each: a standstill in the clearance, an application of 0.3 s to
+    10 to 20 rad past contact, half a second of holding with reversals, the release."""
+    rng = np.random.default_rng(seed)
+    parts, time = [], np.arange(round(0.3 / dt)) * dt / 0.3
+    rise = 0.5 * (1.0 - np.cos(np.pi * time))
+    for _ in range(count):
+        top = p["clearance"] + rng.uniform(10.0, 20.0)
+        held = top - rng.uniform(0.5, 2.0) * (1.0 - np.cos(2.0 * np.pi * np.arange(round(1.0 / dt)) * dt / 0.5))
+        parts += [np.zeros(round(1.4 / dt)), top * rise, held, top * (1.0 - rise)]
+    return np.concatenate(parts)

@@ -29,10 +29,13 @@ def friction_state(state, travel, presliding_angle):
     return along(abs(travel)), mean
 
 
-def predict_errors(x, P, decay, contact_variance, gain_variance, noise_decay, noise_variance, offset_variance):
-    transition = np.diag([decay, 1.0, 1.0, noise_decay, 1.0])
-    coloured = (1.0 - noise_decay**2) * noise_variance
-    noise = np.diag([1.0 - decay**2, contact_variance, gain_variance, coloured, offset_variance])
+def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
+    """Order of the states as in `models.fusion`: FAST first, NOISE fourth."""
+    transition = np.eye(len(x))
+    transition[0, 0], transition[3, 3] = decay, noise_decay
+    noise = np.diag(walked)
+    noise[0, 0] += 1.0 - decay**2
+    noise[3, 3] += (1.0 - noise_decay**2) * noise_variance
     return transition @ x, transition @ P @ transition.T + noise
 
 

@@ -29,26 +29,6 @@ def rig_parameters(thickness_mm: float):
     return to_parameters(adaptkit.shipped(pad_thickness_mm=thickness_mm))
 
 
-def ideal(parameters):
-    """A brake of the thesis's models alone, with a clearance known to 0.02 rad."""
-    p = parameters[0].copy()
-    p["effects"] = np.zeros((), p["effects"].dtype)
-    return p
-
-
-def noisy(rows, p, seed=1):
-    """SAMPLE rows with the noise of current and speed that the parameters name."""
-    rng = np.random.default_rng(seed)
-    rho = np.exp(-0.004 / p["current_correlation_time"])
-    noise = np.zeros(len(rows))
-    for i in range(1, len(rows)):
-        noise[i] = rho * noise[i - 1] + np.sqrt(1.0 - rho * rho) * rng.normal()
-    rows = rows.copy()
-    rows["current_q"] += p["current_sigma"] * noise
-    rows["speed"] += p["speed_sigma"] * rng.normal(size=len(rows))
-    return rows
-
-
 @pytest.mark.parametrize("name", LOGS)
 def test_contact_is_signalled_within_two_and_a_half_radians_on_the_rig(logs, name):
     log = logs[name]
@@ -66,9 +46,9 @@ def test_contact_is_signalled_within_two_and_a_half_radians_on_the_rig(logs, nam
 
 @pytest.mark.parametrize("speed", [1.0, 10.0, 60.0, 210.0])
 def test_contact_is_signalled_in_time_at_any_motor_speed(parameters, speed):
-    p = ideal(parameters)
+    p = brake.ideal(parameters)
     rows, _ = brake.samples(p, brake.clamp(p, 12.0, (p["clearance"] + 12.0) / speed))
-    estimates = estimate(noisy(rows, p), p)
+    estimates = estimate(brake.noisy(rows, p), p)
     signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
     assert -0.6 < signalled < 2.5
 
@@ -76,20 +56,20 @@ def test_contact_is_signalled_in_time_at_any_motor_speed(parameters, speed):
 @pytest.mark.parametrize("speed", [1.0, 5.0])
 def test_torque_alone_signals_contact_where_the_angle_says_nothing(parameters, speed):
     """Power-on clearance unknown by three radians: at moderate speed the rise of torque is what tells."""
-    p = ideal(parameters)
+    p = brake.ideal(parameters)
     p["clearance_sigma"] = 3.0
     rows, _ = brake.samples(p, brake.clamp(p, 6.0, (p["clearance"] + 6.0) / speed))
-    estimates = estimate(noisy(rows, p), p)
+    estimates = estimate(brake.noisy(rows, p), p)
     signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
     assert 0.0 < signalled < 2.5
 
 
 def test_an_offset_of_the_current_is_no_contact(parameters):
-    p = ideal(parameters)
+    p = brake.ideal(parameters)
     approach = brake.clamp(p, -1.0, 4.0)
     rows, _ = brake.samples(p, np.concatenate([approach, approach[::-1]] * 4))
     rows["current_q"] += 0.8
-    assert not estimate(noisy(rows, p), p)["engaged"].any()
+    assert not estimate(brake.noisy(rows, p), p)["engaged"].any()
 
 
 def test_false_alarms_are_rarer_than_one_in_ten_thousand_releases():
@@ -166,7 +146,7 @@ def test_the_contact_angle_that_fits_is_left_alone(logs):
 
 def test_contact_follows_slow_growth_between_applications(parameters):
     """The disc grows 20 µm over forty seconds of stops: the walk lets the contact angle follow, and sigma covers the rest."""
-    p = ideal(parameters)
+    p = brake.ideal(parameters)
     p["clearance_sigma"] = 0.05
     p["contact_walk"] = 0.1
     up = brake.clamp(p, 15.0, 0.8)
@@ -176,12 +156,12 @@ def test_contact_follows_slow_growth_between_applications(parameters):
     moved = np.linspace(0.0, growth, len(angle))
     rows, force = brake.samples(p, angle + moved)
     rows["angle"] -= moved
-    estimates = estimate(noisy(rows, p), p)
+    estimates = estimate(brake.noisy(rows, p), p)
     late = slice(len(angle) // 2, None)
     error = estimates["contact_angle"] - (p["clearance"] - moved)
     assert np.abs(error[late]).max() < 0.3
     assert np.mean(np.abs(estimates["force"] - force)[late] < 2.0 * estimates["sigma"][late]) > 0.9
     fixed = p.copy()
     fixed["contact_walk"], fixed["clearance_sigma"] = 0.0, 1e-3
-    stuck = estimate(noisy(rows, p), fixed)
+    stuck = estimate(brake.noisy(rows, p), fixed)
     assert np.abs(estimates["force"] - force)[late].mean() < 0.3 * np.abs(stuck["force"] - force)[late].mean()

@@ -4,7 +4,15 @@ import naive
 import numpy as np
 import pytest
 
-from emb_daemon.models.fusion import STATES, maximum_likelihood, predict_errors, update_errors, variance_along
+from emb_daemon.models.fusion import (
+    OF_THE_FORCE,
+    STATES,
+    force_variance,
+    maximum_likelihood,
+    predict_errors,
+    update_errors,
+    variance_along,
+)
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.thermal import CHAIN, NODES, at_depth, friction_power, heat_step, mean_temperature, stiffness_factor
 from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
@@ -50,11 +58,20 @@ def test_filter_time_update():
     rng = np.random.default_rng(1)
     for _ in range(20):
         x, P, _ = _random_filter(rng)
-        arguments = rng.uniform(0.1, 1.0, 6)
+        arguments = *rng.uniform(0.1, 1.0, 3), rng.uniform(0.0, 1.0, STATES)
         expected = naive.predict_errors(x, P, *arguments)
         predict_errors(x, P, *arguments)
         np.testing.assert_allclose(x, expected[0], rtol=1e-12)
         np.testing.assert_allclose(P, expected[1], rtol=1e-12)
+
+
+def test_force_variance_is_that_of_the_states_the_force_rests_on():
+    _, P, h = _random_filter(np.random.default_rng(3))
+    of_the_torque = [i for i in range(STATES) if i not in OF_THE_FORCE]
+    h[of_the_torque] = 0.0
+    assert force_variance(P, h) == pytest.approx(h @ P @ h)
+    h[of_the_torque] = 7.0
+    assert force_variance(P, h) == pytest.approx(h[list(OF_THE_FORCE)] @ P[np.ix_(OF_THE_FORCE, OF_THE_FORCE)] @ h[list(OF_THE_FORCE)])
 
 
 def test_filter_measurement_update():

@@ -24,9 +24,9 @@ _DT = 0.004
 class Watched:
     """A resolver and a current that pass by, sample after sample."""
 
-    def __init__(self, doubt=0.0):
+    def __init__(self, contradiction=0.0):
         self.c = np.zeros(1, PLAUSIBILITY)
-        self.c["doubt"] = doubt
+        self.c["contradiction"] = contradiction
         self.m = np.zeros(1, SAMPLE)
         self.m["dt"], self.m["has_current"] = _DT, True
         self._noise = np.random.default_rng(1)
@@ -43,14 +43,14 @@ class Watched:
         return verdict
 
 
-def test_doubt_gives_away_twenty_a_sample_and_counts_at_most_twelve_sigma():
+def test_a_contradiction_gives_away_twenty_a_sample_and_counts_at_most_twelve_sigma():
     c = np.zeros(1, PLAUSIBILITY)
     for ratio, expected in ((5.0, 5.0), (2.0, 0.0), (-5.0, 5.0), (100.0, 129.0), (np.nan, 129.0), (0.0, 109.0)):
         count_contradiction(c[0], ratio)
-        assert c["doubt"][0] == expected
+        assert c["contradiction"][0] == expected
     for _ in range(100):
         count_contradiction(c[0], 12.0)
-    assert c["doubt"][0] == 1.5 * 5.0 * 600.0
+    assert c["contradiction"][0] == 1.5 * 5.0 * 600.0
 
 
 def test_torque_beyond_friction():
@@ -82,23 +82,23 @@ def test_a_motion_that_fits_raises_nothing():
         assert Watched().pass_by(500, speed=speed) == AGREE
 
 
-def test_doubt_raises_at_600_and_ends_at_150():
+def test_contradiction_raises_at_600_and_ends_at_150():
     watched = Watched(600.0)
     assert watched.pass_by(1, speed=10.0) == AGREE
-    watched.c["doubt"] = 600.1
+    watched.c["contradiction"] = 600.1
     assert watched.pass_by(1, speed=10.0) == UNDECIDED
-    watched.c["doubt"] = 150.1
+    watched.c["contradiction"] = 150.1
     assert watched.pass_by(1, speed=10.0) == UNDECIDED
-    watched.c["doubt"] = 150.0
+    watched.c["contradiction"] = 150.0
     assert watched.pass_by(1, speed=10.0) == AGREE
 
 
-def test_doubt_raises_five_times_later_before_the_contact_is_confirmed():
+def test_contradiction_raises_five_times_later_before_the_contact_is_confirmed():
     assert Watched(2999.0).pass_by(1, speed=10.0, confirmed=False) == AGREE
     assert Watched(3001.0).pass_by(1, speed=10.0, confirmed=False) == UNDECIDED
     frozen_current = Watched(0.0)
     frozen_current.pass_by(9, speed=10.0, current=1.0, confirmed=False)
-    frozen_current.c["doubt"] = 601.0
+    frozen_current.c["contradiction"] = 601.0
     assert frozen_current.pass_by(1, speed=10.0, current=1.0, confirmed=False) == TORQUE_FROZEN
 
 
@@ -120,7 +120,7 @@ def test_an_angle_that_repeats_under_torque_that_must_turn_the_motor_is_stuck():
     watched = Watched(0.0)
     watched.pass_by(1, speed=0.0)
     watched.pass_by(7, speed=0.0)
-    watched.c["doubt"] = 700.0
+    watched.c["contradiction"] = 700.0
     assert watched.pass_by(1, speed=0.0) == STIFFNESS_WRONG
 
 
@@ -143,7 +143,7 @@ def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_does_for_25_s
     assert watched.pass_by(24, speed=10.0) == STIFFNESS_WRONG
     assert watched.c["frozen_s"][0] == pytest.approx(before + 24 * _DT), "the motor turned on meanwhile"
     assert watched.pass_by(2, speed=10.0) == AGREE
-    assert watched.c["doubt"][0] == 0.0 and watched.c["frozen_s"][0] == 0.0
+    assert watched.c["contradiction"][0] == 0.0 and watched.c["frozen_s"][0] == 0.0
 
 
 def test_a_small_mismatch_of_angle_and_speed_is_forgotten():
@@ -151,7 +151,7 @@ def test_a_small_mismatch_of_angle_and_speed_is_forgotten():
     watched = Watched()
     watched.m["speed"] = 200.0
     assert watched.pass_by(2000, speed=200.0, follows=0.99) == AGREE
-    assert abs(watched.c["unlike"][0]) == pytest.approx(0.008 / (1.0 - np.exp(-0.04)), rel=0.01)
+    assert abs(watched.c["apart"][0]) == pytest.approx(0.008 / (1.0 - np.exp(-0.04)), rel=0.01)
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():

@@ -1,0 +1,199 @@
+"""The independent monitor: the true force of every brake that its datasheet allows lies within the bounds, and each clause of
+them is needed."""
+
+import brake
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.estimator.monitor import (
+    LEAST_GAIN,
+    MONITOR,
+    MOST_FRICTION,
+    MOST_GAIN,
+    OFFSET_SHARE,
+    SMOOTHED_S,
+    TOLERATED_S,
+    bound,
+    contradicts,
+)
+from emb_daemon.estimator.records import SAMPLE
+
+_DT = 0.004
+CLOSING, OPENING, HOLDING = 10.0, -10.0, 0.0
+
+
+class Watched:
+    """A brake of parameters ``p`` whose current passes the monitor."""
+
+    def __init__(self, p):
+        self.p, self.w, self.m = p, np.zeros(1, MONITOR), np.zeros(1, SAMPLE)
+        self.m["dt"], self.m["has_current"], self.m["has_status"] = _DT, True, True
+
+    def hold(self, torque, speed=HOLDING, samples=200):
+        """Steady motor torque, N m, as the datasheet's torque constant would make of the current. Returns low and high."""
+        self.m["current_q"], self.m["speed"] = torque / self.p["torque_constant"], speed
+        for _ in range(samples):
+            bound(self.w[0], self.p, self.m[0])
+        return float(self.w["low"][0]), float(self.w["high"][0])
+
+
+@pytest.fixture(scope="module")
+def p():
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.types import to_parameters
+    from emb_daemon.resources import resource
+
+    return brake.ideal([to_parameters(load_calibration(resource("config/calibration.yaml")))])
+
+
+@given(
+    force=st.floats(0.0, 1.0),
+    gain=st.floats(LEAST_GAIN, MOST_GAIN),
+    load=st.floats(0.0, MOST_FRICTION),
+    dry=st.floats(0.0, MOST_FRICTION),
+    offset=st.floats(-OFFSET_SHARE, OFFSET_SHARE),
+    direction=st.floats(-1.0, 1.0),
+    speed=st.sampled_from([CLOSING, OPENING, HOLDING]),
+)
+def test_the_true_force_of_any_brake_of_the_datasheet_is_within_the_bounds(p, force, gain, load, dry, offset, direction, speed):
+    """Share of the largest force; torque constant, friction and offset anywhere in their ranges; friction against the motion, or
+    either way if the motor stands."""
+    true = force * p["maximum_force"]
+    against = np.sign(speed) if speed else direction
+    torque = p["gear_gain"] * true + against * (load * p["load_friction"] * true + dry * p["offset_friction"])
+    shown = torque / gain + offset * p["gear_gain"] * p["maximum_force"]
+    low, high = Watched(p).hold(shown, speed)
+    assert low - 1.0 <= true <= high + 1.0
+
+
+@pytest.mark.parametrize(("gain", "friction", "offset"), [(1.0, 1.0, 0.0), (0.65, 0.1, 0.04), (1.09, 1.9, -0.04), (0.65, 1.9, 0.04)])
+@pytest.mark.parametrize("seconds", [0.15, 1.0, 8.0])
+def test_strokes_at_any_speed_never_contradict_the_true_force(p, gain, friction, offset, seconds):
+    """From slow to as fast as the motor turns, with the noise of its sensors: the true force, known to 50 N, is never ruled out."""
+    true = p.copy()
+    for name in ("load_friction", "offset_friction"):
+        true[name] *= friction
+    rise = 0.5 * (1.0 - np.cos(np.pi * np.arange(round(seconds / _DT)) * _DT / seconds))
+    still = np.zeros(100)
+    top = p["clearance"] + 18.0
+    path = top * np.concatenate([still, rise, still + 1.0, 1.0 - rise, still, rise, 1.0 - rise, still])
+    rows, force = brake.samples(true, path)
+    rows = brake.noisy(rows, p)
+    rows["current_q"] = rows["current_q"] / gain + offset * p["gear_gain"] * p["maximum_force"] / p["torque_constant"]
+    watched = Watched(p)
+    for row, now in zip(rows, force, strict=True):
+        bound(watched.w[0], p, row)
+        assert not contradicts(watched.w[0], now, 50.0, row["dt"])
+
+
+def test_bounds_of_a_holding_motor_by_hand(p):
+    """1 N m shown: at least 0.6 of it less offset and doubled friction, at most 1.1 of it and both over what the gear leaves."""
+    low, high = Watched(p).hold(1.0)
+    offset = OFFSET_SHARE * p["gear_gain"] * p["maximum_force"]
+    dry, load = 2.0 * p["offset_friction"], 2.0 * p["load_friction"]
+    assert low == pytest.approx((0.6 - offset - dry) / (p["gear_gain"] + load), rel=1e-6)
+    assert high == pytest.approx(min((1.1 + offset + dry) / (p["gear_gain"] - load), p["maximum_force"]), rel=1e-6)
+
+
+def test_a_closing_motor_pays_friction_and_an_opening_one_is_held_by_it(p):
+    """Closing, friction cannot hold the force up: a lower upper bound. Opening, it cannot have taken torque: a higher lower one."""
+    standing, closing, opening = (Watched(p).hold(0.4, speed) for speed in (HOLDING, CLOSING, OPENING))
+    assert closing[0] == pytest.approx(standing[0]) and closing[1] < 0.8 * standing[1]
+    assert opening[1] == pytest.approx(standing[1]) and opening[0] > 1.2 * standing[0]
+
+
+def test_slow_creep_is_no_motion(p):
+    assert Watched(p).hold(0.4, 1.9) == Watched(p).hold(0.4, -1.9) == pytest.approx(Watched(p).hold(0.4, HOLDING))
+
+
+def test_a_torque_that_opens_is_bounded_as_well(p):
+    """A magnet that is stronger than stated makes more of a negative current: the lower bound stays zero."""
+    low, high = Watched(p).hold(-0.2, OPENING)
+    offset, dry = OFFSET_SHARE * p["gear_gain"] * p["maximum_force"], 2.0 * p["offset_friction"]
+    assert low == 0.0
+    assert high == pytest.approx(max(-0.6 * 0.2 + offset + dry, 0.0) / (p["gear_gain"] - 2.0 * p["load_friction"]), rel=1e-6)
+
+
+def test_without_torque_only_offset_and_friction_can_hold_a_force(p):
+    low, high = Watched(p).hold(0.0)
+    assert low == 0.0 and 0.0 < high < 0.35 * p["maximum_force"]
+
+
+@pytest.mark.parametrize(("has_status", "park_brake"), [(True, 1.0), (False, 0.0)])
+def test_a_latched_brake_needs_no_current(p, has_status, park_brake):
+    watched = Watched(p)
+    watched.m["has_status"], watched.m["park_brake"] = has_status, park_brake
+    assert watched.hold(0.0) == (0.0, p["maximum_force"])
+    assert watched.hold(1.0)[0] > 0.0, "but a torque still means a force"
+
+
+def test_a_gear_that_locks_itself_gives_no_upper_bound(p):
+    locking = p.copy()
+    locking["load_friction"] = 0.41 * p["gear_gain"]
+    assert Watched(locking).hold(0.0)[1] == p["maximum_force"]
+    locking["load_friction"] = 0.39 * p["gear_gain"]
+    assert Watched(locking).hold(0.0, CLOSING)[1] < p["maximum_force"]
+    assert Watched(locking).hold(0.0)[1] < p["maximum_force"]
+
+
+def test_without_current_nothing_is_ruled_out_and_it_starts_anew(p):
+    watched = Watched(p)
+    watched.hold(1.0)
+    watched.m["has_current"] = False
+    assert watched.hold(np.nan) == (0.0, p["maximum_force"])
+    watched.m["has_current"] = True
+    assert watched.hold(0.3, samples=1) == pytest.approx(Watched(p).hold(0.3)), "no memory of what was before"
+
+
+def test_what_accelerates_the_motor_is_no_force(p):
+    """A free motor that speeds up at 2000 rad/s^2 through the clearance: its torque means no force."""
+    watched = Watched(p)
+    watched.m["current_q"] = p["inertia"] * 2000.0 / p["torque_constant"]
+    for sample in range(60):
+        watched.m["speed"] = 2000.0 * sample * _DT
+        bound(watched.w[0], p, watched.m[0])
+    assert watched.w["torque"][0] == pytest.approx(0.0, abs=0.12 * p["inertia"] * 2000.0)
+
+
+def test_a_torque_is_smoothed(p):
+    """One sample of ten newton metres moves it by what one sample is of the time, no more."""
+    watched = Watched(p)
+    watched.hold(0.0)
+    watched.hold(10.0, samples=1)
+    assert watched.w["torque"][0] == pytest.approx(10.0 * (1.0 - np.exp(-_DT / SMOOTHED_S)), rel=1e-6)
+
+
+def _said(watched, force, samples):
+    return [contradicts(watched.w[0], force, 100.0, _DT) for _ in range(samples)]
+
+
+def test_a_force_outside_is_contradicted_after_the_time_that_is_tolerated(p):
+    watched = Watched(p)
+    low, high = watched.hold(0.6)
+    for force in (high + 301.0, low - 301.0):
+        _said(watched, 0.5 * (low + high), 500)
+        watched.w["force"] = force
+        assert _said(watched, force, 150).index(True) == pytest.approx(TOLERATED_S / _DT, abs=1.0)
+        back = _said(watched, 0.5 * (low + high), 100)
+        assert not any(back[25:]), "over soon after it is back"
+        watched.w["force"] = force
+        assert not any(_said(watched, force, 90)), "and the time counts anew"
+
+
+def test_three_sigma_are_allowed(p):
+    watched = Watched(p)
+    low, high = watched.hold(0.6)
+    for force in (high + 299.0, low - 299.0):
+        watched.w["force"] = force
+        assert not any(_said(watched, force, 500))
+
+
+def test_what_is_no_number_is_another_facts_business(p):
+    """And leaves no trace: the next force is judged."""
+    watched = Watched(p)
+    low, high = watched.hold(0.6)
+    watched.w["force"] = 0.5 * (low + high)
+    assert not any(_said(watched, np.nan, 200))
+    assert not any(_said(watched, 0.5 * (low + high), 200)) and watched.w["force"][0] == pytest.approx(0.5 * (low + high))

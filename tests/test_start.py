@@ -1,0 +1,139 @@
+"""Power-on: where the contact is unknown until the brake was seen released, and what ends that."""
+
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.wire import contract as r
+from emb_daemon.offline import estimate
+
+
+@pytest.fixture
+def p(parameters):
+    return brake.ideal(parameters)
+
+
+def _clamped(p, past_contact, seconds=2.0, current=True):
+    """Rows of a brake that stands ``past_contact`` rad past contact from the first sample on, and its force."""
+    up = brake.clamp(p, past_contact, 1.0)
+    rows, force = brake.samples(p, np.concatenate([up, np.full(round(seconds / 0.004), up[-1])]))
+    rows, force = rows[len(up) + 100 :].copy(), force[len(up) + 100 :]
+    if not current:
+        rows["current_q"] = 0.0
+    rows["dt"][0] = 0.0
+    return rows, force
+
+
+def _standing(p, seconds=1.0):
+    rows, force = brake.samples(p, np.zeros(round(seconds / 0.004)))
+    return rows, force
+
+
+def _unknown(estimates):
+    return (estimates["reasons"] & r.CONTACT_UNCERTAIN) != 0
+
+
+def _covered(estimates, force, sigmas=3.0):
+    return np.all(np.abs(estimates["force"] - force) < sigmas * estimates["sigma"])
+
+
+def test_a_released_brake_is_known_from_the_first_sample_on(p):
+    """Nobody brakes, the park brake is off: the clearance counts from where the motor stands, and the first stroke is answered by
+    both paths."""
+    rows, force = brake.samples(p, np.concatenate([np.zeros(50), brake.clamp(p, 15.0, 0.3)]))
+    estimates = estimate(rows, p)
+    assert not np.any(_unknown(estimates)) and not np.any(estimates["source"][1:] == r.TORQUE_ONLY)
+    assert _covered(estimates, force)
+
+
+@pytest.mark.parametrize("past_contact", [4.0, 12.0, 22.0])
+@pytest.mark.parametrize(("name", "value"), [("park_brake", 1.0), ("brake_request", 4000.0), ("has_status", False)])
+def test_a_brake_that_may_be_clamped_says_so(p, name, value, past_contact):
+    """Park brake applied, brake requested or nothing heard of either: the torque alone, Degraded, for as long as that lasts."""
+    rows, force = _clamped(p, past_contact)
+    rows[name] = value
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)) and np.all(estimates["source"] == r.TORQUE_ONLY)
+    assert _covered(estimates, force)
+
+
+@pytest.mark.parametrize(("name", "value"), [("park_brake", 1.0), ("has_status", False)])
+@pytest.mark.parametrize("past_contact", [6.0, 14.0, 22.0])
+def test_a_latched_brake_needs_no_current_and_sigma_covers_that(p, name, value, past_contact):
+    """3 to 20 kN without any current: not zero with a small sigma."""
+    rows, force = _clamped(p, past_contact, current=False)
+    rows[name] = value
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)) and _covered(estimates, force)
+
+
+def test_a_clamped_brake_that_says_it_is_released_gives_itself_away(p):
+    """Status says released, yet the motor holds 8 kN: noticed within a tenth of a second, by the torque that it takes."""
+    rows, force = _clamped(p, 15.0)
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)[26:])
+    assert np.all(estimates["source"][26:] == r.TORQUE_ONLY) and _covered(estimates[26:], force[26:])
+
+
+def _latched_then(p):
+    """Latched at 22 rad past contact for a second, opened within a second, standing for a second, clamped again."""
+    top = p["clearance"] + 22.0
+    up, down = brake.clamp(p, 22.0, 1.0), np.linspace(top, 0.0, 250)
+    path = np.concatenate([up, np.full(350, top), down, np.zeros(250), brake.clamp(p, 15.0, 0.5)])
+    rows, force = brake.samples(p, path)
+    first = len(up) + 100
+    rows, force = rows[first:].copy(), force[first:]
+    rows["dt"][0] = 0.0
+    rows["current_q"][:200] = 0.0
+    rows["park_brake"][:240] = 1.0
+    return rows, force, 250 + len(down)
+
+
+def test_what_was_latched_is_known_once_it_was_seen_released(p):
+    """Park brake off, nobody brakes, no torque, and the motor stands: from there the clearance counts, within a quarter second."""
+    rows, force, stands = _latched_then(p)
+    estimates = estimate(rows, p)
+    unknown = np.flatnonzero(_unknown(estimates))
+    assert np.array_equal(unknown, np.arange(unknown[-1] + 1)) and stands < unknown[-1] < stands + 60
+    assert _covered(estimates, force)
+    known = estimates[unknown[-1] + 60 :]
+    assert np.all(known["source"] == r.FUSED) and known["sigma"][-1] < 300.0
+    assert np.abs(known["force"] - force[unknown[-1] + 60 :]).max() < 100.0
+
+
+@pytest.mark.parametrize(("name", "value"), [("park_brake", 1.0), ("brake_request", 2000.0), ("has_status", False)])
+def test_while_somebody_may_brake_standing_still_is_no_release(p, name, value):
+    rows, _, stands = _latched_then(p)
+    rows[name] = value
+    assert np.all(_unknown(estimate(rows, p)))
+
+
+def test_a_motor_that_moves_or_holds_is_not_released(p):
+    """Slow opening without a stop, and a hold under torque with everything released in the status."""
+    rows, _, _ = _latched_then(p)
+    moving = rows[: 100 + 240].copy()
+    assert np.all(_unknown(estimate(moving, p)))
+    holding, _ = _clamped(p, 15.0)
+    holding["park_brake"][:100] = 1.0
+    assert np.all(_unknown(estimate(holding, p)))
+
+
+def test_status_that_comes_late_ends_it(p):
+    rows, _ = _standing(p)
+    rows["has_status"][:100] = False
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)[:100]) and not np.any(_unknown(estimates)[102:])
+
+
+def test_unknown_and_no_current_leaves_nothing(p):
+    rows, _ = _standing(p)
+    rows["park_brake"], rows["has_current"] = 1.0, False
+    estimates = estimate(rows, p)
+    assert np.all(estimates["source"] == r.INVALID) and np.all(estimates["mode"] == r.FAULT)
+
+
+def test_nothing_is_learned_while_the_contact_is_unknown(p):
+    rows, _, _ = _latched_then(p)
+    rows["park_brake"] = 1.0
+    estimates = estimate(rows, p)
+    assert np.all(estimates["stiffness_factor"] == estimates["stiffness_factor"][0])

@@ -1,0 +1,156 @@
+"""The table of facts: each fact gives its reasons and source, and every reason of the DBC has something that raises it."""
+
+import functools
+import operator
+import re
+from pathlib import Path
+
+import brake
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.wire import contract as r
+from emb_daemon.estimator import status
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
+from emb_daemon.estimator.status import TABLE, names, tell_status
+from emb_daemon.estimator.step import _look
+
+#: Reasons that frames, bus and clock give, outside the estimator; test_faults.py, test_faults_loop.py and test_hostile.py raise
+#: each of them.
+_OUTSIDE = (
+    r.RESOLVER_LOST | r.CURRENT_LOST | r.THERMOCOUPLE_LOST | r.WHEEL_SPEED_LOST | r.WHEEL_PULSE_LOST | r.VEHICLE_STATUS_LOST
+    | r.E2E_ERROR | r.BUS_DISTURBED | r.DEADLINE_MISSED | r.SECOND_SENDER
+)  # fmt: skip
+
+_BITS = {name: 1 << bit for bit, name in enumerate(TABLE)}
+
+
+def _told(facts):
+    out = np.zeros(1, ESTIMATE)
+    out["reasons"], out["source"] = -1, -1
+    tell_status(facts, out[0])
+    return int(out["reasons"][0]), int(out["source"][0])
+
+
+def test_without_facts_both_paths_hold():
+    assert _told(0) == (0, r.FUSED)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_each_fact_gives_its_reasons_and_source(name):
+    assert _told(_BITS[name]) == (TABLE[name].reasons, TABLE[name].source)
+    assert names(_BITS[name]) == (name,)
+
+
+@given(st.sets(st.sampled_from(list(TABLE))))
+def test_what_leaves_less_decides(chosen):
+    """Nothing leaves nothing, whatever else is true; without stiffness the torque goes on, whatever was said of the torque while
+    the paths were compared; else stiffness; else both."""
+    reasons, source = _told(sum(_BITS[name] for name in chosen))
+    left = {TABLE[name].source for name in chosen}
+    assert source == next((s for s in (r.INVALID, r.TORQUE_ONLY, r.STIFFNESS_ONLY) if s in left), r.FUSED)
+    assert reasons == functools.reduce(operator.or_, (TABLE[name].reasons for name in chosen), 0)
+
+
+def test_the_bits_are_named_after_their_facts():
+    """A constant that stands in another order than the table would tell something else than was found."""
+    shorter = {"temperature_uncertain": "TEMPERATURE_VAGUE"}
+    for name, bit in _BITS.items():
+        assert getattr(status, shorter.get(name, name.upper())) == bit
+
+
+def test_every_reason_of_the_dbc_can_be_raised():
+    of_the_table = functools.reduce(operator.or_, (fact.reasons for fact in TABLE.values()))
+    assert of_the_table | _OUTSIDE == (1 << len(r.REASONS)) - 1
+    dbc = (Path(__file__).parent.parent / "dbc" / "emb.dbc").read_text(encoding="utf-8")
+    assert set(re.findall(r"SG_ DegradedReasons : \d+\|(\d+)@", dbc)) == {str(len(r.REASONS))}
+
+
+class _Seen:
+    """A state, a sample and an estimate in which nothing is wrong."""
+
+    def __init__(self, p):
+        self.p, self.state, self.sample, self.out = p, new_state(), np.zeros(1, SAMPLE), np.zeros(1, ESTIMATE)
+        self.state["temperature_known"], self.state["scale"] = True, 1.0
+        self.state["monitor"]["high"] = p["maximum_force"]
+        self.sample["dt"] = 0.004
+        self.out["force"], self.out["sigma"] = 5000.0, 40.0
+
+    def facts(self, samples=1):
+        for _ in range(samples):
+            found = _look(self.state[0], self.p, self.sample[0], self.out[0])
+            if found & _BITS["bounds_contradict"]:
+                break
+        return set(names(found))
+
+
+@pytest.fixture
+def seen(parameters):
+    return _Seen(brake.ideal(parameters))
+
+
+def test_nothing_wrong_is_no_fact(seen):
+    assert seen.facts() == set()
+
+
+def test_temperature(seen):
+    seen.state["temperature_sigma"] = 9.9
+    assert not seen.facts()
+    seen.state["temperature_sigma"] = 10.1
+    assert seen.facts() == {"temperature_uncertain"}
+    seen.state["temperature_known"] = False
+    assert seen.facts() == {"temperature_unknown"}
+
+
+def test_stuck_thermocouple_and_contradicted_wheel(seen):
+    seen.state["plate_stuck"] = True
+    seen.state["wheel"]["contradicted"] = True
+    assert seen.facts() == {"thermocouple_stuck", "wheel_contradicted"}
+
+
+@pytest.mark.parametrize("scale", [0.3, 3.0])
+def test_a_learned_value_at_its_bound(seen, scale):
+    seen.state["scale"] = scale
+    assert seen.facts() == {"bound_reached"}
+
+
+def test_a_hundredth_of_the_largest_force(seen):
+    seen.out["sigma"] = 0.0101 * seen.p["maximum_force"]
+    assert seen.facts() == {"force_uncertain"}
+    seen.out["sigma"] = 0.0099 * seen.p["maximum_force"]
+    assert seen.facts() == set()
+    seen.out["contact_sigma"] = 0.51
+    assert seen.facts() == {"force_uncertain"}
+
+
+def test_beyond_what_was_calibrated(seen):
+    seen.out["force"] = 1.01 * seen.p["maximum_force"]
+    assert "beyond_range" in seen.facts()
+    seen.out["force"] = 5000.0
+    seen.sample["speed"] = -1.21 * seen.p["maximum_speed"]
+    assert seen.facts() == {"beyond_range"}
+
+
+@pytest.mark.parametrize("field", ["force", "sigma"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e28])
+def test_what_no_brake_can_do_is_neither_told_nor_used(seen, field, value):
+    """Force and sigma stay within the brake's, whatever came of the arithmetic."""
+    seen.out[field] = value
+    facts, most = seen.facts(), seen.p["maximum_force"]
+    assert 0.0 <= seen.out["force"][0] <= 1.3 * most and 0.0 < seen.out["sigma"][0] <= most
+    if field == "force" or not np.isfinite(value):
+        assert "not_a_number" in facts and seen.out["force"][0] == 0.0 and seen.out["sigma"][0] == most
+    else:
+        assert "force_uncertain" in facts
+
+
+def test_a_force_that_the_monitor_rules_out_is_replaced_by_its_bounds(seen):
+    """Not at once: a stroke may leave the smoothed torque behind. Then: the middle of the interval, half its width for sigma."""
+    seen.facts(200)
+    seen.state["monitor"]["low"], seen.state["monitor"]["high"] = 1000.0, 3000.0
+    assert "bounds_contradict" not in seen.facts(98), "within the time that is tolerated"
+    assert seen.out["force"][0] == 5000.0
+    assert "bounds_contradict" in seen.facts(4)
+    assert (seen.out["force"][0], seen.out["sigma"][0]) == (2000.0, 1000.0)
