@@ -28,7 +28,7 @@ from emb_daemon.estimator.status import (
     ZERO_MOVED,
     tell_status,
 )
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, set_priors
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, set_cold, set_friction, set_priors
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import frozen, watch
@@ -39,8 +39,6 @@ from emb_daemon.models.torque import torque_balance
 SILENCE_S = 0.1
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
-#: Temperature of a brake that tells none, degC.
-_ROOM_C = 20.0
 #: Clamp force over the largest of the calibration that no brake makes.
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
@@ -56,7 +54,7 @@ def _start(s, p, m):
     s.speed = m.speed
     if not s.resumed:
         s.clearance, s.clearance_sigma, s.scale = p.clearance, p.clearance_sigma, 1.0
-        set_priors(s.covariance, p, m.caliper if m.has_thermocouple else m.ambient if m.has_status else _ROOM_C)
+        set_priors(s.covariance, p)
         if p.clearance_sigma == 0.0:
             s.covariance[SCALE, SCALE] = 0.0
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
@@ -88,6 +86,10 @@ def step(s, p, m, out):
     heat(s, p, m)
     if s.temperature_known and not knew and not s.resumed:
         s.growth_start = s.disc
+        set_friction(s.covariance, p, m.caliper)
+        if p.clearance_sigma > 0.0:
+            set_cold(s.covariance, p, 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference)
+        open_all(s, p)
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
     torque, leverage, friction_variance = torque_path(s, p, m)

@@ -33,6 +33,8 @@ _SETTLED_M = 5e-6
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
 _SCALE, _SCALE_WALK_PER_SQRT_S = 0.001, 0.01 / 60.0
+#: Kelvin below the calibration's temperature that its own days cover.
+_MEASURED_K = 10.0
 #: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
 _GROWTH_JUMP_M_PER_K = 0.26e-6
 #: Torque constant and current gain: datasheets state 2 to 3 %; a calibration's own is known better, and ages.
@@ -68,15 +70,31 @@ def torque_offset(p):
 
 
 @njit
-def thickening(p, caliper):
+def thickening(caliper):
     """Factor by which friction's prior is wider at ``caliper`` degC than at the calibration's temperature."""
     return exp(min(max(_WARM_C - caliper, 0.0), 80.0) / _THICKENS_K)
 
 
 @njit
-def set_priors(P, p, caliper):
-    """Covariance at power-on of a brake that is as its calibration says; ``caliper`` degC."""
-    thick = thickening(p, caliper)
+def set_friction(P, p, caliper):
+    """Covariance of the gear friction of a brake at ``caliper`` degC that has not moved yet."""
+    thick = thickening(caliper)
+    P[LOAD, LOAD] = (p.torque_relative_sigma * p.gear_gain) ** 2 + (_FRICTION * p.load_friction * thick) ** 2
+    P[COULOMB, COULOMB] = (_FRICTION * p.offset_friction * thick) ** 2
+    P[VISCOUS, VISCOUS] = (_VISCOUS * p.offset_friction / p.maximum_speed * thick) ** 2
+
+
+@njit
+def set_cold(P, p, rise):
+    """Variance of the stiffness of pads ``rise`` K warmer than those of the calibration: softening was identified on hot pads,
+    and what it says of colder ones is extrapolated."""
+    extrapolated = (p.thermal.softening + p.thermal.softening_history) * max(-rise - _MEASURED_K, 0.0)
+    P[SCALE, SCALE] += extrapolated * extrapolated
+
+
+@njit
+def set_priors(P, p):
+    """Covariance at power-on of a brake that is as its calibration says."""
     P[:, :] = 0.0
     P[FAST, FAST] = 1.0
     P[CONTACT, CONTACT] = p.clearance_sigma**2
@@ -84,9 +102,7 @@ def set_priors(P, p, caliper):
     P[NOISE, NOISE] = (p.torque_constant * p.current_sigma) ** 2
     P[OFFSET, OFFSET] = torque_offset(p) ** 2
     P[SCALE, SCALE] = _SCALE**2
-    P[LOAD, LOAD] = (p.torque_relative_sigma * p.gear_gain) ** 2 + (_FRICTION * p.load_friction * thick) ** 2
-    P[COULOMB, COULOMB] = (_FRICTION * p.offset_friction * thick) ** 2
-    P[VISCOUS, VISCOUS] = (_VISCOUS * p.offset_friction / p.maximum_speed * thick) ** 2
+    set_friction(P, p, _WARM_C)
     P[INERTIA, INERTIA] = _INERTIA**2
     P[FADE, FADE] = _FADE**2
     P[HOUSING, HOUSING] = _HOUSING**2
