@@ -105,9 +105,9 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     mean_force = 0.5 * (force_before + s.force)
     predicted = leverage * mean_force
     h = s.sensitivity[0]
-    accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
+    slow, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     speed = 0.5 * (m.speed + s.speed)
-    to_torque(h, leverage, s.friction_mean, mean_force, speed, accelerating, needed, s.winding, s.housing)
+    to_torque(h, leverage, s.friction_mean, mean_force, speed, slow, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])

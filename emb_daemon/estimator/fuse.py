@@ -34,7 +34,7 @@ from emb_daemon.estimator.status import (
     TORQUE_OLD,
 )
 from emb_daemon.jit import njit
-from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, set_walks, torque_offset
+from emb_daemon.estimator.unknown import HOUSING_S, SLOW_RAD_PER_S, WINDING_S, set_walks, torque_offset
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -89,9 +89,11 @@ def _clear_acceleration(s, m):
 
 @njit
 def needed_torque(s, p, m, mean_force, leverage):
-    """Torque (N m) that inertia took, and that force, friction and inertia must have taken together."""
+    """Torques (N m): friction as far as it is slow, what inertia took, and what force, friction and inertia took together."""
     accelerating = p.inertia * _clear_acceleration(s, m)
-    return accelerating, leverage * mean_force + p.offset_friction * s.friction_mean + accelerating
+    friction = s.friction_mean * (p.offset_friction + p.load_friction * mean_force)
+    slow = friction * exp(-0.5 * abs(m.speed + s.speed) / SLOW_RAD_PER_S)
+    return slow, accelerating, leverage * mean_force + p.offset_friction * s.friction_mean + accelerating
 
 
 @njit
@@ -137,12 +139,16 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
         white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
         speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
-        accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
-        to_torque(h, leverage, s_mean, mean_force, speed, accelerating, needed, s.winding, s.housing)
+        slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
+        to_torque(h, leverage, s_mean, mean_force, speed, slow_friction, accelerating, needed, s.winding, s.housing)
         h[FAST] = leverage * spread
         slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + max(slow, 0.0) / (leverage * leverage))
         trusted = s.plausibility.verdict == AGREE and not s.unknown
+        if trusted != s.trusted:
+            # What the alternatives saw around a sensor's fault tells nothing of the brake.
+            open_all(s, p)
+            s.trusted = trusted
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
         out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
@@ -150,7 +156,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             a = s.alternatives[kind]
             to_force(h, spread, a.slope, s.force + a.shift, warmth)
             taken = needed + leverage * a.shift
-            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, accelerating, taken, s.winding, s.housing)
+            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
             second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
             if trusted:
                 weigh(a, least_odds(kind), first, variance, second, variance_a)

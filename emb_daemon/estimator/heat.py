@@ -41,7 +41,9 @@ def _start_heat(s, t, m):
         share = t.node_position[node] / t.thickness
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-    s.temperature_sigma = s.history_sigma = abs(s.disc - m.caliper)
+    # Plates that are not as warm as all around them tell of heat on its way, and nothing of how long it has been.
+    around = m.ambient if m.has_status else m.caliper
+    s.temperature_sigma = s.history_sigma = max(abs(s.disc - m.caliper), abs(s.disc - around))
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference

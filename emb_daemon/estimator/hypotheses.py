@@ -27,6 +27,7 @@ from emb_daemon.models.fusion import (
     NOISE,
     OFFSET,
     SCALE,
+    SLOW,
     STATES,
     VISCOUS,
     force_variance,
@@ -58,7 +59,7 @@ ALTERNATIVES = 3
 STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH = range(ALTERNATIVES)
 
 #: States of motor and friction.
-_OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA)
+_OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
 #: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over
 #: the first one's.
@@ -169,15 +170,16 @@ def to_force(h, spread, slope, force, warmth):
 
 
 @njit
-def to_torque(h, leverage, friction_mean, force, speed, accelerating, motor_torque, winding, housing):
-    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained; ``accelerating`` and ``motor_torque``
-    N m, what inertia and what everything took."""
+def to_torque(h, leverage, friction_mean, force, speed, slow, accelerating, motor_torque, winding, housing):
+    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained; ``slow``,
+    ``accelerating`` and ``motor_torque`` N m: friction as far as it is slow, what inertia and what everything took."""
     for i in (FAST, CONTACT, SCALE, GROWTH):
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
     h[GAIN], h[FADE], h[HOUSING] = -motor_torque, -motor_torque * winding, -motor_torque * housing
     h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force, friction_mean, speed
     h[INERTIA] = accelerating
+    h[SLOW] = slow
 
 
 @njit

@@ -181,6 +181,7 @@ STATE = np.dtype(
         ("gain", "f8", (STATES,)),
         ("current_before", "f8"),
         ("had_current", "?"),
+        ("trusted", "?"),
         ("contact_anchor", "f8"),
         ("scale", "f8"),
         ("growth", "f8"),

@@ -21,6 +21,7 @@ from emb_daemon.models.fusion import (
     NOISE,
     OFFSET,
     SCALE,
+    SLOW,
     VISCOUS,
 )
 
@@ -46,6 +47,9 @@ _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
 _INERTIA = 0.02
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
 _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
+#: Rise of friction at low speed that a calibration without it leaves, and that wear or another lubricant bring (breakaway over
+#: Coulomb friction 1.3 to 2: Armstrong-Helouvry et al., Automatica 30(7), 1994), shares; speed at which it has fallen to 1/e, rad/s.
+_SLOW, _SLOW_JUMP, SLOW_RAD_PER_S = 0.05, 0.5, 5.0
 #: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
 #: 20 degC: it doubles in ten), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
 _THICKENS_K, _WARM_C, _VISCOUS = 15.0, 15.0, 0.3
@@ -104,6 +108,7 @@ def set_priors(P, p):
     P[SCALE, SCALE] = _SCALE**2
     set_friction(P, p, _WARM_C)
     P[INERTIA, INERTIA] = _INERTIA**2
+    P[SLOW, SLOW] = _SLOW**2
     P[FADE, FADE] = _FADE**2
     P[HOUSING, HOUSING] = _HOUSING**2
 
@@ -112,7 +117,7 @@ def set_priors(P, p):
 def set_walks(walked, p, x, winding, housing, dt):
     """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat."""
     faded = abs(x[FADE]) * winding + abs(x[HOUSING]) * housing + _FADE * (winding + housing)
-    walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = 0.0
+    walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = walked[SLOW] = 0.0
     walked[CONTACT] = p.contact_walk * p.contact_walk * dt
     walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + (_MISSED * faded) ** 2 / _MISSED_S) * dt
     walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
@@ -179,4 +184,5 @@ def add_torque_jumps(P, p):
     P[OFFSET, OFFSET] += torque_offset(p) ** 2
     P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
     P[COULOMB, COULOMB] += (_FRICTION_JUMP * p.offset_friction) ** 2
+    P[SLOW, SLOW] += _SLOW_JUMP**2
     P[VISCOUS, VISCOUS] += (_FRICTION_JUMP * p.offset_friction / p.maximum_speed) ** 2

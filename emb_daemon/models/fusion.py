@@ -13,12 +13,13 @@ for noise, which takes slow model error for white noise. Here the filter estimat
     LOAD      error of the gear friction per clamp force, m/rad
     COULOMB   error of the gear friction without clamp force, N m
     VISCOUS   error of the friction torque per motor speed, N m s/rad
+    SLOW      relative rise of the gear friction at low speed (Stribeck)
     FADE      relative loss of motor torque per heat that the motor's own current left in the winding
     HOUSING   the same for the heat left in the motor's housing
     INERTIA   relative error of the inertia
 
     F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH
-    torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS
+    torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS + T_f SLOW
                                           - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
                                           + white noise,  D = gamma + mu s
 
@@ -29,8 +30,8 @@ from math import sqrt
 
 from emb_daemon.jit import njit
 
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA) = range(13)
-STATES = 13
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(14)
+STATES = 14
 #: States that the clamp force itself rests on.
 OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
 

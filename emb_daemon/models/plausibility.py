@@ -20,7 +20,8 @@ from emb_daemon.jit import njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
 #: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
-#: ``flickered``: samples in which the speed changed while the angle stood.
+#: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the
+#: current changed.
 #: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one.
 PLAUSIBILITY = np.dtype(
@@ -32,6 +33,7 @@ PLAUSIBILITY = np.dtype(
         ("idle", "i8"),
         ("alike", "i8"),
         ("flickered", "i8"),
+        ("current_flickered", "i8"),
         ("current", "f8"),
         ("frozen_s", "f8"),
         ("averaged", "?"),
@@ -93,6 +95,7 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
     c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
     if m.has_current:
         c.idle = c.idle + 1 if m.current_q == c.current else 0
+        c.current_flickered += c.idle == 0
         c.current = m.current_q
     was = c.verdict
     if was == STIFFNESS_WRONG:
@@ -113,7 +116,9 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
         c.frozen_s = c.still * m.dt
         c.alike = 0
         return c.verdict
-    if not disagree:
+    if c.idle >= _FROZEN and c.current_flickered >= _FLICKERED and c.still < _FROZEN:
+        c.verdict = TORQUE_FROZEN
+    elif not disagree:
         c.verdict = AGREE
     elif c.idle >= _REPEATED and c.still < _REPEATED:
         c.verdict = TORQUE_FROZEN
