@@ -12,6 +12,7 @@ from emb_daemon.estimator.hypotheses import (
     least_odds,
     mix,
     open_all,
+    open_again,
     place,
     settle,
     to_force,
@@ -172,6 +173,9 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     else:
         out.torque_sigma = np.inf
         s.torque_age += m.dt
+    if s.plausibility.verdict == TORQUE_FROZEN:
+        # Nothing has jumped: until it was found out, a frozen current spoke for every jump.
+        open_again(s, p)
     out.force, out.sigma = mix(s, h, spread, warmth)
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:

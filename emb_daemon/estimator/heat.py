@@ -13,6 +13,9 @@ from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power
 
 #: Clamp force from which pads and disc exchange heat by contact, N.
 TOUCHING_N = 200.0
+#: Rise of pads over that of their backing plates while heat is on its way: the pad's own resistance over that to the plate's
+#: surroundings.
+_BEHIND_PLATES = 4.0
 #: Disc speed that is assumed where nothing tells of it, for what it may have heated, rad/s: 110 km/h.
 _UNSEEN_RAD_PER_S = 100.0
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
@@ -43,7 +46,7 @@ def _start_heat(s, t, m):
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
     # Plates that are not as warm as all around them tell of heat on its way, and nothing of how long it has been.
     around = m.ambient if m.has_status else m.caliper
-    s.temperature_sigma = s.history_sigma = max(abs(s.disc - m.caliper), abs(s.disc - around))
+    s.temperature_sigma = s.history_sigma = _BEHIND_PLATES * max(abs(s.disc - m.caliper), abs(s.disc - around))
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference

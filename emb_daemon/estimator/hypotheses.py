@@ -36,11 +36,11 @@ from emb_daemon.models.fusion import (
 )
 from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 
-#: Logarithm of the odds that a brake has jumped since it was last looked at: once in a thousand stops. They cannot fall lower,
+#: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall lower,
 #: or a later jump would have to make up for the past.
-PRIOR_ODDS = -7.0
+PRIOR_ODDS = -6.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
-_GROWTH_ODDS = -10.0
+_GROWTH_ODDS = -8.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0

@@ -19,6 +19,7 @@ from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
     BOUNDS_CONTRADICT,
+    CURRENT_IMPLAUSIBLE,
     FORCE_UNCERTAIN,
     NOT_A_NUMBER,
     TEMPERATURE_VAGUE,
@@ -28,7 +29,7 @@ from emb_daemon.estimator.status import (
     ZERO_MOVED,
     tell_status,
 )
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, set_cold, set_friction, set_priors
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import frozen, watch
@@ -88,7 +89,8 @@ def step(s, p, m, out):
         s.growth_start = s.disc
         set_friction(s.covariance, p, m.caliper)
         if p.clearance_sigma > 0.0:
-            set_cold(s.covariance, p, 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference)
+            rise = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference
+            add_softening(s.covariance, p, rise, s.temperature_sigma)
         open_all(s, p)
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
@@ -116,14 +118,13 @@ def step(s, p, m, out):
     out.engaged = s.contact.engaged
     tell(s, out)
     out.mode = RUNNING
-    tell_status(facts | _look(s, p, m, out) | (ZERO_MOVED if moved_zero else 0), out)
+    tell_status(_look(s, p, m, facts, out) | (ZERO_MOVED if moved_zero else 0), out)
     s.fused, s.fused_sigma = out.force, out.sigma
 
 
 @njit
-def _look(s, p, m, out):
-    """Facts beside the paths' own; keeps force and sigma within what the brake can do."""
-    facts = 0
+def _look(s, p, m, facts, out):
+    """``facts`` of the paths and those beside them; keeps force and sigma within what the brake can do."""
     if not s.temperature_known:
         facts |= TEMPERATURE_UNKNOWN
     elif s.temperature_sigma > _TEMPERATURE_UNCERTAIN_K:
@@ -136,10 +137,13 @@ def _look(s, p, m, out):
         facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         facts |= BEYOND_RANGE
-    if contradicts(s.monitor, out.force, out.sigma, m.dt):
+    # A current that is frozen bounds nothing. Else current or estimate is wrong, and sigma reaches from one to the other.
+    if contradicts(s.monitor, out.force, out.sigma, m.dt) and not facts & CURRENT_IMPLAUSIBLE:
         facts |= BOUNDS_CONTRADICT
         low, high = s.monitor.low, s.monitor.high
-        out.force, out.sigma = 0.5 * (low + high), max(0.5 * (high - low), out.sigma)
+        middle = 0.5 * (low + high)
+        out.sigma = max(0.5 * (high - low), out.sigma, abs(out.force - middle))
+        out.force = middle
     if not (np.isfinite(out.force) and np.isfinite(out.sigma)) or out.force > _POSSIBLE * p.maximum_force:
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force

@@ -89,11 +89,12 @@ def set_friction(P, p, caliper):
 
 
 @njit
-def set_cold(P, p, rise):
-    """Variance of the stiffness of pads ``rise`` K warmer than those of the calibration: softening was identified on hot pads,
-    and what it says of colder ones is extrapolated."""
-    extrapolated = (p.thermal.softening + p.thermal.softening_history) * max(-rise - _MEASURED_K, 0.0)
-    P[SCALE, SCALE] += extrapolated * extrapolated
+def add_softening(P, p, rise, sigma):
+    """What the temperature of pads that are first seen leaves open of the stiffness: they are ``rise`` K warmer than those of
+    the calibration, give or take ``sigma`` K. Softening was identified on hot pads; what it says of colder ones is
+    extrapolated."""
+    unsure = max(-rise - _MEASURED_K, 0.0) + sigma
+    P[SCALE, SCALE] += ((p.thermal.softening + p.thermal.softening_history) * unsure) ** 2
 
 
 @njit
