@@ -20,8 +20,8 @@ from math import sqrt
 from emb_daemon.jit import njit
 
 STATES = 5
-#: Index of the torque's offset.
-OFFSET = 4
+#: Index of the torque path's relative error, and of the torque's offset.
+GAIN, OFFSET = 2, 4
 
 
 @njit
