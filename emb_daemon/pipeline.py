@@ -124,6 +124,13 @@ class Pipeline:
         """State when listening began, so that silence can be told from the very start."""
         self.corners["sample_ns"] = time_ns
 
+    def begin_anew(self, corner: int, parameters: np.void) -> None:
+        """Estimate a corner with a PARAMETERS record from its next sample on, as after a restart."""
+        self.parameters[corner] = parameters
+        self.states[corner] = new_state()[0]
+        for name in ("started", "cycle", "announced", "predicted", "late_ns", "agreed"):
+            self.corners[name][corner] = 0
+
     def collect(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
         """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the buffer of samples is nearly full.
 
@@ -378,7 +385,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             else:
                 asked = limits[e.corner]
                 values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result
-                values[3], values[4] = 0.0, 1e-3 * asked.high_force
+                values[3], values[4] = 1e-3 * asked.low_force, 1e-3 * asked.high_force
                 values[5], values[6] = asked.dither_amplitude, asked.dither_frequency
             payload = np.uint64(0)
             for column in range(wires.sent_count[kind]):

@@ -1,7 +1,6 @@
 """Logs through the daemon's pipeline, one after the other as one drive."""
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,6 @@ from emb_daemon.pipeline import Pipeline
 
 #: Pause between two logs of which the second's clock does not go on from the first's.
 _PAUSE_NS = 1_000_000_000
-
-
-def _log_date(time_ns: int) -> str:
-    """The date by a log's clock, so that a replay writes the same file whenever it runs."""
-    return datetime.fromtimestamp(1e-9 * time_ns, UTC).isoformat(timespec="seconds")
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ class Replay:
         self._parameters = np.zeros(4, PARAMETERS)
         self._parameters[self._index] = to_parameters(calibration)
         self._measured_torque = measured_torque
-        self.adaptation = Adaptation({corner: calibration}, Memory(state), _log_date) if state else None
+        self.adaptation = Adaptation({corner: calibration}, Memory(state), int) if state else None
         self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, adaptation=self.adaptation)
         self._end_ns: int | None = None
 

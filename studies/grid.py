@@ -146,7 +146,7 @@ class _Daemon:
     def start(self) -> None:
         parameters = np.zeros(4, PARAMETERS)
         parameters[0] = to_parameters(self._calibration)
-        adaptation = Adaptation({"FL": self._calibration}, Memory(self._folder), lambda _: "2000-01-01T00:00:00+00:00")
+        adaptation = Adaptation({"FL": self._calibration}, Memory(self._folder), int)
         self._pipeline, self._begun = Pipeline(parameters, ("FL",), adaptation=adaptation), False
 
     def answer(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,17 @@ import msgspec
 import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
-from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.learned import (
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    STIFFNESS_RELATIVE_SIGMA,
+    STIFFNESS_SIGMA,
+    Evaluation,
+    curve_values,
+)
+from emb_daemon.adapt.memory import Memory, entry_of, with_entry
+from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import PARAMETERS
@@ -24,32 +34,48 @@ def shipped(**changes):
     return msgspec.structs.replace(load_calibration(ROOT / "config" / "calibration.yaml"), **changes)
 
 
+def accepted(store):
+    """A store that has accepted one more training: twice the friction offset."""
+    calibration = shipped()
+    values = curve_values(calibration, to_parameters(calibration)["curve"]) | {
+        LOAD_FRICTION: calibration.friction.load_m_per_rad,
+        OFFSET_FRICTION: 2.0 * calibration.friction.offset_Nm,
+        PRESLIDING_ANGLE: calibration.friction.presliding_angle_rad,
+        STIFFNESS_SIGMA: 60.0,
+        STIFFNESS_RELATIVE_SIGMA: 0.01,
+    }
+    return with_entry(store, entry_of(ACCEPTED, Evaluation(ACCEPTED, values=values), "2026-11-21", 20.0, 3.0))
+
+
 class ClosedLoop:
-    """One corner of the simulated car and the daemon's pipeline that learns in ``state``.
+    """The simulated car and the daemon's pipeline that learns in ``state``.
 
     Args:
         pads_mm: what is mounted; the daemon believes in ``calibration``.
+        corners: that the car has and the daemon estimates.
     """
 
-    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, seed: int = 1):
-        self.calibration = calibration or shipped()
-        self.car = Car(np.atleast_1d(plant_from_calibration(self.calibration, pad_thickness_mm=pads_mm)), ("FL",), seed)
-        self.adaptation = Adaptation({"FL": self.calibration}, Memory(state), lambda time_ns: f"{1e-9 * time_ns:.1f}")
+    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, seed: int = 1, corners=("FL",)):
+        self.calibration, self.corners = calibration or shipped(), corners
+        plant = plant_from_calibration(self.calibration, pad_thickness_mm=pads_mm)
+        self.car = Car(np.repeat(np.atleast_1d(plant), len(corners)), corners, seed)
+        calibrations = dict.fromkeys(corners, self.calibration)
+        self.adaptation = Adaptation(calibrations, Memory(state), int)
         self.parameters = np.zeros(4, PARAMETERS)
-        self.parameters[0] = to_parameters(self.calibration)
-        self.pipeline = Pipeline(self.parameters, ("FL",), capacity=64, adaptation=self.adaptation)
+        self.pipeline = Pipeline(self.parameters, corners, capacity=64, adaptation=self.adaptation)
         self.pipeline.begin(0)
         self.sent = []
 
     def run(self, schedule, until=None, spoil=None):
-        """Drive ``schedule`` until it, or ``until(estimate)``, ends; returns (ESTIMATE rows, TRUTH rows).
+        """Drive ``schedule`` until it, or ``until(estimate)``, ends; returns (ESTIMATE rows, TRUTH rows), the truth being the
+        first corner's or, of several, all corners' in a row each.
 
         ``spoil(frames)`` may return other frames in their place."""
         estimates, truths = [], []
-        commands = commands_of(schedule, ("FL",))
+        commands = commands_of(schedule, self.corners)
         for row in range(len(schedule)):
             frames = self.car.tick(commands[row], schedule.drives[row])
-            truth = self.car.truth[0].copy()
+            truth = self.car.truth.copy() if len(self.corners) > 1 else self.car.truth[0].copy()
             _, count = self.pipeline.consume(frames if spoil is None else spoil(frames))
             answers = self.pipeline.broadcast(count)
             self.car.hear(answers)

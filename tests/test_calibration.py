@@ -9,7 +9,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.adapt.limits import to_limits
+from emb_daemon.adapt.records import to_limits
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash, dump_calibration, load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved

@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 from test_pipeline import _run, _sliding, car  # noqa: F401
 
-from emb_daemon.adapt import memory
+from emb_daemon.adapt.learned import Evaluation
 from emb_daemon.adapt.memory import Memory, Store
+from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
 from emb_daemon.wire import contract as r
@@ -219,10 +222,11 @@ def test_full_disk_under_the_state_directory(tmp_path, monkeypatch, caplog, code
 
     loop = adaptkit.ClosedLoop(tmp_path)
     monkeypatch.setattr(os, "fsync", full)
-    learned = np.zeros(1, memory.LEARNED)[0]
-    learned["curve"][0] = 100.0
+    adapter = loop.adaptation.adapters[0]
+    adapter["outcome"] = ACCEPTED
+    loop.adaptation._evaluations[0] = Evaluation(ACCEPTED, values={"friction.offset_Nm": 0.03})
     with caplog.at_level(logging.ERROR):
-        loop.adaptation._settle(loop.adaptation._stores[0], memory.VERDICTS.index("accepted"), learned, 0, 20.0, 0.0)
+        loop.adaptation._keep(0, adapter)
     assert "could not be written" in caplog.text and os.strerror(code) in caplog.text
     assert memory_.path("FL").read_bytes() == content
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation-FL.json"], "nothing half written is left"
@@ -231,16 +235,15 @@ def test_full_disk_under_the_state_directory(tmp_path, monkeypatch, caplog, code
 
 
 def test_calibration_replaced_while_clamped(driven):
-    """Other parameters from one tick to the next: every estimate stays a number, the force follows the new curve."""
-    setup = Setup(CONFIG)
-    setup.parameters["curve"] *= 1.1
-    driven.daemon._reloaded = setup, []
-    driven.daemon._take_calibration()
-    after, old = driven.run(100), Driven()
-    old.run(150)
-    ratio = after["stiffness_force"] / old.run(100)["stiffness_force"]
-    assert np.all(after["source"] == r.FUSED) and np.all(after["sigma"] > 0.0) and np.all(np.isfinite(after["force"]))
-    assert 1.0 < ratio[0] < 1.1 and ratio[-1] == pytest.approx(1.1, abs=0.03)
+    """The clamped brake keeps the calibration that knows its contact; released, the corner begins anew with the other."""
+    other = moved(driven.daemon._calibrations["FL"], {"motor.inertia_kg_m2": 2e-4})
+    before = driven.daemon.pipeline.parameters.copy()
+    driven.daemon._waiting["FL"] = other, None
+    driven.daemon._follow_reload()
+    assert driven.estimates[-1]["engaged"] and driven.daemon.pipeline.parameters.tobytes() == before.tobytes()
+    driven.daemon.pipeline.states[0]["contact"]["engaged"] = False
+    driven.daemon._follow_reload()
+    assert driven.daemon.pipeline.parameters[0] == to_parameters(other) and not driven.daemon.pipeline.states[0]["started"]
 
 
 def test_swapped_messages_of_a_pair_are_one_sample(car):  # noqa: F811

@@ -171,14 +171,14 @@ def test_sigma_grows_while_the_torque_path_is_missing(parameters):
     moving = np.concatenate([brake.clamp(p, 15.0, 1.0), p["clearance"] + 15.0 + 2.0 * np.sin(np.arange(1000) * 0.05)])
     rows, _ = brake.samples(p, moving)
     rows["has_current"][500:] = False
-    sigma = estimate(rows, p)["sigma"]
+    without = estimate(rows, p)
     full = rows.copy()
     full["has_current"] = True
-    with_torque = estimate(full, p)["sigma"]
+    with_torque = estimate(full, p)
     turning = slice(520, None)
-    assert np.array_equal(sigma[:500], with_torque[:500])
-    assert np.all(sigma[turning] > with_torque[turning])
-    same_place = sigma[500::126]
+    assert np.array_equal(without["sigma"][:500], with_torque["sigma"][:500])
+    assert np.all(without["stiffness_sigma"][turning] > with_torque["stiffness_sigma"][turning])
+    same_place = without["sigma"][500::126]
     assert np.all(np.diff(same_place[:4]) > 0.0)
 
 

@@ -84,28 +84,32 @@ def test_no_alarm_on_a_good_brake(seed):
     assert not len(_alarm(estimates)) and not np.any(estimates["reasons"] & r.STUCK)
 
 
-@pytest.mark.parametrize(("begin", "within"), [(_CLAMPING, 100), (_HOLDING, 100), (_BEFORE_RELEASE, 250)])
-def test_dead_current_is_named_and_stiffness_goes_on(begin, within):
-    """No current while the brake is clamped, or once it moves: Stuck, StiffnessOnly, and the force is as good as ever."""
+@pytest.mark.parametrize("begin", [_CLAMPING, _HOLDING, _BEFORE_RELEASE])
+def test_dead_current_is_named_and_stiffness_goes_on(begin):
+    """A current that repeats while the motor is clamped: Stuck within a twentieth of a second, StiffnessOnly, and the force is as
+    good as ever."""
     estimates, force = _with(begin, _no_current)
-    alarm = _alarm(estimates)
-    assert begin < alarm[0] < begin + within
-    dead = alarm[alarm < begin + _LASTING]
-    assert np.all(estimates["source"][alarm] == r.STIFFNESS_ONLY) and np.all(estimates["reasons"][dead] & r.STUCK)
-    assert np.all(estimates["mode"][alarm] == r.DEGRADED)
+    alarm, stuck = _alarm(estimates), np.flatnonzero(estimates["reasons"] & r.STUCK)
+    assert begin < alarm[0] and alarm[0] <= stuck[0] < begin + 13
+    assert np.array_equal(stuck, np.arange(stuck[0], begin + _LASTING))
+    assert np.all(estimates["source"][stuck] == r.STIFFNESS_ONLY) and np.all(estimates["mode"][alarm] == r.DEGRADED)
     assert _honest(estimates, force, slice(begin, None)) and _recovered(estimates, force)
-    assert np.sqrt(np.mean((estimates["force"] - force)[alarm] ** 2)) < 100.0
+    assert np.sqrt(np.mean((estimates["force"] - force)[stuck] ** 2)) < 100.0
 
 
 @pytest.mark.parametrize("offset_A", [-4.0, 4.0])
-@pytest.mark.parametrize("begin", [_HOLDING, _BEFORE_RELEASE])
-def test_current_with_an_offset_is_detected(begin, offset_A):
-    """4 A too much or too little, 5 kN of the torque path: StiffnessOnly, the force stays honest."""
+def test_current_with_an_offset_is_detected(offset_A):
+    """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second, covered
+    by sigma as long as nothing tells which path is wrong, and over once the clearance has told."""
+    begin = _HOLDING
     estimates, force = _with(begin, _current(offset_A))
     alarm = _alarm(estimates)
-    assert begin < alarm[0] < begin + 250
-    assert np.all(estimates["source"][alarm] == r.STIFFNESS_ONLY) and not np.any(estimates["reasons"] & r.STUCK)
+    assert begin < alarm[0] < begin + 25 and len(alarm) > 400 and not np.any(estimates["reasons"] & r.STUCK)
+    assert np.all(estimates["mode"][alarm] == r.DEGRADED)
     assert _honest(estimates, force, slice(begin, None)) and _recovered(estimates, force)
+    after = slice(begin + _LASTING, None)
+    assert np.sqrt(np.mean((estimates["force"] - force)[2250:] ** 2)) < 100.0, "the torque path takes the blame"
+    assert _honest(estimates, force, after, 3.5)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -122,9 +126,9 @@ def test_a_lasting_offset_of_the_current_is_covered_or_said(offset_A, begin, see
     assert np.all(beyond < 4.0) and np.mean(beyond > 3.0) < 0.002
 
 
-@pytest.mark.parametrize("offset_A", [-6.0, -2.0, 1.0, 2.0])
+@pytest.mark.parametrize("offset_A", [-1.0, 1.0])
 def test_an_offset_from_power_on_is_learned_in_the_clearance(offset_A):
-    """The first stroke shows it before the pads touch: the force is as good as without, and a large one is reported."""
+    """Of an ordinary current sensor: the first stroke shows it before the pads touch, and the force is as good as without."""
     samples, force = _drive()
     parameters = to_parameters(load_calibration(resource("config/calibration.yaml")))
     good = estimate(samples, parameters)
@@ -134,15 +138,19 @@ def test_an_offset_from_power_on_is_learned_in_the_clearance(offset_A):
     clamped = force > 2000.0
     assert np.abs(estimates["force"] - good["force"])[clamped].max() < 0.5 * good["sigma"][clamped].min()
     assert np.all(np.abs(estimates["sigma"] / good["sigma"] - 1.0)[clamped] < 0.1)
-    assert bool(np.all(estimates["reasons"][clamped] & r.PATHS_DISAGREE)) == (abs(offset_A) > 3.0)
+    assert not np.any(estimates["reasons"][clamped])
 
 
-def test_offset_is_the_torque_paths_fault_once_the_pads_are_clear():
-    """Then the difference no longer counts as doubt of the stiffness."""
-    estimates, _ = _with(_BEFORE_RELEASE, _current(4.0))
-    alarm = _alarm(estimates)
-    clear = alarm[(estimates["contact_angle"][alarm] - _drive()[0]["angle"][alarm]) > 1.0]
-    assert len(clear) > 100 and np.all(estimates["sigma"][clear] < 100.0)
+@pytest.mark.parametrize("offset_A", [-6.0, -2.0, 2.0, 6.0])
+def test_a_large_offset_at_power_on_may_be_a_clamped_brake(offset_A):
+    """A released motor needs none of it: the contact stays unknown until the motor needs no torque, and sigma covers the rest."""
+    samples, force = _drive()
+    samples = samples.copy()
+    samples["current_q"] += offset_A
+    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    before = slice(30, 2000)
+    assert np.all(estimates["reasons"][before] & r.CONTACT_UNCERTAIN) and np.all(estimates["source"][before] == r.TORQUE_ONLY)
+    assert _honest(estimates, force, before, 3.0)
 
 
 @pytest.mark.parametrize("names", [("angle", "speed"), ("angle",)])
@@ -171,12 +179,23 @@ def test_resolver_that_stands_still_with_noise_is_no_fault():
     assert not np.any(estimates["reasons"] & (r.STUCK | r.PATHS_DISAGREE))
 
 
-def test_resolver_that_repeats_a_speed_is_stuck():
-    """Also while no torque tells."""
+def test_resolver_that_flickered_and_repeats_is_stuck():
+    """Speed noise of a motor at rest does not repeat: twelve samples, also while no torque tells."""
     estimates, force = _with(_RELEASED, _freeze("angle", "speed"))
     stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
-    assert _RELEASED + 40 < stuck[0] < _RELEASED + 60 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
+    assert _RELEASED + 10 < stuck[0] < _RELEASED + 15 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
     assert _honest(estimates, force, slice(_RELEASED, None)) and _recovered(estimates, force)
+
+
+def test_resolver_that_never_flickered_and_repeats_a_speed_is_stuck():
+    """From power-on: nothing is known of its noise, so it takes fifty samples of a speed that is not zero."""
+    samples, _ = _drive()
+    rows = np.repeat(samples[_RELEASED : _RELEASED + 1], 200)
+    rows["dt"], rows["speed"] = 0.004, 0.7
+    rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
+    estimates = estimate(rows, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
+    assert 45 < stuck[0] < 55 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
 
 
 def test_stuck_resolver_and_no_current_leaves_nothing():

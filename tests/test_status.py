@@ -78,9 +78,9 @@ class _Seen:
         self.sample["dt"] = 0.004
         self.out["force"], self.out["sigma"] = 5000.0, 40.0
 
-    def facts(self, samples=1):
+    def facts(self, samples=1, before=0):
         for _ in range(samples):
-            found = _look(self.state[0], self.p, self.sample[0], self.out[0])
+            found = _look(self.state[0], self.p, self.sample[0], before, self.out[0])
             if found & _BITS["bounds_contradict"]:
                 break
         return set(names(found))
@@ -147,10 +147,23 @@ def test_what_no_brake_can_do_is_neither_told_nor_used(seen, field, value):
 
 
 def test_a_force_that_the_monitor_rules_out_is_replaced_by_its_bounds(seen):
-    """Not at once: a stroke may leave the smoothed torque behind. Then: the middle of the interval, half its width for sigma."""
+    """Not at once: a stroke may leave the smoothed torque behind. Then: the middle of the interval, with a sigma that reaches its
+    ends and the force that was ruled out."""
     seen.facts(200)
     seen.state["monitor"]["low"], seen.state["monitor"]["high"] = 1000.0, 3000.0
     assert "bounds_contradict" not in seen.facts(98), "within the time that is tolerated"
     assert seen.out["force"][0] == 5000.0
     assert "bounds_contradict" in seen.facts(4)
-    assert (seen.out["force"][0], seen.out["sigma"][0]) == (2000.0, 1000.0)
+    assert (seen.out["force"][0], seen.out["sigma"][0]) == (2000.0, 3000.0)
+    wide = seen.state["monitor"]
+    wide["low"], wide["outside_s"] = 0.0, 1.0
+    seen.out["force"], seen.out["sigma"] = 3200.0, 10.0
+    assert "bounds_contradict" in seen.facts()
+    assert (seen.out["force"][0], seen.out["sigma"][0]) == (1500.0, 1700.0)
+
+
+def test_a_frozen_current_rules_nothing_out(seen):
+    seen.facts(200)
+    seen.state["monitor"]["low"], seen.state["monitor"]["high"] = 0.0, 1000.0
+    assert seen.facts(200, before=_BITS["current_implausible"]) == {"current_implausible"}
+    assert seen.out["force"][0] == 5000.0

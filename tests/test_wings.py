@@ -21,7 +21,7 @@ _ABOVE = ("cli", "api", "__init__")
 #: Libraries of the extra `offline`.
 _OFFLINE = {"scipy", "pyarrow", "matplotlib", "plotly"}
 #: Arrows that are being taken out.
-_LEAVING = {("adapt", "runtime"), ("adapt", "plant"), ("adapt", "pipeline"), ("adapt", "matplotlib")}
+_LEAVING: set[tuple[str, str]] = set()
 
 
 def _imports() -> dict[tuple[str, str], set[str]]:

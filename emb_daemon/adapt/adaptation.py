@@ -1,29 +1,37 @@
 """The part of adaptation that is not done in a tick: evaluation, memory, words for the log.
 
 In the daemon a helper thread does it, off the real-time priority and without the interpreter's lock where it computes; in
-replay it happens at once. Both take effect at the same sample.
+replay it happens at once. Both take effect at the same sample. What is in use is known to the loop alone: the helper thread
+is given what it needs and hands back what it found.
 """
 
 import contextlib
+import logging
 import os
 import queue
 import threading
 from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import compile_fit, fit_training
-from emb_daemon.adapt.limits import to_limits
-from emb_daemon.adapt.memory import Entry, Memory, Store, apply_entry, entry_of, with_entry
-from emb_daemon.adapt.session import answer_adapting, end
-from emb_daemon.calibration.types import Calibration
-from emb_daemon.estimator.records import STATE
-from emb_daemon.runtime.journal import log
+from emb_daemon.adapt.learned import CLEARANCE, Evaluation, with_learned
+from emb_daemon.adapt.memory import Entry, Memory, Store, entry_of, with_entry
+from emb_daemon.adapt.snapshots import Snapshots
+from emb_daemon.adapt.training import answer_adapting
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator import restart
+from emb_daemon.estimator.records import PARAMETERS, STATE
+from emb_daemon.wire.contract import NO_RESULT
 from emb_daemon.wire.layout import CORNERS
 
 #: Patience with the helper thread at the end, s.
 _CLOSING_S = 2.0
+
+log = logging.getLogger(__name__)
 
 
 class Adaptation:
@@ -32,111 +40,180 @@ class Adaptation:
     Args:
         calibrations: by corner name.
         memory: where learned values are kept.
-        clock: the date (ISO 8601) that belongs to a sample's time in ns.
+        clock: the real time (CLOCK_REALTIME) that belongs to a sample's time, both in ns.
         threaded: evaluate and write in a helper thread.
 
     Attributes:
         adapters, limits: ADAPTER and LIMITS arrays, shape (4,).
         rows: TRAINING array, shape (4, CAPACITY).
+        learned: PARAMETERS array, shape (4,): what each corner's last accepted evaluation puts in use.
     """
 
     def __init__(
-        self, calibrations: dict[str, Calibration], memory: Memory, clock: Callable[[int], str], threaded: bool = False
+        self,
+        calibrations: dict[str, Calibration],
+        memory: Memory,
+        clock: Callable[[int], int],
+        threaded: bool = False,
     ):
         self.adapters = np.zeros(4, r.ADAPTER)
         self.limits = np.zeros(4, r.LIMITS)
         self.rows = np.zeros((4, r.CAPACITY), r.TRAINING)
+        self.learned = np.zeros(4, PARAMETERS)
         self._scratch = np.zeros(1, STATE)
         self._memory, self._clock, self._threaded = memory, clock, threaded
+        self._calibrations: dict[int, Calibration] = {}
         self._stores: dict[int, Store] = {}
+        self._evaluations: dict[int, Evaluation] = {}
+        self._snapshots = Snapshots(memory.folder, restart.SNAPSHOT)
+        self._resumable: dict[int, tuple[np.void, int]] = {}
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
-        self._take(self.read(calibrations))
-
-    def read(self, calibrations: dict[str, Calibration]) -> list[tuple[np.void, Store]]:
-        """Limits and what the memory holds for these calibrations; may take long and touches nothing in use."""
-        found = []
         for name, calibration in calibrations.items():
-            store, warning = self._memory.load(name, calibration)
-            if warning:
-                log.warning("corner %s: %s", name, warning)
-            found.append((to_limits(calibration), store))
-        return found
+            self.replace(name, calibration, self.read(name, calibration))
+            if self._snapshots:
+                snapshot, time_ns, warning = self._snapshots.load(name, self.in_use(name))
+                if warning:
+                    log.warning("corner %s: %s", name, warning)
+                if snapshot is not None:
+                    self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
-    def _take(self, found: list[tuple[np.void, Store]]) -> None:
-        for limits, store in found:
-            corner = CORNERS.index(store.corner)
-            self.limits[corner] = limits
-            self._stores[corner] = store
+    def read(self, corner: str, calibration: Calibration) -> Store:
+        """What the memory holds for a corner with this calibration; may take long and touches nothing in use."""
+        store, warning = self._memory.load(corner, calibration)
+        if warning:
+            log.warning("corner %s: %s", corner, warning)
+        return store
 
-    def replace(self, found: list[tuple[np.void, Store]], parameters: np.ndarray) -> None:
-        """Go over to other calibrations (what `read` returned) between two ticks; training that runs is aborted."""
-        for _, store in found:
-            adapter = self.adapters[CORNERS.index(store.corner)]
-            if adapter["phase"] != r.IDLE:
-                end(adapter, r.BAD_INPUT, r.RESULT_ABORTED)
-        self._take(found)
-        self.restore(parameters)
+    def replace(self, corner: str, calibration: Calibration, store: Store) -> None:
+        """Go over to another calibration between two ticks, and to what `read` found; a training that runs is forgotten."""
+        index = CORNERS.index(corner)
+        self._calibrations[index], self._stores[index] = calibration, store
+        self.limits[index] = r.to_limits(calibration)
+        self._resumable.pop(index, None)
+        generation = self.adapters[index]["generation"] + 1
+        self.adapters[index] = np.zeros((), r.ADAPTER)
+        # Of an evaluation that is still on its way nothing may be taken for one of a later training.
+        self.adapters[index]["generation"] = generation
+        if store.current is not None and calibration.adaptation.enabled:
+            log.info("corner %s: learned values of %s in use", corner, store.current.date)
 
-    def restore(self, parameters: np.ndarray) -> None:
-        """Put what was learned before into PARAMETERS, shape (4,)."""
-        for corner, store in self._stores.items():
-            if store.current is not None and self.limits[corner]["enabled"]:
-                apply_entry(store.current, parameters[corner])
-                log.info("corner %s: adapted values of %s in use", store.corner, store.current.date)
+    def in_use(self, corner: str) -> Calibration:
+        """A corner's calibration with what was learned."""
+        index = CORNERS.index(corner)
+        current = self._stores[index].current
+        return with_learned(self._calibrations[index], current.values if current else None)
 
     def current(self, corner: str) -> Entry | None:
-        """The values in use that were learned, or None."""
+        """The training whose values are in use, or None."""
         return self._stores[CORNERS.index(corner)].current
 
-    def last_verdict(self, corner: str) -> str:
+    def last_outcome(self, corner: str) -> str:
         """How the last training of a corner ended, in words; empty if there was none."""
         adapter = self.adapters[CORNERS.index(corner)]
-        return r.VERDICTS[adapter["verdict"]] if adapter["result"] != r.NO_RESULT else ""
+        return r.OUTCOMES[adapter["outcome"]] if adapter["result"] != NO_RESULT else ""
+
+    def restore(self, parameters: np.ndarray) -> None:
+        """Put each corner's calibration in use into PARAMETERS, shape (4,)."""
+        for corner in self._stores:
+            parameters[corner] = to_parameters(self.in_use(CORNERS[corner]))
 
     def warm_up(self, pipeline) -> None:
         """Compile, or load from the cache, what evaluations call, for a pipeline like this; touch the memory that training
         will need; start the helper thread."""
         for corner in self._stores:
             self.rows[corner] = np.zeros((), r.TRAINING)
-        compile_fit(pipeline.parameters[0], pipeline.states[0])
+        compile_fit(next(iter(self._calibrations.values())), pipeline.states[0])
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)
             self._thread.start()
 
     def answer(self, samples, count, states, parameters, estimates) -> None:
         """`pipeline.answer` that learns on the way."""
+        if self._resumable:
+            self._resume(samples[:count], states, parameters)
         first = 0
         while True:
             while not self._done.empty():
-                self._bring_back(*self._done.get())
-            first = self._answer(samples, first, count, states, parameters, estimates)
-            if self.adapters["wanted"].any() or self.adapters["settled"].any():
-                for corner in range(4):
-                    self._serve(corner, self.adapters[corner], states[corner], parameters[corner])
+                self._take_evaluation(*self._done.get())
+            first = answer_adapting(
+                samples, first, count, states, parameters, self.learned, estimates, self.adapters, self.limits, self._scratch,
+                self.rows,
+            )  # fmt: skip
+            if any(self.adapters[name].any() for name in ("evaluation_wanted", "ended", "snapshot_wanted")):
+                for corner in self._stores:
+                    self._attend(corner, self.adapters[corner], states[corner], parameters[corner])
             if first >= count:
                 return
 
-    def _answer(self, samples, first, count, states, parameters, estimates) -> int:
-        return answer_adapting(
-            samples, first, count, states, parameters, estimates, self.adapters, self.limits, self._scratch, self.rows
-        )
+    def _resume(self, samples: np.ndarray, states: np.ndarray, parameters: np.ndarray) -> None:
+        """Let corners whose first sample has come go on from where they were."""
+        for corner in list(self._resumable):
+            rows = np.flatnonzero((samples["corner"] == corner) & ~samples["is_prediction"])
+            if len(rows):
+                snapshot, time_ns = self._resumable.pop(corner)
+                sample = samples[rows[0]]
+                elapsed_s = 1e-9 * (self._clock(int(sample["time_ns"])) - time_ns)
+                if elapsed_s < 0.0:
+                    log.warning("corner %s: snapshot is %.0f s in the future; not used", CORNERS[corner], -elapsed_s)
+                else:
+                    restart.resume(states[corner], parameters[corner], snapshot, elapsed_s)
 
-    def _serve(self, corner: int, adapter: np.void, state: np.void, parameters: np.void) -> None:
-        # Records are views, and the loop goes on writing to them: what is handed over is copied.
-        if adapter["settled"]:
-            adapter["settled"] = False
-            self._do(self._settle, self._stores[corner], int(adapter["verdict"]), adapter["learned"].copy(),
-                     int(adapter["time_ns"]), float(adapter["ambient"]), float(adapter["rise"]))  # fmt: skip
-        if adapter["wanted"]:
-            adapter["wanted"] = False
+    def _attend(self, corner: int, adapter: np.void, state: np.void, parameters: np.void) -> None:
+        """Have done what the tick asks for."""
+        if adapter["snapshot_wanted"]:
+            adapter["snapshot_wanted"] = False
+            self._keep_snapshot(corner, state, parameters)
+        if adapter["ended"]:
+            adapter["ended"] = False
+            self._keep(corner, adapter)
+        if adapter["evaluation_wanted"]:
+            adapter["evaluation_wanted"] = False
             rows = self.rows[corner, : int(adapter["training_rows"])]
-            self._do(self._fit, corner, int(adapter["generation"]), rows, parameters.copy(), state.copy(),
-                     float(adapter["power_on_angle"]))  # fmt: skip
+            # Records are views, and the loop goes on writing to them: what is handed over is copied.
+            self._do(self._evaluate, corner, int(adapter["generation"]), rows, self._calibrations[corner],
+                     self.in_use(CORNERS[corner]), state.copy(), float(adapter["power_on_angle"]),
+                     float(adapter["factor_sigma"]))  # fmt: skip
 
-    def close(self) -> None:
-        """Let what is being written be written."""
+    def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
+        if state["started"]:
+            snapshot = np.zeros(1, restart.SNAPSHOT)[0]
+            if not restart.take_snapshot(state, parameters, snapshot):
+                return
+            time_ns = self._clock(int(self.adapters[corner]["time_ns"]))
+            self._do(self._write_snapshot, CORNERS[corner], self.in_use(CORNERS[corner]), snapshot, time_ns)
+
+    def _write_snapshot(self, corner: str, calibration: Calibration, snapshot: np.void, time_ns: int) -> None:
+        try:
+            self._snapshots.save(corner, calibration, snapshot, time_ns)
+        except OSError as error:
+            log.error("corner %s: snapshot could not be written: %s", corner, error)
+
+    def _keep(self, corner: int, adapter: np.void) -> None:
+        """Keep the outcome of a training that was evaluated; have it logged and written."""
+        outcome, evaluation = int(adapter["outcome"]), self._evaluations.pop(corner, None)
+        store = None
+        if outcome == r.ACCEPTED or outcome >= r.NOT_CONVERGED:
+            real_s = 1e-9 * self._clock(int(adapter["time_ns"]))
+            date = datetime.fromtimestamp(real_s, UTC).isoformat(timespec="seconds")
+            entry = entry_of(outcome, evaluation, date, float(adapter["ambient"]), float(adapter["rise"]))
+            store = self._stores[corner] = with_entry(self._stores[corner], entry)
+        self._do(self._write, CORNERS[corner], outcome, evaluation.note if store else "", store)
+
+    def _take_evaluation(self, corner: int, generation: int, evaluation: Evaluation, learned: np.void) -> None:
+        adapter = self.adapters[corner]
+        if adapter["phase"] != r.EVALUATING or adapter["generation"] != generation:
+            return
+        self._evaluations[corner], self.learned[corner] = evaluation, learned
+        adapter["evaluation"], adapter["evaluation_ready"] = evaluation.outcome, True
+        for name in ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma"):
+            adapter[name] = getattr(evaluation, name)
+
+    def close(self, states: np.ndarray, parameters: np.ndarray) -> None:
+        """Keep what STATE and PARAMETERS, shape (4,), hold at the end, and let what is being written be written."""
+        for corner in self._stores:
+            self._keep_snapshot(corner, states[corner], parameters[corner])
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join(_CLOSING_S)
@@ -160,33 +237,24 @@ class Adaptation:
             except Exception:
                 log.exception("adaptation")
 
-    def _fit(
-        self, corner: int, generation: int, rows: np.ndarray, parameters: np.void, state: np.void, power_on_angle: float
-    ) -> None:
-        learned = fit_training(rows, parameters, state, self.limits[corner])
-        clearance = learned["contact_angle"] - power_on_angle
-        believable = abs(clearance - parameters["clearance"]) <= self.limits[corner]["clearance_change"]
-        learned["clearance"] = clearance if believable else np.nan
-        self._done.put((corner, generation, learned))
+    def _evaluate(
+        self, corner: int, generation: int, rows: np.ndarray, base: Calibration, calibration: Calibration, state: np.void,
+        power_on_angle: float, factor_sigma: float,
+    ) -> None:  # fmt: skip
+        evaluation = fit_training(rows, calibration, base, state, factor_sigma)
+        # Contact is told by the clearance after a restart; where the motor did not start released, that stays as it is.
+        clearance = evaluation.contact_angle - power_on_angle
+        if abs(clearance - calibration.contact.clearance_rad) <= base.adaptation.clearance_change_rad:
+            evaluation.values[CLEARANCE] = clearance
+        accepted = evaluation.outcome == r.ACCEPTED
+        learned = to_parameters(with_learned(base, evaluation.values) if accepted else calibration)
+        self._done.put((corner, generation, evaluation, learned))
 
-    def _bring_back(self, corner: int, generation: int, learned: np.void) -> None:
-        adapter = self.adapters[corner]
-        if adapter["phase"] == r.EVALUATING and adapter["generation"] == generation:
-            adapter["learned"] = learned
-            adapter["ready"] = True
-
-    def _settle(self, store: Store, verdict: int, learned: np.void, time_ns: int, ambient: float, rise: float) -> None:
-        """Log an outcome and keep it."""
-        words = {"corner": store.corner, "verdict": r.VERDICTS[verdict]}
-        log.info("corner %(corner)s: adaptation: %(verdict)s", words, extra={"fields": words})
-        if r.BRAKE_REQUESTED <= verdict < r.NOT_CONVERGED:
-            return
-        corner = CORNERS.index(store.corner)
-        if self._stores[corner].calibration != store.calibration:
-            return
-        store = with_entry(self._stores[corner], entry_of(learned, verdict, self._clock(time_ns), ambient, rise))
-        self._stores[corner] = store
-        try:
-            self._memory.save(store)
-        except OSError as error:
-            log.error("corner %s: learned values could not be written: %s", store.corner, error)
+    def _write(self, corner: str, outcome: int, note: str, store: Store | None) -> None:
+        words = {"corner": corner, "outcome": r.OUTCOMES[outcome] + (f" ({note})" if note else "")}
+        log.info("corner %(corner)s: adaptation: %(outcome)s", words, extra={"fields": words})
+        if store is not None:
+            try:
+                self._memory.save(store)
+            except OSError as error:
+                log.error("corner %s: learned values could not be written: %s", corner, error)

@@ -1,39 +1,71 @@
 """The joint fit: contact angle, characteristic curve, friction and presliding angle from motor current and angle.
 
 The estimator's own stiffness and torque paths are run over the training with trial parameters; what motor torque they leave
-unexplained is made small (Levenberg-Marquardt with Huber weights). Dynamics, effects, torque constant and inertia stay those
-of the calibration. Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
+unexplained is made small (Levenberg-Marquardt with Huber weights). Dynamics, effects and inertia stay those of the
+calibration.
+
+An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
+sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
+which steel keeps for life, can.
+
+Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
 
 Only the paths are compiled. The fit is done once in a park brake's life of minutes, beside the loop, and what little it
 computes itself would take far longer to compile than to run.
 """
 
-from math import exp, inf, log, sqrt
+from math import exp, expm1, hypot, log, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.pairs import ANGLE, CYCLE_S, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
+from emb_daemon.adapt.learned import (
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    STIFFNESS_RELATIVE_SIGMA,
+    STIFFNESS_SIGMA,
+    TRAVELS,
+    Evaluation,
+    curve_terms,
+    curve_values,
+    why_out_of_bounds,
+)
+from emb_daemon.adapt.pairs import ANGLE, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
+from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
-from emb_daemon.estimator.records import PARAMETERS, STATE
+from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
+from emb_daemon.wire.contract import CYCLE_S
 
-#: Order of the fitted values: contact angle, load friction, offset friction, logarithm of the presliding angle, curve.
-_CONTACT, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(5)
+#: Order of the fitted values, see `_Training`.
+_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(7)
+TORQUE_CONSTANT = "motor.torque_constant_Nm_per_A"
+#: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
+#: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
+_GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
 #: Residuals beyond this many standard deviations count linearly (Huber).
 _HUBER = 2.5
+#: Samples of which the mean torque is fitted: the acceleration's noise falls with their number, and the motion asked for has
+#: a period of ten such blocks.
+_BLOCK = 5
+#: Blocks beyond this many standard deviations are left out of a second round, if they are no more than this share.
+_FAR, _FEW = 8.0, 0.05
+#: Drop of the cost per correlated block by a curve of its own from which the pads count as changed: at three coefficients
+#: noise alone makes more once in a thousand trainings (chi-square).
+_UNCHANGED = 16.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12
 _LEAST_SAMPLES = 1000
 _RANGES = 5
-#: Points of the travel at which the curve is looked at.
-_TRAVELS = 40
 
 
 @njit
@@ -71,89 +103,155 @@ def _run(states, parameters, rows, residual, force):
 
 
 class _Training:
-    """One training as a function of the fitted values.
+    """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithm of the presliding
+    angle, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
-        now, state: PARAMETERS and STATE records of the estimator at its end.
-        scale: what one unit of each curve term is, N/rad^(n+1).
+        calibration: in use until now.
+        state: STATE record of the estimator at its end.
     """
 
-    def __init__(self, rows, now, state, scale):
-        self._rows, self._now, self._state, self._scale = rows, now, state, scale
-        self._parameters, self._states = np.zeros(1, PARAMETERS), np.zeros(1, STATE)
+    def __init__(self, rows, calibration, state, scale):
+        self._rows, self._calibration, self._state, self._scale = rows, calibration, state, scale
+        self._states = np.zeros(1, STATE)
+        self.left_out = np.zeros((len(rows) - 1) // _BLOCK, bool)
 
-    def parameters(self, x):
-        """PARAMETERS record with the trial values ``x``."""
-        self._parameters[0] = self._now
-        p = self._parameters[0]
-        p["load_friction"] = x[_LOAD] * p["gear_gain"]
-        p["offset_friction"] = x[_OFFSET]
-        p["presliding_angle"] = exp(min(max(x[_PRESLIDING], -12.0), 2.0))
-        p["curve"][: len(self._scale)] = x[_CURVE:] * self._scale
-        return p
+    def values(self, x) -> dict[str, float]:
+        """What the fitted values ``x`` mean to the calibration."""
+        return curve_values(self._calibration, x[_CURVE:] * self._scale) | {
+            LOAD_FRICTION: x[_LOAD] * self._calibration.motor.gear_gain_m_per_rad,
+            OFFSET_FRICTION: x[_OFFSET],
+            PRESLIDING_ANGLE: exp(min(max(x[_PRESLIDING], -12.0), 2.0)),
+        }
 
     def simulate(self, x):
-        """Unexplained motor torque (N m; NaN where unknown) and stiffness force (N) at each row."""
-        self.parameters(x)
+        """What `_improve` makes small, unexplained motor torque (N m; NaN where unknown) and stiffness force (N) at each row.
+
+        The first is the torque's mean over `_BLOCK` samples in standard deviations of what noise makes of it *with the trial's
+        torque constant*: current and acceleration are both measured (Deming's regression), and in other units a small torque
+        constant would seem to explain more because it makes the current's noise small."""
+        torque_constant = self._calibration.motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
+        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant})
         self._states[0] = self._state
         self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
-        _run(self._states, self._parameters, self._rows, residual, force)
-        return residual, force
+        _run(self._states, np.atleast_1d(to_parameters(trial)), self._rows, residual, force)
+        residual -= x[_TORQUE_OFFSET]
+        blocks = residual[1 : 1 + len(self.left_out) * _BLOCK].reshape(-1, _BLOCK).mean(axis=1) / _block_noise(trial)
+        blocks[self.left_out] = np.nan
+        return blocks, residual, force
 
 
-def compile_fit(now, state):
-    """Compile, or load from the cache, all that a fit calls; PARAMETERS and STATE records as `fit_training` gets them."""
-    rows = np.zeros(2, r.TRAINING)
-    _Training(rows, now, state, np.ones(1)).simulate(np.zeros(_CURVE + 1))
-    pairs_of_passes(rows, now)
-    travel_at(0.0, now["curve"])
-    characteristic_curve(0.0, now["curve"])
+def _noises(calibration):
+    """Torque that stands for the noise of one sample's current and speed, N m."""
+    motor, noise = calibration.motor, calibration.noise
+    return motor.torque_constant_Nm_per_A * noise.current_A, motor.inertia_kg_m2 * noise.speed_rad_per_s / CYCLE_S
 
 
-def _huber(residual, sigma):
-    """Mean Huber cost of the finite residuals, in units of ``sigma`` squared."""
-    size = np.abs(residual[np.isfinite(residual)]) / sigma
-    return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() / max(len(size), 1)
+def _block_noise(calibration):
+    """Standard deviation (N m) of the mean torque of `_BLOCK` samples: of current that is correlated over some of them, and of
+    the speeds at both ends."""
+    current, speed = _noises(calibration)
+    rho = exp(-CYCLE_S / calibration.noise.current_correlation_s)
+    correlated = 1.0 + 2.0 * sum((1.0 - lag / _BLOCK) * rho**lag for lag in range(1, _BLOCK))
+    return sqrt(current**2 * correlated / _BLOCK + 2.0 * (speed / _BLOCK) ** 2)
 
 
-def _normal_equations(residual, jacobian, sigma):
-    """Weighted normal matrix (n, n) and gradient (n,); ``jacobian`` has shape (n, samples)."""
-    known = np.isfinite(residual)
-    value, derivative = residual[known], jacobian[:, known]
-    weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(value), 1e-300)) / sigma**2
+def compile_fit(calibration, state):
+    """Compile, or load from the cache, all that a fit calls; as `fit_training` gets them."""
+    rows, p = np.zeros(2, r.TRAINING), to_parameters(calibration)
+    x = np.zeros(_CURVE + curve_terms(calibration))
+    x[_CURVE] = 1.0
+    _Training(rows, calibration, state, np.ones(len(x) - _CURVE)).simulate(x)
+    pairs_of_passes(rows, p)
+    travel_at(0.0, p["curve"])
+    characteristic_curve(0.0, p["curve"])
+
+
+def _cost(blocks, x, prior):
+    """Huber cost of the finite blocks, and what ``x`` costs by ``prior`` (information)."""
+    size = np.abs(blocks[np.isfinite(blocks)])
+    return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() + prior @ (x * x)
+
+
+def _normal_equations(blocks, jacobian):
+    """Weighted normal matrix (n, n) and gradient (n,); ``jacobian`` has shape (n, blocks)."""
+    known = np.isfinite(blocks)
+    value, derivative = blocks[known], jacobian[:, known]
+    weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(value), 1e-300))
     return (derivative * weight) @ derivative.T, derivative @ (weight * value)
 
 
-def _improve(training, x, steps, sigma):
-    """Levenberg-Marquardt from ``x`` with difference quotients over ``steps``.
+def _improve(training, x, steps, prior, free):
+    """Levenberg-Marquardt from ``x`` in the values ``free`` (indices), with difference quotients over ``steps`` and ``prior``
+    information on each value, zero being expected.
 
-    Returns ``(x, residual, force, normal matrix, iterations)`` at the end; -1 iterations if it did not converge."""
-    residual, force = training.simulate(x)
-    cost, damping = _huber(residual, sigma), 1e-3
-    normal = np.zeros((len(x), len(x)))
-    for iteration in range(_ITERATIONS):
-        moved = [training.simulate(x + step)[0] for step in np.diag(steps)]
-        normal, gradient = _normal_equations(residual, (moved - residual) / steps[:, np.newaxis], sigma)
+    Returns a `_Fit`; -1 iterations if it did not converge."""
+    best = training.simulate(x)
+    cost, damping = _cost(best[0], x, prior), 1e-3
+    normal, iterations = np.zeros((len(free), len(free))), -1
+    for count in range(1, _ITERATIONS + 1):
+        moves = [training.simulate(x + step)[0] for step in np.diag(steps)[free]]
+        normal, gradient = _normal_equations(best[0], (moves - best[0]) / steps[free, np.newaxis])
+        normal += np.diag(prior[free])
+        gradient += (prior * x)[free]
         before = cost
         while damping < 1e10:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+            trial = x.copy()
             try:
-                trial = x - np.linalg.solve(damped, gradient)
+                trial[free] -= np.linalg.solve(damped, gradient)
             except np.linalg.LinAlgError:
-                trial = np.full(len(x), np.nan)
+                trial[:] = np.nan
             # Force rises from contact: a curve that falls there belongs to a contact angle that lies too early.
             if trial[_CURVE] > 0.0:
                 attempt = training.simulate(trial)
-                attempt_cost = _huber(attempt[0], sigma)
+                attempt_cost = _cost(attempt[0], trial, prior)
                 if attempt_cost <= cost:
-                    x, (residual, force), cost, damping = trial, attempt, attempt_cost, max(0.1 * damping, 1e-9)
+                    x, best, cost, damping = trial, attempt, attempt_cost, max(0.1 * damping, 1e-9)
                     break
             damping *= 10.0
         if before - cost <= _CONVERGED * before:
-            return x, residual, force, normal, iteration + 1
-    return x, residual, force, normal, -1
+            iterations = count
+            break
+    blocks, residual, force = best
+    correlation = _inflation(blocks)
+    spread = correlation * _deviation(blocks) ** 2
+    covariance = np.zeros((len(x), len(x)))
+    covariance[np.ix_(free, free)] = _inverse(normal) * spread
+    # The contact angle with the curve held: what the filter may still be wrong by with this very curve.
+    contact_sigma = sqrt(spread / max(normal[_CONTACT, _CONTACT], 1e-300))
+    return _Fit(x, blocks, residual, force, cost, iterations, correlation, spread, covariance, contact_sigma)
+
+
+class _Fit(NamedTuple):
+    """Where `_improve` ended: fitted values, what `_Training.simulate` gives there, cost, iterations, factor by which the
+    blocks' correlation widens the covariance, and that with their size; the covariance, zero for what was held."""
+
+    x: np.ndarray
+    blocks: np.ndarray
+    residual: np.ndarray
+    force: np.ndarray
+    cost: float
+    iterations: int
+    correlation: float
+    spread: float
+    covariance: np.ndarray
+    contact_sigma: float
+
+
+def _fit(training, x, steps, free):
+    """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
+    against that; outliers are left out of the second round."""
+    prior = np.zeros(len(x))
+    prior[_GAIN] = _GAIN_SIGMA**-2
+    first = _improve(training, x, steps, prior, free)
+    far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
+    if np.mean(far) <= _FEW:
+        training.left_out |= far
+    return _improve(training, first.x, steps, first.spread * prior, free)
 
 
 def _inverse(normal):
@@ -170,6 +268,11 @@ def _inverse(normal):
     return factor.T @ factor * both
 
 
+def _deviation(values):
+    """Standard deviation of what is known of ``values``, but for outliers."""
+    return 1.4826 * np.median(np.abs(values[np.isfinite(values)]))
+
+
 def _inflation(residual):
     """Factor by which autocorrelated residuals widen a covariance: 1 + 2 sum of their autocorrelation."""
     value = np.nan_to_num(residual)
@@ -182,21 +285,22 @@ def _force_sigma(curve, scale, covariance, top):
 
     Returns ``(s0, s1, largest)``: the straight line s0^2 + (s1 F)^2 through its square over the travel (least squares,
     neither part negative), and its largest value."""
-    travel = top * np.arange(1, _TRAVELS + 1) / _TRAVELS
+    travel = top * np.arange(1, TRAVELS + 1) / TRAVELS
     force, slope = np.array([characteristic_curve(x, curve) for x in travel]).T
-    direction = np.zeros((_TRAVELS, len(covariance)))
+    direction = np.zeros((TRAVELS, len(covariance)))
     direction[:, _CONTACT] = -slope
     direction[:, _CURVE:] = scale * travel[:, np.newaxis] ** np.arange(1, len(scale) + 1)
     variance = np.einsum("ti,ij,tj->t", direction, covariance, direction)
     square = force * force
-    spread = _TRAVELS * (square @ square) - square.sum() ** 2
-    share = max((_TRAVELS * (square @ variance) - square.sum() * variance.sum()) / spread, 0.0)
+    spread = TRAVELS * (square @ square) - square.sum() ** 2
+    share = max((TRAVELS * (square @ variance) - square.sum() * variance.sum()) / spread, 0.0)
     constant = max(variance.mean() - share * square.mean(), 0.25 * variance.mean())
     return sqrt(constant), sqrt(share), sqrt(variance.max())
 
 
-def _excited(angle, force, residual, low, high, needed):
-    """Whether each of equal force ranges, and the clearance, was passed in both directions by enough samples."""
+def _excited(angle, force, residual, low, high, limits):
+    """Whether each of equal force ranges, and the clearance where it was asked for, was passed in both directions by enough
+    samples."""
     known = np.isfinite(residual)
     known[0] = False
     clamping = np.diff(angle, prepend=angle[0]) > 0.0
@@ -204,107 +308,129 @@ def _excited(angle, force, residual, low, high, needed):
     place[force <= low] = _RANGES
     known &= force <= high
     counts = [np.bincount(place[known & side], minlength=_RANGES + 1) for side in (clamping, ~clamping)]
-    return np.min(counts) >= needed
+    asked = _RANGES if limits.low_force_N > 0.0 else _RANGES + 1
+    return np.min(counts, axis=0)[:asked].min() >= limits.samples_per_range
 
 
-def fit_training(rows, now, state, limits):
+def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     """What one training teaches.
 
     Args:
         rows: TRAINING array, the samples in order.
-        now: PARAMETERS record in use.
+        calibration, base: in use until now, and as the file has it.
         state: STATE record, the estimator's at the end of the training.
-        limits: LIMITS record.
+        factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
 
     Returns:
-        LEARNED record; its ``verdict`` says whether it may be used.
+        `Evaluation`; its ``outcome`` says whether it may be used.
     """
-    out = np.zeros(1, r.LEARNED)[0]
-    out["samples"] = len(rows)
+    now, limits = to_parameters(calibration), calibration.adaptation
     if len(rows) < _LEAST_SAMPLES:
-        out["verdict"] = r.TOO_FEW
-        return out
-    terms = max(np.flatnonzero(now["curve"]), default=0) + 1
+        return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
+    terms = curve_terms(calibration)
     pairs = pairs_of_passes(rows, now)
     contact, start = curve_from_pairs(pairs, terms)
     offset, load = friction_from_pairs(pairs)
     if not (np.isfinite(contact) and np.isfinite(load)):
-        out["verdict"] = r.NOT_EXCITED
-        return out
+        return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     powers = np.arange(1, terms + 1)
     highest = rows["angle"].max()
     top = highest - contact
     scale = max(start @ top**powers, 1.0) / top**powers
-    x = np.array([contact, max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"]), *start / scale])
+    friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
+    x = np.array([contact, 0.0, 0.0, *friction, *start / scale])
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(now["offset_friction"], 1e-4)
 
-    expected, _ = torque_sigma(now["torque_constant"] * now["current_sigma"], now["inertia"] * now["speed_sigma"] / CYCLE_S)
-    training = _Training(rows, now, state, scale)
-    x, residual, force, normal, out["iterations"] = _improve(training, x, steps, expected)
-    p = training.parameters(x)
-
-    sigma = 1.4826 * np.median(np.abs(residual[np.isfinite(residual)]))
-    out["correlation"] = _inflation(residual)
-    spread = out["correlation"] * (sigma / expected) ** 2
-    covariance = _inverse(normal) * spread
-    out["residual"] = sigma / now["torque_constant"]
-    out["residual_ratio"] = sigma / expected
-    out["contact_angle"] = x[_CONTACT]
-    out["contact_sigma"] = sqrt(covariance[_CONTACT, _CONTACT])
-    out["contact_given_curve_sigma"] = sqrt(spread / max(normal[_CONTACT, _CONTACT], 1e-300))
-    for name in ("curve", "load_friction", "offset_friction", "presliding_angle"):
-        out[name] = p[name]
+    training = _Training(rows, calibration, state, scale)
+    fit = _fit(training, x, steps, np.arange(len(x)))
+    # Pads that did not change keep the curve of a whole campaign, however much better one with more freedom fits the noise.
+    held = fit.x.copy()
+    held[_CURVE:] = now["curve"][:terms] / scale
+    held = _fit(training, held, steps, np.arange(_CURVE))
+    unchanged = held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
+    if unchanged:
+        fit = held
+    x, covariance = fit.x, fit.covariance
+    values = training.values(x)
+    if unchanged:
+        values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
+    curve = to_parameters(moved(calibration, values))["curve"]
+    expected, _ = torque_sigma(*_noises(calibration))
+    sigma = _deviation(fit.residual)
+    sigmas = np.sqrt(np.diag(covariance))
     top = highest - x[_CONTACT]
-    out["top_force"] = characteristic_curve(top, p["curve"])[0]
-    constant, relative, out["force_sigma"] = _force_sigma(p["curve"], scale, covariance, top)
-    # What the fit cannot see: the dynamics' own error, and the torque constant's, which the curve inherits.
-    out["stiffness_sigma"] = sqrt(constant**2 + limits["dynamics_sigma"] ** 2)
-    out["stiffness_relative_sigma"] = sqrt(relative**2 + limits["torque_constant_sigma"] ** 2)
-    out["pairs_difference"] = _pairs_difference(pairs, x[_CONTACT], p["curve"], out["top_force"])
-    out["curve_change"] = _curve_change(p["curve"], now["curve"], limits["high_force"])
-    out["verdict"] = _judge(rows, force, residual, top, now, limits, out)
-    return out
+    # The torque constant's error scales the whole curve, whose shape is known better than its size.
+    along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
+    constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
+    # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
+    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
+    if unchanged:
+        values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
+    else:
+        values[STIFFNESS_SIGMA] = hypot(constant, base.noise.stiffness_N)
+        values[STIFFNESS_RELATIVE_SIGMA] = hypot(relative, scale_sigma)
+    found = Evaluation(
+        r.ACCEPTED,
+        values={key: float(value) for key, value in values.items()},
+        sigmas=curve_values(calibration, sigmas[_CURVE:] * scale)
+        | {
+            LOAD_FRICTION: float(sigmas[_LOAD] * now["gear_gain"]),
+            OFFSET_FRICTION: float(sigmas[_OFFSET]),
+            PRESLIDING_ANGLE: float(sigmas[_PRESLIDING] * values[PRESLIDING_ANGLE]),
+        },
+        contact_angle=float(x[_CONTACT]),
+        contact_sigma=fit.contact_sigma,
+        torque_error=expm1(-x[_GAIN]),
+        torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
+        evidence={
+            "samples": len(rows),
+            "residual_A": float(sigma / now["torque_constant"]),
+            "residual_ratio": float(sigma / expected),
+            "correlation": float(fit.correlation),
+            "curve_changed": float(not unchanged),
+            "contact_sigma_rad": float(sigmas[_CONTACT]),
+            "force_sigma_N": force_sigma,
+            "top_force_N": float(characteristic_curve(top, curve)[0]),
+            "torque_gain": exp(x[_GAIN]),
+            "torque_gain_sigma": float(sigmas[_GAIN]),
+            "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
+        },
+    )
+    found.evidence["pairs_difference"] = _pairs_difference(pairs, x, curve, rows, now["gear_gain"])
+    found.outcome, found.note = _judge(rows, fit, base, found)
+    return found
 
 
-def _pairs_difference(pairs, contact, curve, top_force):
-    """RMS difference of the pairs' forces from the curve, as a share of the largest force."""
-    force = np.array([characteristic_curve(angle - contact, curve)[0] for angle in pairs[:, ANGLE]])
-    return sqrt(np.average((pairs[:, FORCE] - force) ** 2, weights=pairs[:, WEIGHT])) / max(top_force, 1.0)
+def _pairs_difference(pairs, x, curve, rows, gear_gain):
+    """RMS difference of the pairs' forces from the curve, as a share of the largest force; at the pads' temperature, and with
+    the torque constant and offset that were found."""
+    factor = rows["factor"].mean()
+    force = factor * np.array([characteristic_curve(angle - x[_CONTACT], curve)[0] for angle in pairs[:, ANGLE]])
+    seen = exp(x[_GAIN]) * pairs[:, FORCE] - x[_TORQUE_OFFSET] / gear_gain
+    return sqrt(np.average((seen - force) ** 2, weights=pairs[:, WEIGHT])) / max(force.max(), 1.0)
 
 
-def _curve_change(curve, before, force):
-    """Relative change of the travel that it takes to reach ``force``."""
-    travel, past = travel_at(force, curve), travel_at(force, before)
-    return abs(travel - past) / past if past > 0.0 else inf
-
-
-def _judge(rows, force, residual, top, now, limits, out):
-    """ACCEPTED, or the first reason against it."""
-    high = limits["high_force"]
-    covered = limits["coverage"] * high
-    uncertain = out["contact_sigma"] + out["force_sigma"] + out["residual"]
-    if out["iterations"] < 0 or not np.isfinite(uncertain) or out["contact_sigma"] == 0.0:
-        return r.NOT_CONVERGED
-    if out["top_force"] < covered:
-        return r.NOT_COVERED
-    if not _excited(rows["angle"], force, residual, 0.01 * high, covered, limits["samples_per_range"]):
-        return r.NOT_EXCITED
-    if out["residual_ratio"] > limits["residual_ratio"]:
-        return r.RESIDUAL
-    travels = np.maximum(top * np.arange(_TRAVELS + 1) / _TRAVELS, 1e-6)
-    if any(characteristic_curve(travel, out["curve"])[1] <= 0.0 for travel in travels):
-        return r.NOT_PHYSICAL
-    load, offset = out["load_friction"], out["offset_friction"]
-    if not 0.0 <= load <= limits["maximum_friction_share"] * now["gear_gain"] or not offset >= 0.0:
-        return r.NOT_PHYSICAL
-    if out["curve_change"] > limits["curve_change"]:
-        return r.CHANGED_TOO_MUCH
-    friction, past = offset + load * high, now["offset_friction"] + now["load_friction"] * high
-    if abs(friction - past) > limits["friction_change"] * past:
-        return r.CHANGED_TOO_MUCH
-    if out["force_sigma"] > limits["maximum_sigma"]:
-        return r.TOO_UNCERTAIN
-    if out["pairs_difference"] > limits["pairs_difference"]:
-        return r.PAIRS_DISAGREE
-    return r.ACCEPTED
+def _judge(rows, fit, base, found):
+    """(ACCEPTED or the first reason against it, a note with numbers)."""
+    limits, evidence = base.adaptation, found.evidence
+    covered = limits.coverage * base.training_force_N
+    uncertain = evidence["contact_sigma_rad"] + evidence["force_sigma_N"] + evidence["residual_A"]
+    if fit.iterations < 0 or not np.isfinite(uncertain) or evidence["contact_sigma_rad"] == 0.0:
+        return r.NOT_CONVERGED, ""
+    if evidence["top_force_N"] < covered:
+        return r.NOT_COVERED, f"{evidence['top_force_N']:.0f} N of {covered:.0f} N"
+    low = max(0.01 * base.training_force_N, limits.low_force_N)
+    if not _excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
+        return r.NOT_EXCITED, ""
+    if evidence["residual_ratio"] > limits.residual_ratio:
+        return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"
+    if abs(fit.x[_GAIN]) > _GAIN_LIMIT:
+        return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} of the calibration's"
+    if out_of_bounds := why_out_of_bounds(base, found.values):
+        return r.OUT_OF_BOUNDS, out_of_bounds
+    if evidence["force_sigma_N"] > limits.maximum_sigma_N:
+        return r.TOO_UNCERTAIN, f"{evidence['force_sigma_N']:.0f} N"
+    if evidence["pairs_difference"] > limits.pairs_difference:
+        return r.PAIRS_DISAGREE, f"by {100.0 * evidence['pairs_difference']:.1f} % of full force"
+    return r.ACCEPTED, ""

@@ -1,25 +1,21 @@
-"""Records of park brake adaptation: what is collected, within which limits, what is learned. SI units, degC."""
+"""What adaptation keeps between ticks: its phases, how a training can end, and the records of both. SI units, degC."""
 
 import numpy as np
 
-from emb_daemon.estimator.records import CURVE_TERMS
-
-#: Phases of a corner's adaptation.
+#: Phases of a corner's adaptation: nothing; motion was asked for; motion came unasked; a training is being evaluated.
 IDLE, ASKING, WATCHING, EVALUATING = range(4)
 
-#: Result of the last training (wire: Result).
-NO_RESULT, RESULT_ACCEPTED, RESULT_REJECTED, RESULT_ABORTED = range(4)
-
-#: Why training came to nothing. Up to NOT_CONVERGED it was aborted, from there on its result was rejected.
-(ACCEPTED, BRAKE_REQUESTED, PARK_BRAKE_LEFT, VEHICLE_MOVED, BAD_INPUT, NO_ANSWER, TOO_LONG, NOT_IN_TIME, TOO_WARM,
- NOT_CONVERGED, TOO_FEW, NOT_COVERED, NOT_EXCITED, RESIDUAL, NOT_PHYSICAL, CHANGED_TOO_MUCH, TOO_UNCERTAIN,
+#: How a training ended. Before NOT_CONVERGED it was aborted, from there on its evaluation was rejected.
+(ACCEPTED, BRAKE_REQUESTED, PARK_BRAKE_LEFT, VEHICLE_MOVED, BAD_INPUT, NO_ANSWER, TOO_LONG, NOT_IN_TIME, AMBIENT,
+ OTHERS_NOT_HOLDING, NOT_CONVERGED, TOO_FEW, NOT_COVERED, NOT_EXCITED, RESIDUAL, OUT_OF_BOUNDS, TOO_UNCERTAIN,
  PAIRS_DISAGREE) = range(18)  # fmt: skip
-VERDICTS = (
+OUTCOMES = (
     "accepted", "brake requested", "park brake released", "vehicle moved", "input lost or implausible",
     "training motion did not come", "training motion took too long", "evaluation was not ready in time",
-    "pads too warm or too cold", "fit did not converge", "too few samples", "force range not covered",
-    "a force range not excited in both directions", "residual too large", "outside physical bounds",
-    "too far from the last accepted values", "too uncertain", "pairs of passes disagree with the model",
+    "too warm or too cold outside", "another corner does not hold the car", "fit did not converge", "too few samples",
+    "force range not covered",
+    "a force range not excited in both directions", "residual too large", "outside the bounds of this brake",
+    "too uncertain", "pairs of passes disagree with the model",
 )  # fmt: skip
 
 #: Samples of one training: what the path models read of a SAMPLE, and the stiffness factor that held then.
@@ -41,13 +37,16 @@ TRAINING = np.dtype(
     align=True,
 )
 
-#: Limits of adaptation, from the calibration; see `calibration.types.Adaptation` for their meaning.
+#: Limits that the tick reads, from the calibration; see `calibration.types.Adaptation` for their meaning. ``estimated``:
+#: whether this process estimates the corner at all.
 LIMITS = np.dtype(
     [
+        ("estimated", "?"),
         ("enabled", "?"),
         ("minimum_ambient", "f8"),
         ("maximum_ambient", "f8"),
-        ("maximum_rise", "f8"),
+        ("parking_force", "f8"),
+        ("low_force", "f8"),
         ("high_force", "f8"),
         ("dither_amplitude", "f8"),
         ("dither_frequency", "f8"),
@@ -55,55 +54,21 @@ LIMITS = np.dtype(
         ("answer_time", "f8"),
         ("longest_training", "f8"),
         ("coverage", "f8"),
-        ("samples_per_range", "i8"),
-        ("residual_ratio", "f8"),
-        ("curve_change", "f8"),
-        ("clearance_change", "f8"),
-        ("friction_change", "f8"),
-        ("maximum_friction_share", "f8"),
-        ("maximum_sigma", "f8"),
-        ("pairs_difference", "f8"),
-        ("torque_constant_sigma", "f8"),
-        ("dynamics_sigma", "f8"),
     ],
     align=True,
 )
 
-#: What one training teaches. ``verdict`` is ACCEPTED or why not; the figures after ``clearance`` are its evidence.
-LEARNED = np.dtype(
-    [
-        ("verdict", "i8"),
-        ("contact_angle", "f8"),
-        ("contact_sigma", "f8"),
-        ("contact_given_curve_sigma", "f8"),
-        ("curve", "f8", (CURVE_TERMS,)),
-        ("load_friction", "f8"),
-        ("offset_friction", "f8"),
-        ("presliding_angle", "f8"),
-        ("stiffness_sigma", "f8"),
-        ("stiffness_relative_sigma", "f8"),
-        ("clearance", "f8"),
-        ("samples", "i8"),
-        ("iterations", "i8"),
-        ("residual", "f8"),
-        ("residual_ratio", "f8"),
-        ("correlation", "f8"),
-        ("top_force", "f8"),
-        ("force_sigma", "f8"),
-        ("pairs_difference", "f8"),
-        ("curve_change", "f8"),
-    ],
-    align=True,
-)
-
-#: One corner's adaptation as it runs. ``wanted`` asks whoever computes for an evaluation of the first ``training_rows`` of
-#: ``rows``, told apart by ``generation``; ``ready`` says that ``learned`` holds it; ``settled`` asks for the outcome to be
-#: logged and kept. ``force`` is the torque path's, smoothed.
+#: One corner's adaptation as it runs. ``evaluation_wanted`` asks whoever computes for an evaluation of the first
+#: ``training_rows`` of ``rows``, told apart by ``generation``; ``evaluation_ready`` says that it is there: how it ended, and
+#: if it was accepted the contact angle with its standard deviation for the learned curve. ``ended`` asks for the outcome to
+#: be logged and kept. ``force`` is the torque path's without the torque's offset, smoothed; ``holding`` whether the corner
+#: surely clamps with its parking force at ``time_ns``; ``pulse`` the wheel's count since which the car stood.
+#: ``snapshot_wanted`` asks for what the estimator knows to be kept, last at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
         ("phase", "i8"),
         ("result", "i8"),
-        ("verdict", "i8"),
+        ("outcome", "i8"),
         ("asked", "?"),
         ("tried", "?"),
         ("started", "?"),
@@ -116,16 +81,26 @@ ADAPTER = np.dtype(
         ("still_angle", "f8"),
         ("tail_time", "f8"),
         ("force", "f8"),
+        ("pulse", "f8"),
+        ("parked", "?"),
+        ("snapshot_ns", "i8"),
+        ("snapshot_wanted", "?"),
+        ("holding", "?"),
         ("rows", "i8"),
         ("training_rows", "i8"),
         ("generation", "i8"),
-        ("wanted", "?"),
-        ("ready", "?"),
-        ("settled", "?"),
+        ("evaluation_wanted", "?"),
+        ("evaluation_ready", "?"),
+        ("evaluation", "i8"),
+        ("contact_angle", "f8"),
+        ("contact_sigma", "f8"),
+        ("torque_error", "f8"),
+        ("torque_error_sigma", "f8"),
+        ("ended", "?"),
         ("ambient", "f8"),
         ("rise", "f8"),
+        ("factor_sigma", "f8"),
         ("time_ns", "i8"),
-        ("learned", LEARNED),
     ],
     align=True,
 )
@@ -135,3 +110,16 @@ ADAPTER = np.dtype(
 TRAINING_SAMPLES = 15_000
 EVALUATION_SAMPLES = 750
 CAPACITY = TRAINING_SAMPLES + EVALUATION_SAMPLES
+
+
+def to_limits(calibration) -> np.void:
+    """LIMITS record of a `Calibration`."""
+    a, limits = calibration.adaptation, np.zeros(1, LIMITS)[0]
+    limits["estimated"], limits["enabled"] = True, a.enabled
+    limits["minimum_ambient"], limits["maximum_ambient"] = a.minimum_ambient_C, a.maximum_ambient_C
+    limits["parking_force"], limits["low_force"] = a.parking_force_N, a.low_force_N
+    limits["high_force"], limits["coverage"] = calibration.training_force_N, a.coverage
+    limits["dither_amplitude"], limits["dither_frequency"] = a.dither_amplitude_rad, a.dither_frequency_Hz
+    limits["settling_time"], limits["answer_time"] = a.settling_time_s, a.answer_time_s
+    limits["longest_training"] = a.longest_training_s
+    return limits

@@ -241,16 +241,19 @@ class Adaptation(Struct, kw_only=True):
     minimum_ambient_C: Annotated[float, usual(100.0)] = -10.0
     #: Highest such ambient temperature.
     maximum_ambient_C: Annotated[float, usual(100.0)] = 45.0
-    #: Largest rise of the pads over ambient at which training teaches something.
-    maximum_rise_K: Positive = 25.0
+    #: Clamp force that every other corner of the process must hold while one is trained: what keeps a car on a slope of a
+    #: fifth with three wheels.
+    parking_force_N: Positive = 3000.0
+    #: Clamp force down to which training motion is asked for; zero is released, which alone shows contact and clearance.
+    low_force_N: Annotated[NonNegative, usual(1000.0)] = 0.0
     #: Clamp force up to which training motion is asked for; left out, 18 kN or 60 % of the largest force, what is less.
     high_force_N: Positive | None = None
     #: Share of that force that must be reached.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
     #: Amplitude of the small fast sinusoid on top.
     dither_amplitude_rad: Annotated[NonNegative, usual(1.0)] = 0.9
-    #: Its frequency.
-    dither_frequency_Hz: Positive = 5.0
+    #: Its frequency. The inertia's torque, which shows the torque constant, grows with its square.
+    dither_frequency_Hz: Positive = 8.0
     #: Standing quietly with the park brake applied before training is asked for.
     settling_time_s: Annotated[NonNegative, usual(5.0)] = 5.0
     #: Waiting for the motion that was asked for.
@@ -261,11 +264,11 @@ class Adaptation(Struct, kw_only=True):
     samples_per_range: Annotated[int, Meta(ge=1)] = 50
     #: Residual current over the noise that the calibration knows.
     residual_ratio: Positive = 1.5
-    #: Largest relative change of the travel to high_force_N against the values in use, for one training.
+    #: Share by which the travel to high_force_N may be under that of the stiffest curve or over that of the softest.
     curve_change: Positive = 0.35
-    #: Largest relative change of the friction there, for one training.
+    #: Largest relative change of the friction there.
     friction_change: Positive = 0.6
-    #: Largest change of the clearance, for one training.
+    #: Largest change of the clearance.
     clearance_change_rad: Positive = 5.0
     #: Friction torque over clamp torque that a gear can have.
     maximum_friction_share: Annotated[Share, usual(0.5)] = 0.6
@@ -273,8 +276,9 @@ class Adaptation(Struct, kw_only=True):
     maximum_sigma_N: Positive = 200.0
     #: Largest RMS difference of the pairs of passes from the learned curve, as a share of the largest force.
     pairs_difference: Positive = 0.04
-    #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
-    torque_constant_relative: Annotated[NonNegative, usual(0.002)] = 0.002
+    #: Relative standard deviation of the force's scale that training cannot see: gear gain, inertia, and what the pads'
+    #: dynamics are wrong by where they look like inertia.
+    torque_constant_relative: Annotated[NonNegative, usual(0.01)] = 0.01
 
     def __post_init__(self):
         if self.minimum_ambient_C >= self.maximum_ambient_C:

@@ -53,21 +53,21 @@ def _show(entry) -> None:
     if entry is None:
         print("  no training was accepted; the calibration's values are in use")
         return
-    curve = " ".join(f"{value:.5g}" for value in entry.curve if value)
-    clearance = "not learned" if entry.clearance_rad is None else f"{entry.clearance_rad:.2f} rad"
-    print(f"  learned         {entry.date}, at {entry.ambient_C:.0f} °C, pads {entry.pad_rise_K:+.1f} K")
-    print(f"  curve           {curve}  N/rad, N/rad², …")
-    print(
-        f"  friction        {1e3 * entry.offset_friction_Nm:.2f} mN m + {1e6 * entry.load_friction_m_per_rad:.3f} µm/rad · F"
-    )
-    print(f"  presliding      {1e3 * entry.presliding_angle_rad:.1f} mrad")
-    print(f"  clearance       {clearance}, contact angle ±{entry.contact_sigma_rad:.2f} rad")
-    print(f"  force           ±{entry.force_sigma_N:.0f} N at most, reached {1e-3 * entry.top_force_N:.1f} kN")
-    residual = f"residual {entry.residual_A:.3f} A ({entry.residual_ratio:.2f} of noise)"
-    print(f"  evidence        {entry.samples} samples, {residual}, pairs differ {100 * entry.pairs_difference:.1f} %")
+    print(f"  learned {entry.date}, at {_number(entry.ambient_C)} °C, pads {_number(entry.pad_rise_K)} K above it")
+    for key, value in entry.values.items():
+        sigma = f" ± {entry.sigmas[key]:.2g}" if key in entry.sigmas else ""
+        print(f"  {key:40} {value:.6g}{sigma}")
+    print(f"  evidence: {_figures(entry)}")
 
 
 def _line(entry) -> None:
-    change = "" if entry.curve_change is None else f", travel to full force changed by {100 * entry.curve_change:.1f} %"
-    ratio = "" if entry.residual_ratio is None else f", residual {entry.residual_ratio:.2f} of noise"
-    print(f"  {entry.date}  {entry.verdict}: {entry.samples} samples{ratio}{change}")
+    note = f" ({entry.note})" if entry.note else ""
+    print(f"  {entry.date}  {entry.outcome}{note}: {_figures(entry)}")
+
+
+def _figures(entry) -> str:
+    return ", ".join(f"{name} {_number(value)}" for name, value in entry.evidence.items())
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4g}"

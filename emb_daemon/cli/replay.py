@@ -70,12 +70,11 @@ def run(arguments: argparse.Namespace) -> int:
         write_table(output, {name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
     if arguments.report:
         from emb_daemon.adapt.memory import Memory
-        from emb_daemon.calibration.types import to_parameters
         from emb_daemon.report.replay import replay_page
 
         described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
         learned = Memory(arguments.state).read(arguments.corner) if arguments.state else None
-        page = replay_page(results, arguments.corner, described, learned, to_parameters(calibration))
+        page = replay_page(results, arguments.corner, described, learned, calibration)
         page.write(arguments.report)
     report = [result.figures() for result in results]
     if arguments.json:

@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
     daemon.warm_up()
     if compiled_for_the_next_start():
         log.info("kernels compiled, starting again with them: the compiler would keep twice the daemon's memory")
+        # A handler does not survive, and without one the signal ends the process; to be ignored does survive.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     # Not before: a signal that comes while kernels are compiled ends the process at once.
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())

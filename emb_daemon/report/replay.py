@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.adapt.memory import apply_entry
+from emb_daemon.calibration.parameters import moved, parameter
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.judging import PATHS
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
@@ -142,58 +143,47 @@ def _cells(part: dict) -> list[str]:
     return [*(f"{part[name]:.1f}" for name in ("rmse", "bias", "p95", "max")), f"{part['samples']}"]
 
 
-def _adaptation(page: Page, learned, calibration: np.void) -> None:
+def _adaptation(page: Page, learned, calibration: Calibration) -> None:
     """What park brake adaptation made of the drive."""
     section = page.section(
         "Adaptation",
         "Learned from motor current and angle of training motions, the newest last; only an accepted one is used. Trainings "
         "before this drive are of the same state directory.",
     )
+    figures = (("samples", 1, 0), ("residual_ratio", 1, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1, 0))
     rows = [
         [
             entry.date.replace("T", " "),
-            Cell(entry.verdict, PASS if entry.curve is not None else FAIL),
+            Cell(f"{entry.outcome} {entry.note}".strip(), PASS if entry.values else FAIL),
             *(
                 "–" if value is None else f"{factor * value:.{digits}f}"
                 for value, factor, digits in (
-                    (entry.samples, 1, 0), (entry.residual_ratio, 1, 2), (entry.curve_change, 100, 1),
-                    (entry.top_force_N, 1e-3, 1), (entry.ambient_C, 1, 0), (entry.pad_rise_K, 1, 0),
+                    *((entry.evidence.get(name), factor, digits) for name, factor, digits in figures),
+                    (entry.ambient_C, 1, 0), (entry.pad_rise_K, 1, 0),
                 )
             ),
         ]
         for entry in learned.history
     ]  # fmt: skip
-    headings = [
-        "training",
-        "verdict",
-        "samples",
-        "residual / noise",
-        "travel changed / %",
-        "up to / kN",
-        "air / °C",
-        "pads / K",
-    ]
+    headings = ["training", "outcome", "samples", "residual / noise", "up to / kN", "sigma / N", "air / °C", "pads / K"]
     section.table(headings, rows)
     if learned.current is None:
         return
-    adapted = calibration.copy()
-    apply_entry(learned.current, adapted)
-    scales = (
-        ("friction, constant", "offset_friction", 1e3, "mN m"), ("friction per force", "load_friction", 1e6, "µm/rad"),
-        ("presliding angle", "presliding_angle", 1e3, "mrad"), ("clearance", "clearance", 1.0, "rad"),
-    )  # fmt: skip
+    values, sigmas = learned.current.values, learned.current.sigmas
     section.table(
-        ["", "calibration", "learned", "unit"],
+        ["", "calibration", "learned", "sigma", "unit"],
         [
-            [label, f"{factor * calibration[name]:.4g}", f"{factor * adapted[name]:.4g}", unit]
-            for label, name, factor, unit in scales
+            [key, f"{now.value:.4g}", f"{value:.4g}", f"{sigmas[key]:.2g}" if key in sigmas else "", now.unit]
+            for key, value in values.items()
+            for now in [parameter(calibration, key)]
         ],
     )
+    records = to_parameters(calibration), to_parameters(moved(calibration, values))
     traces = []
-    for name, parameters, style in (("calibration", calibration, PALE), ("learned", adapted, MODEL)):
+    for name, parameters, style in zip(("calibration", "learned"), records, (PALE, MODEL), strict=True):
         angle = np.linspace(0.0, _TRAVEL_RAD, 2000)
         force = np.polyval([*parameters["curve"][::-1], 0.0], angle)
-        inside = force <= learned.current.top_force_N
+        inside = force <= learned.current.evidence["top_force_N"]
         traces.append(Trace(name, angle[inside], 1e-3 * force[inside], style))
     section.figure(
         xy_figure([Panel("Characteristic curve of the cold pads", "kN", traces)], "motor angle past contact / rad"),
@@ -201,13 +191,13 @@ def _adaptation(page: Page, learned, calibration: np.void) -> None:
     )
 
 
-def replay_page(results: list, corner: str, calibration: str, learned=None, parameters: np.void | None = None) -> Page:
+def replay_page(results: list, corner: str, described: str, learned=None, calibration: Calibration | None = None) -> Page:
     """The page of one or more `replay.Result`, one after the other as the drive that they are.
 
     Args:
-        calibration: which one it was, in words.
+        described: which calibration it was, in words.
         learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
-        parameters: the calibration's PARAMETERS record, to compare that with.
+        calibration: to compare that with.
     """
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
@@ -217,7 +207,7 @@ def replay_page(results: list, corner: str, calibration: str, learned=None, para
     doubtful = float(np.mean(estimates["reasons"] != 0))
     details = [
         f"{len(estimates)} samples, {time_s[-1]:.1f} s; a reason for doubt in {100.0 * doubtful:.1f} % of them.",
-        f"Calibration: {calibration}.",
+        f"Calibration: {described}.",
     ]
     known = np.isfinite(force_N)
     if known.any():
@@ -246,5 +236,5 @@ def replay_page(results: list, corner: str, calibration: str, learned=None, para
     if known.any():
         _errors(page, estimates, force_N, figures)
     if learned is not None and learned.history:
-        _adaptation(page, learned, parameters)
+        _adaptation(page, learned, calibration)
     return page

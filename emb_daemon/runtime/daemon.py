@@ -9,15 +9,15 @@ keeps ticking by itself, so that silence is reported too.
 import math
 import threading
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
-from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.memory import Memory, Store
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import compile_beside, njit
@@ -39,8 +39,8 @@ _STATUS_NS = 10_000_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
 
-def _date(_time_ns: int) -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+def _real_time(_time_ns: int) -> int:
+    return time.time_ns()
 
 
 class Pacer:
@@ -108,14 +108,17 @@ class Daemon:
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
-        self._adaptation = Adaptation(setup.calibrations, Memory(state), _date, threaded=True) if state else None
+        self._adaptation = Adaptation(setup.calibrations, Memory(state), _real_time, threaded=True) if state else None
         corners = tuple(setup.configuration.corners)
         self.pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self.ticks = self.missed = 0
         self._invalid = 0
-        self._stop = threading.Event()
-        self._reload = threading.Event()
-        self._reloaded: tuple[Setup, list] | None = None
+        # Plain flags: a signal handler that takes a lock, as an Event does, may wait for the very thread it interrupts.
+        self._stopping = self._reload_wanted = False
+        self._reader: threading.Thread | None = None
+        #: Calibrations by corner: of the files in use, and of those that were read and wait for the brake's release.
+        self._calibrations = dict(setup.calibrations)
+        self._waiting: dict[str, tuple[Calibration, Store | None]] = {}
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
@@ -123,11 +126,11 @@ class Daemon:
 
     def stop(self) -> None:
         """Ask the loop to end; safe in a signal handler."""
-        self._stop.set()
+        self._stopping = True
 
     def reload(self) -> None:
         """Ask for the calibrations to be read again; safe in a signal handler."""
-        self._reload.set()
+        self._reload_wanted = True
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
@@ -164,7 +167,7 @@ class Daemon:
         watchdog_ns = int(0.4e9 * self._manager.watchdog_s) if self._manager.watchdog_s else None
         next_ping, next_status = now, now + _STATUS_NS
         self._manager.notify("READY=1", "STATUS=waiting for inputs")
-        while not self._stop.is_set():
+        while not self._stopping:
             wake = pacer.next_wake(time.monotonic_ns())
             remaining = wake - time.monotonic_ns()
             if remaining > 0:
@@ -174,8 +177,8 @@ class Daemon:
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
-            if self._reload.is_set() or self._reloaded is not None:
-                self._take_calibration()
+            if self._reload_wanted or self._reader is not None or self._waiting:
+                self._follow_reload()
             if watchdog_ns and now >= next_ping:
                 next_ping = now + watchdog_ns
                 self._ping()
@@ -184,7 +187,7 @@ class Daemon:
                 self._manager.notify(f"STATUS={self.ticks} ticks, {self.missed} missed, {self._bus.dropped} frames dropped")
         self._manager.notify("STOPPING=1")
         if self._adaptation:
-            self._adaptation.close()
+            self._adaptation.close(self.pipeline.states, self.pipeline.parameters)
         log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
 
     def tick(self, now_ns: int, pacer: Pacer) -> None:
@@ -245,27 +248,49 @@ class Daemon:
                 bits |= reason
         self.pipeline.disturbed[:] = bits
 
-    def _take_calibration(self) -> None:
-        if self._reloaded is not None:
-            (setup, learned), self._reloaded = self._reloaded, None
-            self.pipeline.parameters[:] = setup.parameters
-            if self._adaptation:
-                self._adaptation.replace(learned, self.pipeline.parameters)
-            for name, calibration in setup.calibrations.items():
-                log.info("corner %s: calibration %s in use", name, calibration_hash(calibration))
-        if self._reload.is_set():
-            self._reload.clear()
-            threading.Thread(target=self._read_calibration, name="reload", daemon=True).start()
+    def _follow_reload(self) -> None:
+        """Have the calibrations read, one reading at a time, and let corners go over to those that changed."""
+        if self._reader is not None and not self._reader.is_alive():
+            self._reader = None
+        if self._reload_wanted and self._reader is None:
+            self._reload_wanted = False
+            self._reader = threading.Thread(target=self._read_calibrations, name="reload", daemon=True)
+            self._reader.start()
+        for name in [name for name in self._waiting if self._released(name)]:
+            self._begin_anew(name, *self._waiting.pop(name))
 
-    def _read_calibration(self) -> None:
+    def _released(self, name: str) -> bool:
+        state = self.pipeline.states[CORNERS.index(name)]
+        return not (state["started"] and state["contact"]["engaged"])
+
+    def _read_calibrations(self) -> None:
         try:
             setup = Setup(self._setup.path)
-            if setup.configuration.corners.keys() != self._setup.configuration.corners.keys():
+            if setup.calibrations.keys() != self._setup.calibrations.keys():
                 raise InputError(f"{setup.path}: corners: a reload cannot change them, restart instead")
         except InputError as error:
             log.error("calibration not reloaded, the old one stays: %s", error)
-        else:
-            self._reloaded = setup, self._adaptation.read(setup.calibrations) if self._adaptation else []
+            return
+        waiting = {}
+        for name, calibration in setup.calibrations.items():
+            words = {"corner": name, "calibration": calibration_hash(calibration)}
+            if words["calibration"] == calibration_hash(self._calibrations[name]):
+                log.info("corner %(corner)s: calibration %(calibration)s unchanged", words, extra={"fields": words})
+            else:
+                log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
+                waiting[name] = calibration, self._adaptation.read(name, calibration) if self._adaptation else None
+        self._waiting = waiting
+
+    def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None) -> None:
+        """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what
+        it starts from, belong to that."""
+        self._calibrations[name] = calibration
+        if self._adaptation:
+            self._adaptation.replace(name, calibration, learned)
+            calibration = self._adaptation.in_use(name)
+        self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
+        words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
+        log.info("corner %(corner)s: begins anew with calibration %(calibration)s", words, extra={"fields": words})
 
     def _ping(self) -> None:
         """Tell the watchdog that the loop is well: it ticks, and no estimate came out that is not a number."""

@@ -1,21 +1,28 @@
-"""What adaptation does in a tick: watch for the chance, ask, collect, wait for the evaluation, take its outcome over.
+"""What adaptation does in a tick: watch for the chance, ask, collect, wait for the evaluation, go over to what it found.
 
 Training is asked for once per application of the park brake. Motion that comes unasked while the park brake is applied is
 used too; then whoever moves the brake may raise BrakeRequest with it, so that only an asked training ends on it.
 """
+
+from math import hypot
 
 import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import settle, unexplained_step
 from emb_daemon.estimator.answer import answer_row
+from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.jit import njit
-from emb_daemon.models.fusion import OFFSET
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET
 from emb_daemon.wire import contract as e
 
-_NONE, _RUN = 0, 1
-_PARK_APPLIED = 1.0
 _STANDING_RAD_S = 0.1
+#: Pulses of a wheel that turned: one more or less is an edge of the encoder's wheel that stands before its sensor.
+_ROLLED_PULSES = 2
+#: Time between snapshots of what the estimator knows: a restart loses no more than this.
+_SNAPSHOT_NS = 10_000_000_000
+#: Age of another corner's estimate from which nothing is known of it.
+_SILENT_NS = 100_000_000
 #: Time between two samples from which some are missing.
 _GAP_S = 0.006
 #: Motor travel that counts as motion, and the time without any after which unasked motion is over.
@@ -32,33 +39,59 @@ _BAD = (
 
 
 @njit
-def _obstacle(a, m, estimate, limits):
+def _obstacle(a, m, estimate, limits, others_hold):
     """ACCEPTED if training may go on, or what forbids it. A gap is bridged for as long as the estimate is."""
+    if a.phase == r.ASKING and not others_hold:
+        return r.OTHERS_NOT_HOLDING
     if not estimate.is_sample:
         return r.BAD_INPUT if estimate.source == e.INVALID else r.ACCEPTED
     if estimate.reasons & _BAD or not m.has_status:
         return r.BAD_INPUT
-    if m.park_brake != _PARK_APPLIED:
+    if m.park_brake != e.PARK_APPLIED:
         return r.PARK_BRAKE_LEFT
-    if m.vehicle_speed > 0.0 or (m.has_wheel_speed and m.wheel_speed > _STANDING_RAD_S):
+    if m.vehicle_speed > 0.0 or (m.has_wheel_speed and m.wheel_speed > _STANDING_RAD_S) or _rolled(a, m):
         return r.VEHICLE_MOVED
     if a.asked and m.brake_request != 0.0:
         return r.BRAKE_REQUESTED
-    if not limits.minimum_ambient <= a.ambient <= limits.maximum_ambient or abs(a.rise) > limits.maximum_rise:
-        return r.TOO_WARM
+    if not limits.minimum_ambient <= a.ambient <= limits.maximum_ambient:
+        return r.AMBIENT
     return r.ACCEPTED
 
 
 @njit
-def end(a, verdict, result):
+def _rolled(a, m):
+    """Whether the wheel turned since the car was found standing."""
+    if not m.has_wheel_pulse:
+        return False
+    pulses = (m.wheel_pulse - a.pulse) % e.PULSE_MODULO
+    if min(pulses, e.PULSE_MODULO - pulses) < _ROLLED_PULSES:
+        return False
+    a.pulse = m.wheel_pulse
+    return True
+
+
+@njit
+def others_hold(adapters, limits, k, time_ns):
+    """Whether every other corner that this process estimates holds its parking force: then the car stays where it is while
+    corner ``k`` is opened. One that is being trained does not count, nor one of which nothing is heard."""
+    for other in range(len(adapters)):
+        o = adapters[other]
+        silent = time_ns - o.time_ns > _SILENT_NS
+        if other != k and limits[other].estimated and (silent or not o.holding or o.phase == r.ASKING):
+            return False
+    return True
+
+
+@njit
+def end_training(a, outcome, result):
     """Back to idle; nothing that was collected survives."""
     a.phase = r.IDLE
     a.rows = 0
-    a.wanted = a.ready = False
+    a.evaluation_wanted = a.evaluation_ready = False
     a.parked_time = 0.0
-    if a.asked or result != r.RESULT_ABORTED:
-        a.result, a.verdict = result, verdict
-        a.settled = True
+    if a.asked or result != e.RESULT_ABORTED:
+        a.result, a.outcome = result, outcome
+        a.ended = True
     a.asked = False
 
 
@@ -80,14 +113,14 @@ def _collect(a, s, rows, m):
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
-    row.factor = s.factor * s.scale
+    row.factor = s.factor
     a.rows += 1
 
 
 @njit
 def _stroke(a, limits, dt):
     """Whether a whole stroke lies behind: released, clamped, released, and a little more."""
-    low = a.force < _LOW * limits.high_force
+    low = a.force < _LOW * limits.high_force + limits.low_force
     if a.was_high:
         if low or a.tail_time > 0.0:
             a.tail_time += dt
@@ -109,75 +142,78 @@ def _progress(a, limits):
 
 
 @njit
-def take_over(s, p, scratch, rows, learned):
-    """Put learned values into a corner's parameters and bring its path models to the last of ``rows`` with them."""
-    for i in range(len(p.curve)):
-        p.curve[i] = learned.curve[i]
-    p.load_friction, p.offset_friction = learned.load_friction, learned.offset_friction
-    p.presliding_angle = learned.presliding_angle
-    p.stiffness_sigma, p.stiffness_relative_sigma = learned.stiffness_sigma, learned.stiffness_relative_sigma
-    if np.isfinite(learned.clearance):
-        p.clearance = learned.clearance
+def apply_learned(s, scratch, rows, learned, a):
+    """Go over to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the path models to
+    the last of ``rows``."""
     first = max(0, len(rows) - _RUN_UP)
     scratch[0] = s
     t = scratch[0]
-    t.contact_angle = learned.contact_angle
-    settle(t, p, rows[first])
+    t.contact_angle = a.contact_angle
+    settle(t, learned, rows[first])
     for i in range(first + 1, len(rows)):
-        unexplained_step(t, p, rows[i])
+        unexplained_step(t, learned, rows[i])
     s.contact_angle, s.past_contact = t.contact_angle, t.past_contact
     s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
     s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
     s.effects = t.effects
     # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
     # what may still differ for this very curve.
+    # Stiffness, contact and friction are new; what concerns the motor and its current sensor is no part of them.
+    motor = (OFFSET, FADE, HOUSING)
     for i in range(len(s.error)):
-        # An offset of the current sensor is no part of what was learned.
-        if i != OFFSET:
+        if i not in motor:
             s.error[i] = 0.0
         for j in range(len(s.error)):
-            if i != j:
+            if i != j and (i not in motor or j not in motor):
                 s.covariance[i, j] = 0.0
-    s.covariance[0, 0] = 1.0
-    s.covariance[1, 1] = learned.contact_given_curve_sigma**2
+    s.covariance[FAST, FAST] = 1.0
+    s.covariance[CONTACT, CONTACT] = a.contact_sigma**2
+    s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
+    s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
+    s.scale = 1.0
     s.contact.confirmed, s.contact.lost = True, False
+    s.contact_anchor = s.contact_angle
+    open_all(s, learned)
 
 
 @njit
-def _effect(a, s, p, scratch, rows):
-    """The moment for the outcome of an evaluation."""
-    if not a.ready:
-        end(a, r.NOT_IN_TIME, r.RESULT_ABORTED)
-    elif a.learned.verdict == r.ACCEPTED:
-        take_over(s, p, scratch, rows[: a.rows], a.learned)
-        end(a, r.ACCEPTED, r.RESULT_ACCEPTED)
+def _conclude(a, s, parameters, learned, scratch, rows):
+    """The moment for the outcome of an evaluation; ``parameters`` has shape (1,)."""
+    if not a.evaluation_ready:
+        end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
+    elif a.evaluation == r.ACCEPTED:
+        apply_learned(s, scratch, rows[: a.rows], learned, a)
+        parameters[0] = learned
+        end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
-        end(a, a.learned.verdict, r.RESULT_REJECTED)
+        end_training(a, a.evaluation, e.RESULT_REJECTED)
     a.tried = True
 
 
 @njit
-def observe(a, s, p, limits, scratch, rows, m, estimate):
+def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
     """Advance one corner's adaptation by one estimate, and state it there.
 
     Args:
         a: ADAPTER record.
-        s, p: STATE and PARAMETERS records of the corner.
+        s: STATE record of the corner.
+        parameters: its PARAMETERS, shape (1,); ``learned`` the PARAMETERS record that an accepted evaluation puts there.
         limits: LIMITS record.
+        others_hold: whether the car stays where it is while this corner is opened.
         scratch: STATE array, shape (1,).
         rows: TRAINING array, shape (CAPACITY,).
         m, estimate: SAMPLE and ESTIMATE; the sample is old if the estimate is a prediction.
     """
+    if estimate.is_sample:
+        _follow(a, s, parameters[0], limits, m, estimate)
     if not limits.enabled:
         return
-    if estimate.is_sample:
-        _follow(a, s, m, estimate)
-    obstacle = _obstacle(a, m, estimate, limits)
+    obstacle = _obstacle(a, m, estimate, limits, others_hold)
     if obstacle == r.PARK_BRAKE_LEFT:
         a.tried = False
     if obstacle != r.ACCEPTED:
         if a.phase != r.IDLE:
-            end(a, obstacle, r.RESULT_ABORTED)
+            end_training(a, obstacle, e.RESULT_ABORTED)
         a.parked_time = 0.0
     elif not estimate.is_sample:
         pass
@@ -186,74 +222,86 @@ def observe(a, s, p, limits, scratch, rows, m, estimate):
         if not a.tried:
             if a.still_time == 0.0:
                 _begin(a, r.WATCHING)
-            elif a.parked_time >= limits.settling_time:
+            elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, p, limits, scratch, rows, m, estimate)
-    estimate.adapt_request = _RUN if a.phase == r.ASKING else _NONE
-    estimate.adapt_progress = 100 if a.result == r.RESULT_ACCEPTED else 0
+        _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate)
+    estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
+    estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
         estimate.adapt_progress = _progress(a, limits)
         # Reasons say what is degraded meanwhile, and Status with them.
         if estimate.mode == e.RUNNING or estimate.mode == e.DEGRADED:
             estimate.mode = e.ADAPTING
-    estimate.adapt_result = a.result if a.phase == r.IDLE else r.NO_RESULT
+    estimate.adapt_result = a.result if a.phase == r.IDLE else e.NO_RESULT
 
 
 @njit
-def _follow(a, s, m, estimate):
-    """Keep account of motion, smoothed force and temperature."""
+def _follow(a, s, p, limits, m, estimate):
+    """Keep account of motion, force and temperature."""
     if not a.started:
         a.started = True
         a.power_on_angle = a.still_angle = m.angle
         a.still_time = _STILL_S
+        a.pulse = m.wheel_pulse
     if abs(m.angle - a.still_angle) > _MOTION_RAD:
         a.still_angle, a.still_time = m.angle, 0.0
     else:
         a.still_time += m.dt
     if np.isfinite(estimate.torque_force):
-        a.force += min(1.0, m.dt / _SMOOTHING_S) * (estimate.torque_force - a.force)
+        force = estimate.torque_force - s.error[OFFSET] / p.gear_gain
+        a.force += min(1.0, m.dt / _SMOOTHING_S) * (force - a.force)
+    a.holding = estimate.source != e.INVALID and estimate.force - 2.0 * estimate.sigma >= limits.parking_force
     a.ambient = m.ambient if m.has_status else np.nan
     a.rise = 0.5 * (s.mean[0] + s.mean[1]) - m.ambient if s.temperature_known and m.has_status else np.nan
+    # Temperature is read off the same thermal model now and then; what it may be wrong by, the curve inherits.
+    t = p.thermal
+    a.factor_sigma = (
+        t.softening * hypot(s.temperature_doubt, t.sigma) + t.softening_history * hypot(s.history_doubt, t.sigma)
+    ) / s.factor
     a.time_ns = estimate.time_ns
+    parked = m.has_status and m.park_brake == e.PARK_APPLIED
+    if (parked and not a.parked) or a.time_ns - a.snapshot_ns >= _SNAPSHOT_NS:
+        a.snapshot_ns, a.snapshot_wanted = a.time_ns, True
+    a.parked = parked
 
 
 @njit
-def _advance(a, s, p, limits, scratch, rows, m, estimate):
+def _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
         _collect(a, s, rows, m)
         if a.rows - a.training_rows >= r.EVALUATION_SAMPLES:
-            _effect(a, s, p, scratch, rows)
+            _conclude(a, s, parameters, learned, scratch, rows)
         return
     if a.phase == r.ASKING and a.rows == 0 and a.still_time > 0.0:
         if a.phase_time > limits.answer_time:
             a.tried = True
-            end(a, r.NO_ANSWER, r.RESULT_ABORTED)
+            end_training(a, r.NO_ANSWER, e.RESULT_ABORTED)
         return
     _collect(a, s, rows, m)
     if _stroke(a, limits, m.dt):
-        a.phase, a.training_rows, a.ready, a.wanted = r.EVALUATING, a.rows, False, True
+        a.phase, a.training_rows, a.evaluation_ready, a.evaluation_wanted = r.EVALUATING, a.rows, False, True
         a.generation += 1
     elif a.phase == r.WATCHING and a.still_time > _STILL_S:
-        end(a, r.ACCEPTED, r.RESULT_ABORTED)
+        end_training(a, r.ACCEPTED, e.RESULT_ABORTED)
     elif a.rows >= r.TRAINING_SAMPLES or a.phase_time > limits.answer_time + limits.longest_training:
         a.tried = True
-        end(a, r.TOO_LONG, r.RESULT_ABORTED)
+        end_training(a, r.TOO_LONG, e.RESULT_ABORTED)
 
 
 @njit
-def answer_adapting(samples, first, count, states, parameters, estimates, adapters, limits, scratch, rows):
-    """`pipeline.answer` from row ``first``, with adaptation.
+def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
+    """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""
     for number in range(first, count):
         m, estimate = samples[number], estimates[number]
-        index = m.corner
-        answer_row(m, states[index], parameters[index], estimate)
-        a = adapters[index]
-        observe(a, states[index], parameters[index], limits[index], scratch, rows[index], m, estimate)
-        if a.wanted:
+        k = m.corner
+        answer_row(m, states[k], parameters[k], estimate)
+        a, own, hold = adapters[k], parameters[k : k + 1], others_hold(adapters, limits, k, estimate.time_ns)
+        observe(a, states[k], own, learned[k], limits[k], hold, scratch, rows[k], m, estimate)
+        if a.evaluation_wanted:
             return number + 1
     return count

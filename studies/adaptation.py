@@ -1,8 +1,8 @@
 """What can be said of contact and adaptation only by many repetitions: false alarms, wear over a life, kills while writing.
 
-    python -m emb_daemon.adapt.evidence alarms
-    python -m emb_daemon.adapt.evidence wear --output DIR
-    python -m emb_daemon.adapt.evidence kills
+    python -m studies.adaptation alarms
+    python -m studies.adaptation wear --output DIR
+    python -m studies.adaptation kills
 
 Everything here is simulated.
 """
@@ -96,7 +96,7 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
             for name, state in (("with", Path(folder)), ("without", None)):
                 parameters = np.zeros(4, PARAMETERS)
                 parameters[0] = to_parameters(calibration)
-                learner = Adaptation({"FL": calibration}, Memory(state), str) if state else None
+                learner = Adaptation({"FL": calibration}, Memory(state), int) if state else None
                 pipeline = Pipeline(parameters, ("FL",), capacity=1 << 14, adaptation=learner)
                 pipeline.begin(0)
                 estimates, start = [], 0
@@ -111,7 +111,7 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
                     "inside_two_sigma": float(np.mean(np.abs(error) < 2.0 * estimates["sigma"][-judged:])),
                 }
                 if learner:
-                    row["verdict"] = learner.last_verdict("FL")
+                    row["outcome"] = learner.last_outcome("FL")
             rows.append(row)
     return {"cycles": cycles, "trainings": trainings, "wear_mm": wear_mm, "rows": rows}
 
@@ -135,12 +135,11 @@ def specimen(number: int) -> Store:
     """A store whose every value tells ``number``, so that a mixture of two would show."""
     value = float(number)
     entry = Entry(
-        date=str(number), verdict="accepted", ambient_C=value, pad_rise_K=value, curve=(value,) * 5,
-        load_friction_m_per_rad=value, offset_friction_Nm=value, presliding_angle_rad=value, stiffness_sigma_N=value,
-        stiffness_relative_sigma=value, clearance_rad=value, samples=number, residual_A=value, residual_ratio=value,
-        contact_sigma_rad=value, force_sigma_N=value, top_force_N=value, pairs_difference=value, curve_change=value,
+        date=str(number), outcome="accepted", note="", ambient_C=value, pad_rise_K=value,
+        values=dict.fromkeys("abcdefghijkl", value), sigmas=dict.fromkeys("abcdefghijkl", value),
+        evidence=dict.fromkeys("mnopqr", value),
     )  # fmt: skip
-    return Store(format=1, corner="FL", actuator="specimen", calibration=str(number), current=entry, history=(entry,) * 50)
+    return Store(format=2, corner="FL", actuator="specimen", calibration=str(number), current=entry, history=(entry,) * 50)
 
 
 def _write_for_ever(memory: Memory, number: int) -> None:

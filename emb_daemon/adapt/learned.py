@@ -1,0 +1,125 @@
+"""What a training teaches: values of the calibration's own keys, and the bounds outside of which none is believed.
+
+Learned values are a partial calibration, applied by `calibration.parameters.moved`. They are held to the same bounds when a
+training is accepted and when a file is read.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.errors import InputError
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
+
+CLEARANCE = "contact.clearance_rad"
+LOAD_FRICTION = "friction.load_m_per_rad"
+OFFSET_FRICTION = "friction.offset_Nm"
+PRESLIDING_ANGLE = "friction.presliding_angle_rad"
+STIFFNESS_SIGMA = "noise.stiffness_N"
+STIFFNESS_RELATIVE_SIGMA = "noise.stiffness_relative"
+
+#: Points of the travel at which a curve is looked at.
+TRAVELS = 40
+
+
+@dataclass
+class Evaluation:
+    """Outcome of one training's evaluation.
+
+    Attributes:
+        outcome: ACCEPTED or why not; ``note`` says it with numbers where there are any.
+        values, sigmas: by the calibration's keys.
+        contact_angle: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad.
+        torque_error, torque_error_sigma: of the torque path, as a share of the force: the magnets' and the current sensor's.
+        evidence: figures for people, by name.
+    """
+
+    outcome: int
+    note: str = ""
+    values: dict[str, float] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    contact_angle: float = np.nan
+    contact_sigma: float = np.nan
+    torque_error: float = 0.0
+    torque_error_sigma: float = np.nan
+    evidence: dict[str, float] = field(default_factory=dict)
+
+
+def _mounted(calibration: Calibration) -> range:
+    """Indices of the curves between which `calibration.types.curve_at` finds that of the mounted pads."""
+    thicknesses = [curve.pad_thickness_mm for curve in calibration.stiffness.curves]
+    upper = int(np.clip(np.searchsorted(thicknesses, calibration.pad_thickness_mm), 1, max(len(thicknesses) - 1, 1)))
+    return range(upper - 1, min(upper + 1, len(thicknesses)))
+
+
+def curve_terms(calibration: Calibration) -> int:
+    """Number of coefficients of the curve that training can teach."""
+    return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted(calibration))
+
+
+def curve_values(calibration: Calibration, coefficients) -> dict[str, float]:
+    """The keys that make ``coefficients`` the curve of the mounted pads: both curves beside their thickness become it."""
+    values = {}
+    for index in _mounted(calibration):
+        for term in range(len(calibration.stiffness.curves[index].coefficients)):
+            value = float(coefficients[term]) if term < len(coefficients) else 0.0
+            values[f"stiffness.curves[{index}].coefficients[{term}]"] = value
+    return values
+
+
+def learned_keys(calibration: Calibration) -> set[str]:
+    """The one list of what training teaches. The clearance is missing where the released position was not seen."""
+    names = {CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA}
+    return names | curve_values(calibration, ()).keys()
+
+
+def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str:
+    """What in learned ``values`` a brake with this calibration cannot have, in words; empty if nothing."""
+    limits, keys = calibration.adaptation, learned_keys(calibration)
+    if wrong := (values.keys() | {CLEARANCE}) ^ keys:
+        return f"{', '.join(sorted(wrong))}: missing, or not learned"
+    try:
+        p = to_parameters(moved(calibration, values, checked=True))
+    except InputError as error:
+        return "; ".join(str(error).splitlines())
+    high = calibration.training_force_N
+    own_curve = any(values[key] != value_of(calibration, key) for key in curve_values(calibration, ()))
+    least_relative = limits.torque_constant_relative if own_curve else calibration.noise.stiffness_relative
+    bounds = [
+        ("travel to full force, rad", travel_at(high, p["curve"]), *_possible_travel(calibration)),
+        ("load friction, m/rad", p["load_friction"], 0.0, limits.maximum_friction_share * p["gear_gain"]),
+        (
+            "friction at full force, N m",
+            p["offset_friction"] + p["load_friction"] * high,
+            *_about(calibration.friction.offset_Nm + calibration.friction.load_m_per_rad * high, limits.friction_change),
+        ),
+        (STIFFNESS_SIGMA, p["stiffness_sigma"], calibration.noise.stiffness_N, high),
+        (STIFFNESS_RELATIVE_SIGMA, p["stiffness_relative_sigma"], least_relative, 1.0),
+        (CLEARANCE, p["clearance"] - calibration.contact.clearance_rad, *_about(0.0, 0.0, limits.clearance_change_rad)),
+    ]
+    for name, value, low, highest in bounds:
+        if not low <= value <= highest:
+            return f"{name}: {value:.4g}, expected {low:.4g} to {highest:.4g}"
+    travels = travel_at(high, p["curve"]) * np.arange(1, TRAVELS + 1) / TRAVELS
+    if any(characteristic_curve(travel, p["curve"])[1] <= 0.0 for travel in travels):
+        return "stiffness.curves: the force does not rise with the travel"
+    return ""
+
+
+def _about(value: float, share: float, margin: float = 0.0) -> tuple[float, float]:
+    return value * (1.0 - share) - margin, value * (1.0 + share) + margin
+
+
+def _possible_travel(calibration: Calibration) -> tuple[float, float]:
+    """Travel (rad) to full force between the stiffest and the softest pads of the calibration, and as much beyond as another
+    compound makes."""
+    curves, change = calibration.stiffness.curves, calibration.adaptation.curve_change
+    travels = [travel_at(calibration.training_force_N, np.array(curve.coefficients)) for curve in curves]
+    return (1.0 - change) * min(travels), (1.0 + change) * max(travels)
+
+
+def with_learned(calibration: Calibration, values: dict[str, float] | None) -> Calibration:
+    """The calibration in use: with learned ``values``, where there are any and learning is enabled."""
+    return moved(calibration, values) if values and calibration.adaptation.enabled else calibration

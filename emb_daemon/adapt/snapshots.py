@@ -1,0 +1,107 @@
+"""What an estimator knew when it was last heard of, kept over a restart: one JSON file per corner.
+
+Which quantities these are, and how much less sure they are by the time of the restart, is the estimator's to say (a record
+dtype, with functions that fill it and start from it); here it is stored under its field names, with the moment of the real
+time clock, and given back only to the same actuator with the same calibration, learned values included.
+"""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.adapt import files
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration
+
+_FORMAT = 1
+
+
+class Snapshot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One corner's file."""
+
+    format: int
+    corner: str
+    actuator: str
+    #: Hash of the calibration in use, learned values included.
+    calibration: str
+    #: CLOCK_REALTIME.
+    time_ns: int
+    #: By the dtype's field names; arrays as nested lists, null for NaN.
+    state: dict[str, object]
+
+
+def to_fields(record: np.void) -> dict[str, object]:
+    """A record, nested ones included, as names and plain values. An infinite value is stored as NaN: both mean unknown."""
+    names = record.dtype.names
+    return {name: to_fields(record[name]) if record[name].dtype.names else record[name].tolist() for name in names}
+
+
+def from_fields(fields: dict[str, object], dtype: np.dtype) -> np.void:
+    """The record of ``dtype`` that `to_fields` was given.
+
+    Raises:
+        ValueError: other fields, or another shape or type of one; names it.
+    """
+    if not isinstance(fields, dict) or fields.keys() != set(dtype.names):
+        raise ValueError(f"state: expected the fields {', '.join(dtype.names)}")
+    record = np.zeros(1, dtype)[0]
+    for name in dtype.names:
+        kind = dtype[name]
+        if kind.names:
+            record[name] = from_fields(fields[name], kind)
+            continue
+        try:
+            value = np.array(fields[name], object)
+            value[value == None] = np.nan  # noqa: E711
+            value = value.astype(kind.base, casting="unsafe")
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f"state.{name}: expected {kind}") from None
+        if value.shape != kind.shape:
+            raise ValueError(f"state.{name}: expected {kind}")
+        record[name] = value
+    return record
+
+
+class Snapshots:
+    """The snapshots of one folder.
+
+    Args:
+        folder: that exists.
+        dtype: record that is kept.
+    """
+
+    def __init__(self, folder: Path, dtype: np.dtype):
+        self._folder, self._dtype = folder, dtype
+
+    def path(self, corner: str) -> Path:
+        return self._folder / f"restart-{corner}.json"
+
+    def save(self, corner: str, calibration: Calibration, record: np.void, time_ns: int) -> None:
+        """Keep a record of ``dtype``. Raises OSError; the old file is then untouched."""
+        content = Snapshot(
+            format=_FORMAT, corner=corner, actuator=calibration.actuator, calibration=calibration_hash(calibration),
+            time_ns=time_ns, state=to_fields(record),
+        )  # fmt: skip
+        files.write(self.path(corner), content)
+
+    def load(self, corner: str, calibration: Calibration) -> tuple[np.void | None, int, str | None]:
+        """What was kept of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
+        the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
+        path = self.path(corner)
+        try:
+            found = files.decode(path.read_bytes(), Snapshot)
+            if found.format != _FORMAT:
+                raise ValueError(f"format {found.format}, expected {_FORMAT}")
+            record = from_fields(found.state, self._dtype)
+        except FileNotFoundError:
+            return None, 0, None
+        except ValueError as error:
+            return None, 0, f"{path}: damaged ({error}), set aside as {files.set_aside(path)}"
+        except OSError as error:
+            return None, 0, f"{path}: not readable: {error.strerror}"
+        ours = {"corner": corner, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}
+        for name, expected in ours.items():
+            if getattr(found, name) != expected:
+                return None, 0, f"{path}: belongs to {name} {getattr(found, name)}, not {expected}; not used"
+        return record, found.time_ns, None

@@ -1,0 +1,206 @@
+"""A reload gives what a restart gives, whatever changed; signals in any number and at any moment do no harm."""
+
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import adaptkit
+import numpy as np
+import pytest
+from adaptkit import parked
+
+from emb_daemon.adapt import records as r
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.parameters import keys, moved, parameter
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.answer import answer_row
+from emb_daemon.estimator.records import ESTIMATE, new_state
+from emb_daemon.plant.car import Car
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import city_drive, commands_of
+from emb_daemon.runtime.daemon import Daemon
+from emb_daemon.runtime.rawcan import socket_pair
+
+CONFIG = Path(__file__).parent.parent / "config"
+SHIPPED = load_calibration(CONFIG / "calibration.yaml")
+#: One value of the friction coefficient's table stands for its 288.
+KEYS = [key for key in keys(SHIPPED) if "friction.coefficient" not in key or key.endswith("[1][2][3]")]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("emb.yaml", "calibration.yaml"):
+        shutil.copy(CONFIG / name, tmp_path)
+    lines = (tmp_path / "emb.yaml").read_text().splitlines(keepends=True)
+    (tmp_path / "emb.yaml").write_text("".join(line for line in lines if line.strip()[:3] not in ("FR:", "RL:", "RR:")))
+    return tmp_path
+
+
+@pytest.fixture
+def daemon(folder):
+    bus, theirs = socket_pair()
+    made = Daemon(Setup(folder / "emb.yaml"), theirs, state=folder / "state")
+    made._adaptation._threaded = False
+    yield made
+    bus.close()
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Frames of half a second before and after a reload, simulated."""
+    schedule = city_drive().first(6.0)
+    car = Car(np.atleast_1d(plant_from_calibration(SHIPPED)), ("FL",), start_ns=1_000_000_000)
+    frames, _ = car.run(commands_of(schedule, ("FL",)), schedule.drives)
+    first = np.flatnonzero(frames["can_id"] == 0x100)
+    return frames[first[500] : first[600]], frames[first[600] : first[1000]]
+
+
+def reload_now(daemon, seconds=20.0):
+    """Read the files again and go over to them, as the loop does from tick to tick."""
+    daemon.reload()
+    end = time.monotonic() + seconds
+    daemon._follow_reload()
+    while daemon._reader is not None or daemon._waiting:
+        assert time.monotonic() < end, "not read in time"
+        time.sleep(0.001)
+        daemon._follow_reload()
+
+
+def another(key):
+    """The shipped calibration with one number changed, or None where no other value is allowed alone."""
+    now = parameter(SHIPPED, key)
+    for value in (now.value + 20.0 * now.step, now.value - 20.0 * now.step, now.value + now.step, now.value - now.step):
+        try:
+            return moved(SHIPPED, {key: value}, checked=True)
+        except InputError:
+            continue
+    return None
+
+
+def test_reload_and_restart_give_the_same_estimates_for_every_key(daemon, drive):
+    before, after = drive
+    pipeline, names = daemon.pipeline, [name for name in ESTIMATE.names if name not in ("cycle", "elapsed_cycles")]
+    pipeline.begin(int(before["time_ns"][0]))
+    refused, length = [], int(after["time_ns"][-1] - before["time_ns"][0]) + 4_000_000
+    for key in KEYS:
+        calibration = another(key)
+        if calibration is None:
+            refused.append(key)
+            continue
+        before["time_ns"] += length
+        after["time_ns"] += length
+        pipeline.begin_anew(0, to_parameters(SHIPPED))
+        daemon._adaptation.replace("FL", SHIPPED, daemon._adaptation.read("FL", SHIPPED))
+        pipeline.consume(before)
+        daemon._begin_anew("FL", calibration, daemon._adaptation.read("FL", calibration))
+        _, count = pipeline.consume(after)
+        reloaded, samples = pipeline.estimates[:count].copy(), pipeline.samples[:count].copy()
+        restarted, state = np.zeros(count, ESTIMATE), new_state()
+        for row in range(count):
+            answer_row(samples[row], state[0], to_parameters(calibration), restarted[row])
+        different = [name for name in names if reloaded[name].tobytes() != restarted[name].tobytes()]
+        assert count > 300 and not different, key
+    assert not refused, "no value but its own"
+
+
+def learned_store(daemon, folder):
+    """Let FL's adaptation accept a training, as the tick does."""
+    adaptation = daemon._adaptation
+    adaptation._stores[0] = adaptkit.accepted(adaptation._stores[0])
+    adaptation._do(adaptation._write, "FL", r.ACCEPTED, "", adaptation._stores[0])
+    adaptation.restore(daemon.pipeline.parameters)
+
+
+def test_what_is_learned_while_a_reload_reads_is_kept(daemon, folder):
+    """The calibration did not change: the corner goes on with what it has learned meanwhile, and so does the file."""
+    daemon.reload()
+    daemon._follow_reload()
+    learned_store(daemon, folder)
+    in_use = daemon.pipeline.parameters.copy()
+    reload_now(daemon)
+    assert in_use[0] != to_parameters(SHIPPED)
+    assert daemon.pipeline.parameters.tobytes() == in_use.tobytes()
+    learned_store(daemon, folder)
+    assert len(Memory(folder / "state").read("FL").history) == 2
+
+
+def test_a_corner_whose_calibration_did_not_change_goes_on(daemon, drive):
+    daemon.pipeline.begin(int(drive[0]["time_ns"][0]))
+    daemon.pipeline.consume(drive[0])
+    state = daemon.pipeline.states[0].copy()
+    reload_now(daemon)
+    for name in ("started", "contact_angle", "covariance", "pads", "history"):
+        assert np.array_equal(daemon.pipeline.states[0][name], state[name]), name
+
+
+def test_of_a_training_that_a_reload_interrupts_nothing_is_used_or_written(tmp_path):
+    """Its evaluation comes back after the calibration was replaced."""
+    loop = adaptkit.ClosedLoop(tmp_path, pads_mm=6.0)
+    jobs = []
+    loop.adaptation._do = lambda job, *arguments: jobs.append((job, arguments))
+    adapter = loop.adaptation.adapters[0]
+    loop.run(parked(60.0), until=lambda e: adapter["phase"] == r.EVALUATING)
+    other = moved(loop.calibration, {"contact.clearance_rad": 7.0})
+    loop.adaptation.replace("FL", other, loop.adaptation.read("FL", other))
+    loop.pipeline.begin_anew(0, to_parameters(other))
+    # A training under the new calibration waits for its own evaluation when the old one arrives.
+    adapter["phase"] = r.EVALUATING
+    for job, arguments in jobs:
+        job(*arguments)
+    loop.run(parked(4.0))
+    assert not adapter["evaluation_ready"] and loop.parameters[0] == to_parameters(other)
+    assert Memory(tmp_path).read("FL") is None
+
+
+def test_a_bad_calibration_is_named_and_the_old_one_stays(daemon, folder, caplog):
+    before = daemon.pipeline.parameters.copy()
+    file = folder / "calibration.yaml"
+    file.write_text(file.read_text().replace("format: 1", "format: 7"))
+    reload_now(daemon)
+    assert "the old one stays" in caplog.text and daemon.pipeline.parameters.tobytes() == before.tobytes()
+
+
+def test_the_last_of_quick_reloads_counts(daemon, folder):
+    """Two requests while the first file is still being read: the second file is read after it, never beside it."""
+    reading, go_on, read = [], threading.Event(), daemon._read_calibrations
+
+    def slow():
+        reading.append(len([thread for thread in threading.enumerate() if thread.name == "reload"]))
+        go_on.wait(20.0)
+        read()
+
+    daemon._read_calibrations = slow
+    for clearance in (7.0, 8.0):
+        save_calibration(moved(SHIPPED, {"contact.clearance_rad": clearance}), folder / "calibration.yaml")
+        daemon.reload()
+        daemon._follow_reload()
+    go_on.set()
+    reload_now(daemon)
+    assert daemon.pipeline.parameters[0]["clearance"] == 8.0 and reading[:2] == [1, 1]
+
+
+def test_a_storm_of_signals_stops_nothing(daemon):
+    """A handler that waited for a lock would wait for the loop that it interrupts."""
+    before = signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
+    stormy = True
+
+    def storm():
+        while stormy:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGHUP)
+
+    thread = threading.Thread(target=storm, daemon=True)
+    thread.start()
+    try:
+        for _ in range(2000):
+            daemon._follow_reload()
+    finally:
+        stormy = False
+        thread.join()
+        signal.signal(signal.SIGHUP, before)
+    reload_now(daemon)
+    assert daemon.pipeline.parameters[0] == to_parameters(SHIPPED)

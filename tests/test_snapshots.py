@@ -1,0 +1,163 @@
+"""What survives a restart: stored whole, given back to the same brake alone, and never believed when damaged."""
+
+import types
+
+import adaptkit
+import msgspec
+import numpy as np
+import pytest
+from adaptkit import ClosedLoop, parked
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.adapt import files
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.snapshots import Snapshots, from_fields, to_fields
+
+INNER = np.dtype([("phase", "f8"), ("seen", "?")])
+RECORD = np.dtype([("angle", "f8"), ("count", "i8"), ("known", "?"), ("pads", "f8", (2, 3)), ("wheel", INNER)], align=True)
+SHIPPED = adaptkit.shipped()
+
+
+def record(angle=1.5, count=-3, known=True, pads=0.25):
+    made = np.zeros(1, RECORD)[0]
+    made["angle"], made["count"], made["known"], made["pads"] = angle, count, known, pads
+    made["wheel"]["phase"], made["wheel"]["seen"] = angle, known
+    return made
+
+
+def same(one, other):
+    return all(
+        same(one[name], other[name])
+        if one.dtype[name].names
+        else np.array_equal(one[name], other[name], equal_nan=kind != "b")
+        for name, kind in ((name, one.dtype[name].base.kind) for name in one.dtype.names)
+    )
+
+
+@given(st.floats(allow_infinity=False), st.integers(-(2**53), 2**53), st.booleans(), st.floats(allow_infinity=False))
+def test_a_record_comes_back_to_the_last_bit(angle, count, known, pads):
+    made = record(angle, count, known, pads)
+    stored = msgspec.json.decode(msgspec.json.encode(to_fields(made)))
+    assert same(from_fields(stored, RECORD), made)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"angle": "x"}, {"pads": [1.0, 2.0]}, {"wheel": 3.0}, {"wheel": {"phase": 0.0}}, {"more": 1.0}, {"count": None}],
+)
+def test_a_record_of_another_shape_is_named(change):
+    with pytest.raises(ValueError, match=r"state"):
+        from_fields(to_fields(record()) | change, RECORD)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 255))
+def test_any_damaged_byte_is_noticed(tmp_path_factory, position, flip):
+    snapshots = Snapshots(tmp_path_factory.mktemp("snapshots"), RECORD)
+    snapshots.save("FL", SHIPPED, record(), 5)
+    path = snapshots.path("FL")
+    content = bytearray(path.read_bytes())
+    content[position % len(content)] ^= flip
+    path.write_bytes(content)
+    found, _, warning = snapshots.load("FL", SHIPPED)
+    if found is None:
+        assert "set aside" in warning and not path.exists()
+    else:
+        # White space between the parts means nothing.
+        assert same(found, record())
+
+
+def test_it_belongs_to_one_corner_actuator_and_calibration(tmp_path):
+    snapshots = Snapshots(tmp_path, RECORD)
+    assert snapshots.load("FL", SHIPPED) == (None, 0, None)
+    snapshots.save("FL", SHIPPED, record(), 12345)
+    found, time_ns, warning = snapshots.load("FL", SHIPPED)
+    assert same(found, record()) and time_ns == 12345 and warning is None
+    for other in (adaptkit.shipped(actuator="another"), adaptkit.shipped(pad_thickness_mm=9.0)):
+        found, _, warning = snapshots.load("FL", other)
+        assert found is None and "not used" in warning and snapshots.path("FL").exists()
+
+
+def test_a_file_of_another_format_is_set_aside(tmp_path):
+    snapshots = Snapshots(tmp_path, RECORD)
+    snapshots.save("FL", SHIPPED, record(), 1)
+    path = snapshots.path("FL")
+    content = files.decode(path.read_bytes(), dict)
+    path.write_bytes(files.encode(content | {"format": 9}))
+    assert "format 9" in snapshots.load("FL", SHIPPED)[2] and not path.exists()
+
+
+class Restart(types.SimpleNamespace):
+    """An estimator that keeps its contact angle, and notes with what it was resumed."""
+
+    SNAPSHOT = np.dtype([("contact_angle", "f8"), ("force", "f8")])
+
+    def __init__(self):
+        super().__init__(resumed=[])
+
+    def take_snapshot(self, state, p, snapshot):
+        snapshot["contact_angle"], snapshot["force"] = state["contact_angle"], state["fused"]
+
+    def resume(self, state, p, sample, snapshot, elapsed_s):
+        self.resumed.append((snapshot["contact_angle"], elapsed_s, bool(state["started"])))
+
+
+def restarted(loop, folder, real_ns):
+    """A new process on the same folder, at another time of the real-time clock."""
+    restart = Restart()
+    loop.adaptation = Adaptation({"FL": loop.calibration}, Memory(folder), real_ns, restart=restart)
+    loop.pipeline = type(loop.pipeline)(loop.parameters, ("FL",), capacity=64, adaptation=loop.adaptation)
+    loop.pipeline.begin(0)
+    return restart
+
+
+@pytest.fixture
+def driven(tmp_path):
+    """A closed loop that was stopped after three seconds with the park brake on."""
+    loop = ClosedLoop(tmp_path)
+    restart = restarted(loop, tmp_path, lambda time_ns: time_ns + 10**18)
+    loop.run(parked(2.0, 8000.0))
+    assert restart.resumed == []
+    loop.adaptation.close(loop.pipeline.states, loop.parameters)
+    return loop, float(loop.pipeline.states[0]["contact_angle"]), int(loop.adaptation.adapters[0]["time_ns"])
+
+
+def test_a_restart_goes_on_with_the_first_sample(driven, tmp_path):
+    loop, contact_angle, stopped_ns = driven
+    restart = restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
+    loop.run(parked(0.5))
+    assert restart.resumed == [(contact_angle, pytest.approx(60.0), False)]
+
+
+def test_a_snapshot_from_the_future_is_not_used(driven, tmp_path, caplog):
+    """The real-time clock was set back, or there is none."""
+    loop, _, _ = driven
+    restart = restarted(loop, tmp_path, lambda time_ns: 10**18)
+    loop.run(parked(0.5))
+    assert restart.resumed == [] and "future" in caplog.text
+
+
+def test_what_is_kept_is_as_old_as_promised(tmp_path):
+    """Ten seconds at most while driving, and at once when the park brake is applied."""
+    loop = ClosedLoop(tmp_path)
+    restarted(loop, tmp_path, int)
+    kept = []
+    save = loop.adaptation._snapshots.save
+    loop.adaptation._snapshots.save = lambda *arguments: (kept.append(1e-9 * arguments[-1]), save(*arguments))
+    schedule = parked(12.0, 8000.0)
+    estimates, _ = loop.run(schedule)
+    assert np.diff([*kept, 1e-9 * estimates["time_ns"][-1]]).max() <= 10.01
+    applied = 0.004 * np.argmax(schedule.drives["park_brake"] == 1)
+    assert any(applied <= at <= applied + 0.2 for at in kept)
+
+
+def test_a_disk_that_is_full_stops_nothing(driven, monkeypatch, caplog):
+    loop, _, _ = driven
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "write", full)
+    loop.adaptation.close(loop.pipeline.states, loop.parameters)
+    assert "could not be written" in caplog.text
