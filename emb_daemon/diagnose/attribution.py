@@ -114,7 +114,7 @@ class Search:
         for knob in base_knobs(parameters, len(bench.trials)):
             knobs += self._adopted(knob)
         for effect in REGISTRY:
-            channel = bench.channel_of(effect.path, effect.name)
+            channel = bench.channel_of(effect.channel)
             initial = parameters["effects"][effect.name]
             if any(initial[p.name] != 0.0 for p in effect.amplitudes):
                 self.calibrated.add(effect.name)
@@ -216,9 +216,11 @@ class Search:
         are turned along, about the middle of the angles that occur."""
         values = self.values | {knob: self.values[knob] + step for knob, step in steps.items()}
         named = {knob.name: knob for knob in steps}
-        order = named.get("gear_mesh_ripple.order_per_turn")
-        if order:
-            cosine, sine = named["gear_mesh_ripple.cosine"], named["gear_mesh_ripple.sine"]
+        for effect in REGISTRY:
+            harmonic = effect.harmonic
+            if not harmonic or f"{effect.name}.{harmonic.order}" not in named:
+                continue
+            order, cosine, sine = (named[f"{effect.name}.{key}"] for key in (harmonic.order, harmonic.cosine, harmonic.sine))
             turn = steps[order] * self.middle
             size = complex(
                 values[cosine] + turn * self.values[sine], -(values[sine] - turn * self.values[cosine])
@@ -267,7 +269,7 @@ class Search:
             return [()], 1
         parameter = shapes[0]
         knob = effect_knob(effect, parameter.name, channel)
-        if effect.placebo == "order":
+        if effect.harmonic:
             order, tried = self._strongest_order(effect, parameter.starts, channel)
             return ([((knob, order),)] if order else []), tried
         return [((knob, start),) for start in parameter.starts], len(parameter.starts)
@@ -276,7 +278,7 @@ class Search:
         """Order per turn over which the residual varies most, weighted with the force for a ripple of the gear."""
         samples = np.concatenate([trial.log.samples for trial in self.bench.trials])
         angle, travel = samples["angle"], np.abs(samples["speed"]) * samples["dt"]
-        whole = effect.name == "cogging_torque"
+        whole, grows_with = effect.harmonic.whole, effect.harmonic.grows_with
         if whole:
             orders = np.arange(limits[0], limits[1] + 0.5)
         else:
@@ -284,7 +286,7 @@ class Search:
             orders = np.arange(max(limits[0], 4.0 * np.pi / span), limits[1], 0.5 * np.pi / span)
         knobs = self.channel_knobs(channel)
         residual = self.residual[channel]
-        weight = np.ones(len(residual)) if whole else self.signals["clamp_force"]
+        weight = self.signals[grows_with] if grows_with else np.ones(len(residual))
         columns = [self.columns[knob] for knob in knobs]
         if columns:
             table = np.column_stack(columns)
@@ -320,7 +322,7 @@ class Search:
         """Test all candidates against the present residual."""
         plans, probes = [], []
         for effect in candidates:
-            channel = self.bench.channel_of(effect.path, effect.name)
+            channel = self.bench.channel_of(effect.channel)
             finding = Finding(effect, channel)
             shapes, tried = self.variants(effect, channel) if channel else ([], 1)
             knobs = [effect_knob(effect, p.name, channel) for p in effect.amplitudes] if channel else []
@@ -576,8 +578,9 @@ class Search:
         every = [effect_knob(finding.effect, p.name, finding.channel) for p in finding.effect.amplitudes]
         self.values.update(dict.fromkeys(every, 0.0))
         self.accepted[finding.effect.name] = [*every, *shapes]
-        # The number of teeth is a whole number, and chosen as one.
-        self.knobs += every if finding.effect.name == "cogging_torque" else [*every, *shapes]
+        # A whole number of teeth is chosen as one.
+        chosen = finding.effect.harmonic is not None and finding.effect.harmonic.whole
+        self.knobs += every if chosen else [*every, *shapes]
         for knob, value in zip(knobs, verdict.values, strict=True):
             self.values[knob] = float(np.clip(value, knob.low, knob.high))
         for knob, start in shape:
@@ -718,7 +721,7 @@ class Search:
             finding.reason += _tradeoffs(knobs, sigmas, covariances)
         for effect in REGISTRY:
             if effect.name in self.calibrated:
-                channel = self.bench.channel_of(effect.path, effect.name)
+                channel = self.bench.channel_of(effect.channel)
                 finding = Finding(effect, channel, in_calibration=True, reason="already in the calibration")
                 initial = self.bench.parameters[0]["effects"][effect.name]
                 finding.values = {p.name: float(initial[p.name]) for p in effect.parameters}

@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.knobs import Knob
-from emb_daemon.effects import torque_constant_fade
+from emb_daemon.effects import paths as effects
 from emb_daemon.effects.disc_thickness_variation import STATE as WHEEL_STATE
 from emb_daemon.effects.disc_thickness_variation import track
 from emb_daemon.estimator.records import ESTIMATE, new_state
@@ -44,10 +44,8 @@ def _run(samples, p, state, reference_mean, stiffness, torque, power, temperatur
         mean = reference_mean[row] if len(reference_mean) else 0.5 * (before + force)
         # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
         m = samples[row]
-        fade = torque_constant_fade.term(
-            p[0].effects.torque_constant_fade, m.caliper, m.has_thermocouple, s.disc, s.temperature_known
-        )
-        torque[row] = (s.balance - s.leverage * mean) / (p[0].torque_constant * (1.0 + fade))
+        constant = p[0].torque_constant * effects.torque_constant(p[0].effects, s.effects, m, s.disc, s.temperature_known, 0.0)
+        torque[row] = (s.balance - s.leverage * mean) / constant
         before = force
         while next_row < len(rows) and rows[next_row] == row:
             for side in range(2):
@@ -180,13 +178,11 @@ class Bench:
         held["contact_walk"] = 0.0
         return held
 
-    def channel_of(self, path: str, name: str = "") -> str | None:
-        """Channel in which an effect of a path shows; None where the logs have no such channel."""
-        if path == "thermal":
-            path = "brake_torque" if name == "friction_coefficient_fade" else "temperature"
-        if path in ("stiffness", "torque") and not self.has_reference:
-            path = "innovation"
-        return path if path in self.channels else None
+    def channel_of(self, channel: str) -> str | None:
+        """Channel in which a change shows that shows in ``channel`` where all is measured; None where these logs have none."""
+        if channel in ("stiffness", "torque") and not self.has_reference:
+            channel = "innovation"
+        return channel if channel in self.channels else None
 
     def _outputs(self, trial: Trial, held: np.ndarray):
         samples = trial.log.samples

@@ -8,10 +8,12 @@ from math import cos, pi, sin
 
 import numpy as np
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo
 from emb_daemon.jit import njit
 
 ORDERS = 4
+#: Those that discs commonly have.
+_COMMON_ORDERS = 2
 PULSES_PER_TURN = 96
 PULSE_MODULO = 4096
 #: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
@@ -40,7 +42,7 @@ def track(s, pulse, wheel_speed, dt):
 
 
 @njit
-def term(p, s, pulse, has_pulse, wheel_speed, dt):
+def term(p, s, m):
     """Disc thickness in m above its mean, where the pads stand."""
     if (
         p.order_1_cosine_um == 0.0
@@ -53,10 +55,10 @@ def term(p, s, pulse, has_pulse, wheel_speed, dt):
         and p.order_4_sine_um == 0.0
     ):
         return 0.0
-    if not has_pulse:
+    if not m.has_wheel_pulse:
         s.known = False
         return 0.0
-    angle = track(s, pulse, wheel_speed, dt)
+    angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
     return 1e-6 * (
         p.order_1_cosine_um * cos(angle)
         + p.order_1_sine_um * sin(angle)
@@ -69,11 +71,39 @@ def term(p, s, pulse, has_pulse, wheel_speed, dt):
     )
 
 
+def _from_anywhere(samples, episode, random):
+    """Each episode begins at another place of the disc."""
+    disturbed = samples.copy()
+    offset = random.integers(0, PULSES_PER_TURN, episode[-1] + 1)[episode]
+    disturbed["wheel_pulse"] = np.mod(samples["wheel_pulse"] + offset, PULSE_MODULO)
+    return disturbed
+
+
+def _of_another_size(samples, _episode, random):
+    """A wheel that turns at another ratio: orders that no disc has."""
+    ratio = random.choice((0.63, 1.41, 2.57, 3.37))
+    disturbed = samples.copy()
+    count = np.unwrap(samples["wheel_pulse"], period=PULSE_MODULO)
+    disturbed["wheel_pulse"] = np.mod(np.floor(ratio * count), PULSE_MODULO)
+    disturbed["wheel_speed"] *= ratio
+    return disturbed
+
+
 EFFECT = Effect(
     name="disc_thickness_variation",
-    path="stiffness",
+    hook="thickness",
+    term=term,
     parameters=tuple(
-        Parameter(f"order_{order}_{part}_um", "µm", -60.0, 60.0, 10.0, f"{part} of {order} per turn")
+        Parameter(
+            f"order_{order}_{part}_um",
+            "µm",
+            -60.0,
+            60.0,
+            10.0,
+            f"{part} of {order} per turn",
+            drawn=(-60.0, 60.0) if order <= _COMMON_ORDERS else (0.0, 0.0),
+            group=f"order {order}",
+        )
         for order in range(1, ORDERS + 1)
         for part in ("cosine", "sine")
     ),
@@ -82,6 +112,8 @@ EFFECT = Effect(
     state=STATE,
     signal="disc_angle",
     manoeuvre="hold the clamp force on a turning wheel for several turns",
-    placebo="wheel_pulse",
-    forbidden="standing",
+    placebos=(
+        Placebo("wheel angle beginning anew with each episode", samples=_from_anywhere),
+        Placebo("orders that no disc has", samples=_of_another_size),
+    ),
 )
