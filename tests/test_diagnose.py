@@ -12,9 +12,8 @@ from scipy.signal import lfilter
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.diagnose import blind, confirmation
+from emb_daemon.diagnose import confirmation
 from emb_daemon.diagnose.attribution import Search
-from emb_daemon.diagnose.blind import campaign, run_trial
 from emb_daemon.diagnose.channels import Bench
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.episodes import episodes
@@ -27,6 +26,8 @@ from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import random_angle, simulate_log, training
 from emb_daemon.resources import resource
+from studies import blind
+from studies.blind import campaign, run_trial
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +287,7 @@ def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration):
     ],
 )
 def test_blind(calibration, seed, kind, names, size):
-    """The short version of the blind test; `python -m emb_daemon.diagnose.blind` is the whole."""
+    """The short version of the blind test; `python -m studies.blind` is the whole."""
     trial = run_trial(calibration, seed, kind, names, size, stops=7)
     assert trial.named, trial
     assert trial.after < 45.0

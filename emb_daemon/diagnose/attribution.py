@@ -22,12 +22,12 @@ from itertools import chain, combinations, product
 
 import numpy as np
 
-from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench, Probe, wheel_angle
+from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench, Probe
 from emb_daemon.diagnose.evidence import NOT_EXCITED, Moments, Verdict, false_discovery, fit, judge
 from emb_daemon.diagnose.knobs import Knob, base_knobs, effect_knob
 from emb_daemon.diagnose.signals import signals, smooth_basis
 from emb_daemon.effects import REGISTRY
-from emb_daemon.effects.base import Effect
+from emb_daemon.effects.base import HOOKS, Effect
 
 #: False discovery rate over the catalogue.
 Q_VALUE = 0.01
@@ -52,9 +52,8 @@ _GAUSS_NEWTON = 4
 _DOUBTFUL, _LARGE = 0.05, 0.25
 #: Correlation from which two parameters are known only together.
 _TRADE = 0.9
-#: Disc speed (rad/s) below which the wheel stands but for the sensor's noise.
-_STANDING = 0.5
-_FOREIGN_ORDERS = (0.63, 1.41, 2.57, 3.37)
+#: Draws of a placebo that runs through the estimator, and of one that does not.
+_DRAWS, _SHUFFLES = 2, 5
 
 
 @dataclass
@@ -70,7 +69,7 @@ class Finding:
     q_value: float = 1.0
     p_value: float = 1.0
     reason: str = ""
-    placebo: float | None = None
+    placebos: dict[str, float] = field(default_factory=dict)
     values: dict[str, float] = field(default_factory=dict)
     sigmas: dict[str, float] = field(default_factory=dict)
     confounded_with: str | None = None
@@ -392,13 +391,10 @@ class Search:
                 f"explains {finding.gain:.3g} {unit} RMS where a smooth function of {name} explains "
                 f"{self.rms(free, channel):.3g} {unit}: a shadow of something else"
             )
-        finding.placebo = self.placebo(effect, channel)
-        if finding.placebo is not None and finding.placebo > _OF_PLACEBO * verdict.gain:
-            share = finding.placebo / verdict.gain
-            finding.placebo = share
-            return f"its placebo ({effect.placebo} disturbed) explains {100 * share:.0f} % of the same"
-        if finding.placebo is not None:
-            finding.placebo /= verdict.gain
+        finding.placebos = self.placebos(effect, plan)
+        for text, share in finding.placebos.items():
+            if share > _OF_PLACEBO:
+                return f"its placebo ({text}) explains {100 * share:.0f} % of the same"
         return ""
 
     def model_free(self, channel: str) -> tuple[float, str]:
@@ -437,37 +433,34 @@ class Search:
             result[name] = (plain.left_out, both.left_out)
         return result
 
-    def placebo(self, effect: Effect, channel: str) -> float | None:
-        """Best gain that the effect reaches when what it rests on is disturbed; None where it has no placebo."""
-        clearance = [knob for knob in self.channel_knobs(channel) if knob.name == "contact.clearance_rad"]
-        if not clearance or effect.placebo not in ("wheel_pulse", "disc", "energy") or effect.path != "stiffness":
-            return None
-        lever = np.sum([self.columns[knob] for knob in clearance], axis=0)
-        episode = self.bench.sample_episode
-        trials = []
-        if effect.placebo == "wheel_pulse":
-            angle = np.concatenate([wheel_angle(trial.log.samples) for trial in self.bench.trials])
-            trials += [[lever * np.cos(o * angle), lever * np.sin(o * angle)] for o in _FOREIGN_ORDERS]
-            random = np.random.default_rng(0)
-            shifted = angle + random.uniform(0.0, 2.0 * np.pi, self.bench.episodes)[episode]
-            trials.append([lever * part(order * shifted) for order in (1, 2) for part in (np.cos, np.sin)])
-            # The counterfactual: under pads that stand on it, a disc keeps its thickness.
-            standing = self.signals["disc_speed"] < _STANDING
-            count = np.maximum(np.bincount(episode, standing, minlength=self.bench.episodes), 1.0)
-            varying = []
-            for order, part in product((1, 2), (np.cos, np.sin)):
-                shape = standing * part(order * angle)
-                mean = np.bincount(episode, shape, minlength=self.bench.episodes) / count
-                varying.append(lever * standing * (shape - mean[episode]))
-            trials.append(varying)
-        else:
-            # Temperatures mostly rise through a log, so a shifted one is much the same: each episode gets another's.
-            signal = self.signals["disc_temperature" if effect.placebo == "disc" else "energy"]
-            count = np.maximum(np.bincount(episode, minlength=self.bench.episodes), 1)
-            mean = np.bincount(episode, signal - signal[0], minlength=self.bench.episodes) / count
-            random = np.random.default_rng(0)
-            trials += [[lever * random.permutation(mean)[episode]] for _ in range(5)]
-        return max(self.verdict(channel, own).gain for own in trials)
+    def placebos(self, effect: Effect, plan: tuple) -> dict[str, float]:
+        """Share of a candidate's gain that it reaches with what it rests on disturbed, by placebo."""
+        knobs, shape, _, verdict = plan
+        channel, random = knobs[0].channel, np.random.default_rng(0)
+        result = {}
+        for placebo in effect.placebos:
+            tables = []
+            if placebo.order:
+                orders = placebo.order(shape[0][1])
+                tables = [self._columns(self.bench, knobs, ((shape[0][0], order),)) for order in orders]
+            elif placebo.samples:
+                benches = [self.bench.disturbed(placebo.samples, random) for _ in range(_DRAWS)]
+                tables = [self._columns(bench, knobs, shape) for bench in benches]
+            else:
+                base = [self.columns[k] for k in self.channel_knobs(channel) if k.name == HOOKS[effect.hook].like]
+                if not base:
+                    continue
+                signal, episode = self.signals[effect.signal], self.bench.sample_episode
+                disturbed = [placebo.signal(signal - signal[0], episode, random) for _ in range(_SHUFFLES)]
+                tables = [[np.sum(base, axis=0) * follows] for follows in disturbed]
+            gains = [self.verdict(channel, own).gain for own in tables]
+            result[placebo.text] = max(0.0, *gains) / verdict.gain
+        return result
+
+    def _columns(self, bench: Bench, knobs: list[Knob], shape: tuple[tuple[Knob, float], ...]) -> list[np.ndarray]:
+        at = self.residual if bench is self.bench else bench.residuals(self.values)
+        found = bench.regressors(self.values, [Probe(knob, shape) for knob in knobs], at)
+        return list(found.values())
 
     # -- the search ---------------------------------------------------------------------------------------------------
 
@@ -711,7 +704,7 @@ class Search:
             finding.share_explained = self._share(finding.channel, knobs)
             finding.reason = (
                 f"q = {finding.q_value:.1g} over episodes, gains {finding.gain:.3g} {UNITS[finding.channel]} on left-out ones"
-                + (f", placebo reaches {100 * finding.placebo:.0f} % of it" if finding.placebo is not None else "")
+                + "".join(f", {text} {100 * share:.0f} % of it" for text, share in finding.placebos.items())
                 + (", from the difference of both paths: no reference was recorded" if finding.channel == "innovation" else "")
             )
             for knob in knobs:

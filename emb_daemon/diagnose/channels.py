@@ -5,9 +5,10 @@ candidate is credited with is what the daemon will do with it. Only the learning
 would spread an error of one path over both, and hide slow effects in an angle that wanders.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import numpy as np
@@ -15,8 +16,6 @@ import numpy as np
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.knobs import Knob
 from emb_daemon.effects import paths as effects
-from emb_daemon.effects.disc_thickness_variation import STATE as WHEEL_STATE
-from emb_daemon.effects.disc_thickness_variation import track
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import njit
@@ -53,24 +52,6 @@ def _run(samples, p, state, reference_mean, stiffness, torque, power, temperatur
                     temperatures[next_row, 4 * side + depth] = estimate[0].depth[side, depth]
             temperatures[next_row, 8] = estimate[0].disc
             next_row += 1
-
-
-@njit
-def _wheel_angle(samples, state, angle):
-    s = state[0]
-    for row in range(len(samples)):
-        m = samples[row]
-        if m.has_wheel_pulse:
-            angle[row] = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
-        else:
-            angle[row] = angle[row - 1] if row else 0.0
-
-
-def wheel_angle(samples: np.ndarray) -> np.ndarray:
-    """Wheel angle (rad, unwrapped) at each SAMPLE row, as the estimator tracks it."""
-    angle = np.zeros(len(samples))
-    _wheel_angle(samples, np.zeros(1, WHEEL_STATE), angle)
-    return angle
 
 
 @dataclass
@@ -215,6 +196,15 @@ class Bench:
             sliding = (wheel > _SLIDING) & (power > 0.0) & (trial.brake_torque_Nm > 0.0)
             sliding &= np.nan_to_num(trial.force_N, nan=0.0) > _TOUCHING_N if self.has_reference else True
             result["brake_torque"] = np.where(sliding, trial.brake_torque_Nm - power / np.maximum(wheel, _SLIDING), 0.0)
+        return result
+
+    def disturbed(self, disturb: Callable, random: np.random.Generator) -> "Bench":
+        """The same logs with samples disturbed: (SAMPLE rows, episode of each, generator) → rows."""
+        result = copy.copy(self)
+        result.trials = [
+            replace(trial, log=replace(trial.log, samples=disturb(trial.log.samples, trial.episode, random)))
+            for trial in self.trials
+        ]
         return result
 
     def moved(self, values: dict[Knob, float], log: int) -> np.ndarray:

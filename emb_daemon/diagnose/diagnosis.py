@@ -187,8 +187,9 @@ def finding_json(finding: Finding) -> dict:
     }
     if finding.channel and UNITS[finding.channel] != "N":
         entry["gain"] = {"value": finding.gain, "unit": UNITS[finding.channel]}
-    if finding.placebo is not None:
-        entry["placebo_share"] = finding.placebo
+    if finding.placebos:
+        entry["placebo_share"] = max(finding.placebos.values())
+        entry["placebos"] = finding.placebos
     if finding.confounded_with:
         entry["confounded_with"] = finding.confounded_with
         entry["manoeuvre"] = finding.manoeuvre

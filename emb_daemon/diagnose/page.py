@@ -119,9 +119,8 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Finding) -> None:
         traces.append(Trace(name, x, mean, style))
     panels = [Panel(f"mean residual of the {_PATHS[channel]}", unit, traces)]
     section.figure(xy_figure(panels, finding.effect.signal.replace("_", " ")), "Mean residual in bins of equal counts.")
-    if finding.placebo is not None:
-        section.text(f"Placebo: with {finding.effect.placebo.replace('_', ' ')} disturbed, the same term reaches "
-                     f"{100 * finding.placebo:.0f} % of this gain.")  # fmt: skip
+    for text, share in finding.placebos.items():
+        section.text(f"Placebo: with {text} the same term reaches {100 * share:.0f} % of this gain.")
     section.table(
         ["parameter", "value", "unit"],
         [[n, number(v, finding.sigmas.get(n, 0.0)), _unit(finding, n)] for n, v in finding.values.items()],

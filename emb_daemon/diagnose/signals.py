@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from emb_daemon.diagnose.channels import Bench, wheel_angle
+from emb_daemon.diagnose.channels import Bench
+from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline import estimate
 
 #: Knots of a smooth function of one signal.

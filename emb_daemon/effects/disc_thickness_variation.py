@@ -4,41 +4,17 @@ The wheel angle comes from the wheel's pulse counter, carried on by the wheel sp
 the counter was at power-on, which is arbitrary, so each order has a cosine and a sine.
 """
 
-from math import cos, pi, sin
+from math import cos, sin
 
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo
 from emb_daemon.jit import njit
+from emb_daemon.models.wheel import PULSE_MODULO, PULSES_PER_TURN, WHEEL, track
 
 ORDERS = 4
 #: Those that discs commonly have.
 _COMMON_ORDERS = 2
-PULSES_PER_TURN = 96
-PULSE_MODULO = 4096
-#: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
-_CORRECTION = 0.2
-
-STATE = np.dtype([("known", "?"), ("count", "f8"), ("turned", "f8")], align=True)
-
-
-@njit
-def track(s, pulse, wheel_speed, dt):
-    """Wheel angle in rad: carried on by ``wheel_speed`` rad/s, corrected when the pulse counter has moved."""
-    width = 2.0 * pi / PULSES_PER_TURN
-    if not s.known:
-        s.known = True
-        s.count = pulse
-        s.turned = (pulse + 0.5) * width
-        return s.turned
-    s.turned += wheel_speed * dt
-    moved = (pulse - s.count % PULSE_MODULO + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
-    if moved != 0.0:
-        s.count += moved
-        error = (s.count + 0.5) * width - s.turned
-        # More than two pulses off is no interpolation error: frames were missing.
-        s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
-    return s.turned
 
 
 @njit
@@ -83,8 +59,9 @@ def _of_another_size(samples, _episode, random):
     """A wheel that turns at another ratio: orders that no disc has."""
     ratio = random.choice((0.63, 1.41, 2.57, 3.37))
     disturbed = samples.copy()
-    count = np.unwrap(samples["wheel_pulse"], period=PULSE_MODULO)
-    disturbed["wheel_pulse"] = np.mod(np.floor(ratio * count), PULSE_MODULO)
+    known = samples["has_wheel_pulse"]
+    count = np.unwrap(samples["wheel_pulse"][known], period=PULSE_MODULO)
+    disturbed["wheel_pulse"][known] = np.mod(np.floor(ratio * count), PULSE_MODULO)
     disturbed["wheel_speed"] *= ratio
     return disturbed
 
@@ -109,7 +86,7 @@ EFFECT = Effect(
     ),
     equation="θ → θ + Σ (aₙ cos nφ + bₙ sin nφ) / γ",
     source="Jacobsson, Aspects of disc brake judder, Proc. IMechE D 217, 2003: 10 to 20 µm, orders 1 to 4 when cold",
-    state=STATE,
+    state=WHEEL,
     signal="disc_angle",
     manoeuvre="hold the clamp force on a turning wheel for several turns",
     placebos=(

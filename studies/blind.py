@@ -1,6 +1,6 @@
 """Blind test of diagnose on simulated brakes whose effects a seed has drawn.
 
-    python -m emb_daemon.diagnose.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
+    python -m studies.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
 
 Trials are appended to the file one by one; started again with the same file, the command goes on where it was stopped, and
 prints the table of all.
@@ -31,32 +31,14 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
 
-#: Effects with a force on a path, drawn in blind trials, and how: amplitudes in proportions that one factor scales, and
-#: shape parameters from a range.
-_SHAPES: dict[str, dict[str, tuple[float, float]]] = {
-    "disc_thickness_variation": {},
-    "disc_thermal_expansion": {},
-    "torque_constant_fade": {"disc_share": (0.3, 1.0)},
-    "current_offset": {},
-    "viscous_friction": {},
-    "stribeck_friction": {"speed_rad_per_s": (2.0, 20.0)},
-    "friction_asymmetry": {},
-    "gear_mesh_ripple": {"order_per_turn": (1.3, 12.0)},
-    "cogging_torque": {"order_per_turn": (4.0, 24.0)},
-    "signal_delay": {},
-    "backlash": {},
-    "stiffness_hysteresis": {"slip_angle_rad": (0.4, 2.0)},
-    "second_relaxation": {"time_constant_s": (0.2, 5.0)},
-}
+#: Effects that say from which ranges they are to be drawn.
+DRAWN = {effect.name: effect for effect in REGISTRY if all(parameter.drawn for parameter in effect.parameters)}
 #: Effects outside the catalogue, with a size at which they matter.
 _FOREIGN = {
     "clamp_creep": {"share": 0.06, "time_constant_s": 30.0},
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
 }
-_POSITIVE = ("signal_delay", "second_relaxation")
-#: Largest delay drawn, s: a delay is undone to first order, which a longer one than a cycle and a half outgrows.
-_LONGEST_DELAY_S = 0.006
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
 
@@ -111,36 +93,29 @@ def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:
 
 def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
     """Parameters of an effect at the size that physics leads one to expect."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    values = {}
+    effect, values = DRAWN[name], {}
     for parameter in effect.parameters:
+        low, high = parameter.drawn
         if parameter.starts:
-            low, high = _SHAPES[name][parameter.name]
             value = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-            values[parameter.name] = float(round(value)) if name == "cogging_torque" else value
-        elif "order_3" in parameter.name or "order_4" in parameter.name:
-            values[parameter.name] = 0.0
+            values[parameter.name] = float(round(value)) if effect.harmonic and effect.harmonic.whole else value
+        elif low == high:
+            values[parameter.name] = low
         else:
-            # Only the future would make a delay negative, and only pads that pull a relaxation.
-            sign = 1.0 if parameter.low >= 0.0 or name in _POSITIVE else rng.choice([-1.0, 1.0])
+            sign = 1.0 if low >= 0.0 else rng.choice([-1.0, 1.0])
             values[parameter.name] = float(parameter.prior * sign * rng.uniform(0.5, 1.5))
     return values
 
 
 def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, float]:
-    """The same effect, ``factor`` times as strong, inside its bounds."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    result = dict(values)
-    for parameter in effect.amplitudes:
-        high = _LONGEST_DELAY_S if name == "signal_delay" else parameter.high
-        result[parameter.name] = float(np.clip(values[parameter.name] * factor, max(parameter.low, -high), high))
-    return result
+    """The same effect, ``factor`` times as strong, inside its ranges."""
+    amplitudes = {p.name: float(np.clip(values[p.name] * factor, *p.drawn)) for p in DRAWN[name].amplitudes}
+    return values | amplitudes
 
 
 def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarray:
     """What an effect does on its own path, N, by the estimator's own term."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    channel = bench.channel_of(effect.path, name)
+    channel = bench.channel_of(DRAWN[name].channel)
     other = Bench.__new__(Bench)
     other.__dict__.update(bench.__dict__)
     other.parameters = bench.parameters.copy()
@@ -217,8 +192,7 @@ def parameter_error(trial: Trial) -> float:
     for name, values in trial.hidden.items():
         if name not in trial.found:
             return float("nan")
-        effect = next(e for e in REGISTRY if e.name == name)
-        keys = [p.name for p in effect.amplitudes]
+        keys = [p.name for p in DRAWN[name].amplitudes]
         true, found = (_amplitudes({key: v.get(key, 0.0) for key in keys}) for v in (values, trial.found[name]))
         error = max(abs(found[key] - true[key]) for key in true) / max(abs(value) for value in true.values())
         worst = float(np.nanmax([worst, error]))
@@ -235,7 +209,7 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
 def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, str, tuple[str, ...], float]]:
     """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
-    names = list(_SHAPES)
+    names = list(DRAWN)
     trials: list[tuple[int, str, tuple[str, ...], float]] = [(1000 + k, "null", (), 0.0) for k in range(null)]
     cells = [((name,), size) for name in names for size in SIZES_N]
     trials += [(20000 + 10 * k, "single", *cell) for k, cell in enumerate(cells * single)]
