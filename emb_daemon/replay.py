@@ -9,12 +9,12 @@ import numpy as np
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
-from emb_daemon.judging import force_figures, temperature_figures
 from emb_daemon.logs.columns import References
 from emb_daemon.logs.read import read_frames
-from emb_daemon.offline import corner_index
+from emb_daemon.offline import corner_index, estimate, log_of
+from emb_daemon.offline.log import CAPACITY
+from emb_daemon.offline.score import force_figures, temperature_figures
 from emb_daemon.pipeline import Pipeline
 
 #: Pause between two logs of which the second's clock does not go on from the first's.
@@ -75,7 +75,7 @@ class Replay:
         self._parameters[self._index] = to_parameters(calibration)
         self._measured_torque = measured_torque
         self.adaptation = Adaptation({corner: calibration}, Memory(state), _log_date) if state else None
-        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, adaptation=self.adaptation)
+        self._pipeline = Pipeline(self._parameters, (corner,), capacity=CAPACITY, adaptation=self.adaptation)
         self._end_ns: int | None = None
 
     def _on_the_drive(self, frames: np.ndarray) -> int:
@@ -107,19 +107,9 @@ class Replay:
         """
         frames = self._read(path)
         shift = self._on_the_drive(frames)
-        reference = References(frames, self._corner)
-        pipeline, estimates, samples, start = self._pipeline, [], [], 0
-        while start < len(frames):
-            start, count = pipeline.collect(frames, start, predictions=False)
-            rows = pipeline.samples[:count]
-            if self._measured_torque:
-                rows["brake_torque"] = reference.latest(rows["time_ns"], reference.brake_torque_Nm)
-            pipeline.answer(count)
-            samples.append(rows.copy())
-            estimates.append(pipeline.estimates[:count].copy())
-        estimates, samples = np.concatenate(estimates), np.concatenate(samples)
-        if not len(estimates):
-            raise InputError(f"{path}: no resolver sample of corner {self._corner} that passes its CRC and counter check")
-        times = estimates["time_ns"]
-        force = reference.at(times, reference.clamp_force_N)
-        return Result(Path(path), times - shift, estimates, samples, reference, force)
+        pipeline = self._pipeline
+        log = log_of(frames, self._corner, Path(path), pipeline)
+        if self._measured_torque:
+            log.samples["brake_torque"] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
+        estimates = estimate(log.samples, pipeline.parameters, pipeline.states, self.adaptation)
+        return Result(log.path, log.time_ns - shift, estimates, log.samples, log.reference, log.force_N)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.diagnose.channels import Bench, Trial
-from emb_daemon.judging import PATHS, conditions
 from emb_daemon.offline import estimate
+from emb_daemon.offline.score import PATHS, conditions
 
 _RESAMPLES = 1000
 

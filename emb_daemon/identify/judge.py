@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.judging import PATHS
 from emb_daemon.offline import Log, estimate
+from emb_daemon.offline.score import PATHS
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,9 @@ class Decoder:
     def __init__(self, dbc: str = "dbc/emb.dbc"):
         self._database = load_database(resource(dbc))
 
+    def can_id(self, message: str) -> int:
+        return self._database.get_message_by_name(message).frame_id
+
     def columns(self, frames: np.ndarray, message: str) -> dict[str, np.ndarray]:
         """``time_ns`` and every signal of ``message``, one entry per frame; empty arrays where the log has none."""
         found = self._database.get_message_by_name(message)

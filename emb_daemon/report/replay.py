@@ -7,7 +7,7 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.adapt.memory import apply_entry
 from emb_daemon.estimator.records import MODES, REASONS, SOURCES
-from emb_daemon.judging import PATHS
+from emb_daemon.offline.score import PATHS
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
 
