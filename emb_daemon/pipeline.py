@@ -10,18 +10,17 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_daemon.adapt.records import LIMITS
-from emb_daemon.estimator import records as r
+from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.estimator.step import predict, step
 from emb_daemon.jit import njit
+from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import pack
 from emb_daemon.wire.receive import ACCEPTED, SECOND_SENDER, new_reception, receive
 
-CYCLE_NS = 4_000_000
-CYCLE_S = 0.004
 #: A resolver sample waits this long for its current before it is answered without.
 _PAIRING_NS = CYCLE_NS // 2
 #: Without a resolver sample for this many cycles the daemon predicts, once a cycle.
@@ -34,7 +33,6 @@ _AGREED = 3
 _USABLE_NS = 2_500_000_000
 _REPORTED_CYCLES = 25
 _REFUSED_NS = 1_000_000_000
-_OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
 
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
@@ -317,59 +315,25 @@ def _head(b, row, index, age):
     reasons = b.disturbed[index]
     base = wire.CORNER_MESSAGES * index
     if age >= LATE_CYCLES:
-        reasons |= r.RESOLVER_LOST
+        reasons |= contract.RESOLVER_LOST
     if now - b.receptions[base + wire.CURRENT].time_ns >= LATE_CYCLES * CYCLE_NS:
-        reasons |= r.CURRENT_LOST
+        reasons |= contract.CURRENT_LOST
     for slot, reason in (
-        (base + wire.THERMOCOUPLE, r.THERMOCOUPLE_LOST),
-        (wire.WHEEL_SPEED, r.WHEEL_SPEED_LOST),
-        (wire.WHEEL_PULSE, r.WHEEL_PULSE_LOST),
-        (wire.VEHICLE_STATUS, r.VEHICLE_STATUS_LOST),
+        (base + wire.THERMOCOUPLE, contract.THERMOCOUPLE_LOST),
+        (wire.WHEEL_SPEED, contract.WHEEL_SPEED_LOST),
+        (wire.WHEEL_PULSE, contract.WHEEL_PULSE_LOST),
+        (wire.VEHICLE_STATUS, contract.VEHICLE_STATUS_LOST),
     ):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
         if now - b.receptions[slot].refused_ns < _REFUSED_NS:
-            reasons |= r.E2E_ERROR
+            reasons |= contract.E2E_ERROR
         if now - b.receptions[slot].range_ns < _REFUSED_NS:
-            reasons |= r.OUT_OF_RANGE
+            reasons |= contract.OUT_OF_RANGE
     if now - corner.stranger_ns < _REFUSED_NS:
-        reasons |= r.SECOND_SENDER
+        reasons |= contract.SECOND_SENDER
     row.reasons = reasons
-
-
-@njit
-def answer(samples, count, states, parameters, estimates):
-    """Estimate ``samples[:count]``.
-
-    ``states`` and ``parameters`` have one record for each corner, or one in all.
-    """
-    for number in range(count):
-        corner = samples[number].corner
-        answer_row(samples[number], states[corner % len(states)], parameters[corner % len(parameters)], estimates[number])
-
-
-@njit
-def answer_row(row, state, p, estimate):
-    """Estimate one SAMPLE into one ESTIMATE: the one place from which the estimator is run."""
-    estimate.time_ns = row.time_ns
-    estimate.cycle = row.cycle
-    estimate.elapsed_cycles = row.elapsed_cycles
-    estimate.age_cycles = row.age_cycles
-    estimate.corner = row.corner
-    estimate.counter = row.counter
-    estimate.is_sample = not row.is_prediction
-    if row.is_prediction:
-        predict(state, p, row.age_cycles * CYCLE_S, estimate)
-    else:
-        step(state, p, row, estimate)
-    estimate.reasons |= row.reasons
-    if not state.started:
-        estimate.mode = r.INIT
-    elif estimate.source == r.INVALID:
-        estimate.mode = r.FAULT
-    elif estimate.reasons and estimate.mode == r.RUNNING:
-        estimate.mode = r.DEGRADED
 
 
 @njit
@@ -384,8 +348,13 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             period = wires.sent_cycle_ns[kind] // CYCLE_NS
             if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
                 continue
-            usable = e.source != r.INVALID and e.mode != r.INIT
-            status = _NOT_AVAILABLE if e.mode == r.INIT else _FAULT if not usable else _DEGRADED if e.reasons else _OK
+            usable = e.source != contract.INVALID and e.mode != contract.INIT
+            if e.mode == contract.INIT:
+                status = contract.STATUS_NOT_AVAILABLE
+            elif not usable:
+                status = contract.STATUS_FAULT
+            else:
+                status = contract.STATUS_DEGRADED if e.reasons else contract.STATUS_OK
             if kind == wire.CLAMP_FORCE:
                 values[0] = 1e-3 * e.force
                 values[1] = 1e-3 * e.sigma if usable else np.inf
@@ -396,7 +365,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
                 values[0], values[1] = e.surface[0], e.mean[0]
                 values[2], values[3] = e.surface[1], e.mean[1]
                 if np.isnan(e.surface[0]):
-                    status = _NOT_AVAILABLE
+                    status = contract.STATUS_NOT_AVAILABLE
             elif kind == wire.ESTIMATOR_STATUS:
                 values[0] = e.mode
                 values[1] = e.stiffness_factor

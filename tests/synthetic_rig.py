@@ -10,7 +10,7 @@ from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.identify.stiffness import Pads, simulate, with_dynamics
 from emb_daemon.identify.torque import friction_means
 from emb_daemon.offline import Log
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 GEAR_GAIN = 4e-5
 COUNT_RAD = 2.0 * np.pi / 4096

@@ -10,8 +10,9 @@ from emb_daemon.bench.loop import measure_loop
 from emb_daemon.bench.report import text, verdict
 from emb_daemon.bench.twin import Twin, compiler
 from emb_daemon.effects import REGISTRY
-from emb_daemon.estimator.records import ESTIMATE, PATHS_DISAGREE, REASONS, new_state
+from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.offline import estimate, load_log
+from emb_daemon.wire.contract import PATHS_DISAGREE, REASONS
 
 
 @pytest.fixture(scope="module")

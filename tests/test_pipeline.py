@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from wirekit import MS
 
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.estimator import records as r
 from emb_daemon.estimator.records import ESTIMATE
-from emb_daemon.pipeline import CYCLE_NS, Pipeline
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.resources import resource
+from emb_daemon.wire import contract as r
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
 
 

@@ -10,7 +10,7 @@ from emb_daemon.calibration.types import Noise
 from emb_daemon.identify.torque import TorqueFit, unexplained_current
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3

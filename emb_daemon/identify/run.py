@@ -51,7 +51,7 @@ from emb_daemon.identify.stiffness import (
 )
 from emb_daemon.identify.torque import SIGN, TorqueFit, fit_torque
 from emb_daemon.offline import Log
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
 _WORTH = 1.02

@@ -17,7 +17,7 @@ from emb_daemon.identify.fitting import CLUSTER, clustered_covariance
 from emb_daemon.jit import njit
 from emb_daemon.models.torque import friction_state, slid_angle
 from emb_daemon.offline import Log
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Presliding angle that stands for the thesis's sign function, rad.
 SIGN = 1e-6

@@ -8,8 +8,8 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import MODES, SOURCES
 from emb_daemon.logs.candump import format_candump
+from emb_daemon.wire.contract import MODES, SOURCES
 from emb_daemon.wire.layout import CORNERS
 
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.wire.contract import CYCLE_NS
+
 #: Integration steps in one 4 ms cycle.
 SUBSTEPS = 16
-CYCLE_NS = 4_000_000
 SUBSTEP_S = 1e-9 * CYCLE_NS / SUBSTEPS
 #: Cells through one pad at most.
 CELLS = 30

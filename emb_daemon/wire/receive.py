@@ -3,7 +3,8 @@
 import numpy as np
 
 from emb_daemon.jit import njit
-from emb_daemon.wire.e2e import COUNTER_MODULO, crc
+from emb_daemon.wire.contract import STATUS_DEGRADED
+from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
 from emb_daemon.wire.layout import OURS, SIGNALS, SLOTS, unpack
 
@@ -119,12 +120,12 @@ def _verdict(frame, slot, reception, layout):
         return BAD_LENGTH
     if np.uint8(frame.data & np.uint64(0xFF)) != crc(frame.can_id, frame.data):
         return BAD_CRC
-    counter = np.int64((frame.data >> np.uint64(8)) & np.uint64(0xF))
+    counter = np.int64(counter_of(frame.data))
     if counter >= COUNTER_MODULO:
         return BAD_COUNTER
     if not _in_sequence(counter, frame.time_ns, reception, layout.cycle_ns[slot]):
         return BAD_COUNTER
-    if (frame.data >> np.uint64(12)) & np.uint64(0xF) > np.uint64(1):
+    if status_of(frame.data) > STATUS_DEGRADED:
         return BAD_STATUS
     for column in range(layout.received_count[slot]):
         signal = layout.received[slot, column]
