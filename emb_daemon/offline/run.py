@@ -11,6 +11,7 @@ What fits move are PARAMETERS; records are cheap, so that callers copy and chang
 
 import numpy as np
 
+from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
@@ -24,13 +25,15 @@ PATHS = np.dtype(
     [("force", "f8"), ("torque", "f8"), ("leverage", "f8"), ("friction_mean", "f8"), ("friction_variance", "f8")], align=True
 )
 
-#: The whole step at each sample: ``force`` N by the stiffness path, ``torque`` and ``leverage`` as in PATHS, friction
-#: ``power`` W, pads at 2, 4, 6, 8 mm (inner, then outer) and disc in degC.
+#: The whole step at each sample: ``force`` N by the stiffness path, ``torque`` and ``leverage`` as in PATHS, the
+#: ``torque_constant`` N m/A with what effects make of it, friction ``power`` W, pads at 2, 4, 6, 8 mm (inner, then outer)
+#: and disc in degC.
 TRACE = np.dtype(
     [
         ("force", "f8"),
         ("torque", "f8"),
         ("leverage", "f8"),
+        ("torque_constant", "f8"),
         ("power", "f8"),
         ("temperature", "f8", (9,)),
         ("temperature_known", "?"),
@@ -83,8 +86,10 @@ def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, facto
 def _run_step(samples, parameters, states, estimate, out):
     p, s, e = parameters[0], states[0], estimate[0]
     for row in range(len(samples)):
-        step(s, p, samples[row], e)
-        o = out[row]
+        m, o = samples[row], out[row]
+        step(s, p, m, e)
+        factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
+        o.torque_constant = p.torque_constant * factor
         o.force, o.torque, o.leverage, o.power = e.stiffness_force, s.balance, s.leverage, s.power
         for side in range(2):
             for depth in range(4):
