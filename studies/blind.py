@@ -22,11 +22,13 @@ import msgspec
 import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.diagnose.channels import Bench
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.effects import REGISTRY
-from emb_daemon.offline import log_of
+from emb_daemon.offline.log import log_of
+from emb_daemon.offline.score import rmse
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
@@ -116,16 +118,8 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
 def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarray:
     """What an effect does on its own path, N, by the estimator's own term."""
     channel = bench.channel_of(DRAWN[name].channel)
-    other = Bench.__new__(Bench)
-    other.__dict__.update(bench.__dict__)
-    other.parameters = bench.parameters.copy()
-    for key, value in values.items():
-        other.parameters["effects"][name][key] = value
-    return other.residuals({})[channel] - bench.residuals({})[channel]
-
-
-def _rms(signal: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(signal**2)))
+    with_it = moved(bench.calibration, {f"effects.{name}.{key}": value for key, value in values.items()})
+    return bench.under(with_it).residuals({})[channel] - bench.residuals({})[channel]
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
@@ -146,12 +140,12 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         hidden[names[0]] = dict(_FOREIGN[names[0]])
     elif names:
         frames, _ = simulate_log(base, schedule, seed=seed)
-        bench = Bench([log_of(frames)], to_parameters(start))
+        bench = Bench([log_of(frames)], start)
         for name in names:
             values = draw(name, rng)
             # Twice, because large sizes are not quite linear.
             for _ in range(2):
-                values = scaled(name, values, size / max(_rms(contribution(bench, name, values)), 1e-9))
+                values = scaled(name, values, size / max(rmse(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
     plant = base.copy()
     for name, values in hidden.items():
@@ -163,13 +157,13 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     begin = time.process_time()
     result = diagnose([fit_log], start, [val_log])
     seconds = time.process_time() - begin
-    rest_ = result.unexplained
+    left = result.unexplained
     found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in result.accepted}
     error = None
     if kind in ("single", "pair") and set(found) == set(hidden):
-        bench = Bench([val_log], to_parameters(start))
+        bench = Bench([val_log], start)
         true = {name: contribution(bench, name, values) for name, values in hidden.items()}
-        error = max(_rms(contribution(bench, name, found[name]) - true[name]) / _rms(true[name]) for name in hidden)
+        error = max(rmse(contribution(bench, name, found[name]) - true[name]) / rmse(true[name]) for name in hidden)
     return Trial(
         seed,
         kind,
@@ -178,7 +172,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         found,
         result.before.rmse("fused"),
         result.after.rmse("fused"),
-        rest_.signal if rest_ else None,
+        left.strongest.signal if left and left.strongest else None,
         error,
         seconds,
     )
@@ -230,7 +224,7 @@ def summary(trials: list[Trial]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for label, group in groups.items():
-        before, after = (_rms(np.array([getattr(trial, when) for trial in group])) for when in ("before", "after"))
+        before, after = (rmse(np.array([getattr(trial, when) for trial in group])) for when in ("before", "after"))
         worse = sum(trial.after > _WORSE * trial.before for trial in group)
         false = sum(bool(trial.false_findings) for trial in group)
         lines.append(f"| {label} | {len(group)} | {_share(group)} | {false} | {before:.0f} → {after:.0f} | {worse} |")

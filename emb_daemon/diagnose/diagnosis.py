@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.calibration.parameters import value_of
+from emb_daemon.calibration.parameters import parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirmed, validation_gains
@@ -35,6 +35,8 @@ _EPISODES = 6
 _OVERSTATED = 3.0
 #: Correlation from which two parameters are known only together.
 _TRADE = 0.9
+#: Standard deviations from which a base parameter counts as moved.
+_MOVED = 2.0
 
 
 @dataclass(frozen=True)
@@ -232,7 +234,7 @@ def _tradeoffs(model: Model, effect: Effect, own: Sequence[Coordinate]) -> str:
 
 
 def _recalibrated(selection: Selection) -> dict[str, Recalibrated]:
-    """Base parameters as applied. What only goes together (the curve's coefficients) has its gain together."""
+    """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together."""
     model, calibration = selection.model, selection.model.bench.calibration
     base = [c for c in selection.applied() if not c.effect]
     groups: dict[str, list[Coordinate]] = {}
@@ -247,7 +249,9 @@ def _recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             value, sigma = model.values[c] * size, model.fits[c.channel].sigmas.get(c, 0.0) * abs(size)
             known = any(move.key == c.name for move in c.moves)
             before = value_of(calibration, c.name) if known else c.start
-            unit = c.unit if known else "1"
+            unit = parameter(calibration, c.name).unit if known else "1"
+            if abs(value - before) < _MOVED * sigma and gain < selection.screening.floor(model, c.channel):
+                continue
             key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
             result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel)
     return result
@@ -268,6 +272,7 @@ def _left(
     force = np.concatenate([np.nan_to_num(trial.force_N) for trial in judging.trials])
     if not judging.has_reference:
         force = screening.signals["clamp_force"]
+    rise = np.concatenate([(t.temperature_C - t.temperature_C[:1]).ravel() for t in judging.trials])
     for channel in model.bench.channels:
         if channel not in after:
             continue
@@ -277,7 +282,7 @@ def _left(
             found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
         first, last = _rms(before[channel]), _rms(after[channel])
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, achieved(calibration, channel, force), share, tuple(found))
+        result[channel] = Left(channel, last, achieved(calibration, channel, force, rise), share, tuple(found))
     return result
 
 

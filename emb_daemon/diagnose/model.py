@@ -7,7 +7,7 @@ import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
 from emb_daemon.diagnose.evidence import Evidence, Moments, judge
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench, Probe
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.score import rmse
@@ -94,9 +94,9 @@ class Model:
         return max(_INFLATION, float((sums**2).sum() / max(squares.sum(), 1e-300)))
 
     def refined(self, channels: Iterable[str]) -> "Model":
-        """Everything free in some channels fitted through the estimator."""
-        model = self
-        for channel in self.bench.channels:
+        """Everything free in some channels fitted through the estimator: heat first, on which stiffness rests."""
+        model, channels = self, set(channels)
+        for channel in (*HEAT_CHANNELS, *FORCE_CHANNELS):
             if channel in channels and model.own(channel):
                 model = model._fitted(channel)
         return model

@@ -23,6 +23,7 @@ from emb_daemon.offline.run import held, run_step
 #: Residuals by channel and their unit. `innovation` stands for the paths' reference where a log has none.
 UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
 FORCE_CHANNELS = ("stiffness", "torque", "innovation")
+HEAT_CHANNELS = ("temperature", "brake_torque")
 #: Disc speed (rad/s) below which the brake torque sensor shows static friction.
 _SLIDING = 1.0
 _TOUCHING_N = 300.0

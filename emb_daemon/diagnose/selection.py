@@ -14,7 +14,7 @@ import numpy as np
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
 from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.model import Model, is_shape
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence, dependences
 from emb_daemon.effects import REGISTRY
@@ -104,7 +104,11 @@ class Selection:
             values |= {c: float(np.clip(value, c.low, c.high)) for c, value in fitted}
             centre |= shape
             chosen += shape if harmonic and harmonic.whole else []
-        model = before.entered(values, chosen, centre).refined({winner.channel for winner in winners})
+        channels = {winner.channel for winner in winners}
+        model = before.entered(values, chosen, centre).refined(channels)
+        if "stiffness" in channels:
+            # The force that heats the pads has changed, and with their temperatures what softening and growth mean.
+            model = model.refined({*HEAT_CHANNELS, *channels})
         result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
         for winner in winners:
             if result.model.noise(winner.channel) >= before.noise(winner.channel):
@@ -132,11 +136,19 @@ def select(bench: Bench, progress: Progress) -> Selection:
         selection = _round(selection)
         if selection.accepted == before:
             break
-    if selection.accepted:
-        # The force that heats the pads has changed: everything once more, together.
-        progress("refitting everything together", 0.75)
-        selection = replace(selection, model=selection.model.refined(bench.channels))
-    return _changes(_revised(selection))
+    progress("refitting what is applied", 0.75)
+    return _changes(_revised(_settled_heat(selection)))
+
+
+def _settled_heat(selection: Selection) -> Selection:
+    """Heat that is not applied goes back to the calibration, and what is applied is fitted to that.
+
+    While searching, a friction or a heat capacity that is a little off must not pass for an effect; but growth and softening
+    that were fitted to other temperatures than the estimator will have would be wrong."""
+    model = selection.model
+    idle = [c for c in model.values if c.channel in HEAT_CHANNELS and c.channel not in selection.touched]
+    start = about_middle({c: c.start for c in idle}, model.bench.middle)
+    return replace(selection, model=model.entered(start, chosen=idle).refined(selection.touched))
 
 
 def _recalibrated(selection: Selection, start: Model) -> dict[str, float]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.calibration.types import Calibration
+from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Evidence needed to say that something is left: mean relative gain over its standard error, over episodes.
@@ -14,6 +15,8 @@ _LEAST_SHARE = 0.05
 #: Residual over what the calibration achieved on its own data from which something is left: its figures scatter by a quarter
 #: from log to log and pad to pad, units by less.
 _CLEARLY = 1.5
+#: Heat without a brake torque sensor is as uncertain as pads' friction, which no table knows better from one day to the next.
+_FRICTION_SHARE = 0.08
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,14 @@ class Left:
         return next(iter([*(d for d in self.dependences if d.matters), *self.dependences]), None)
 
 
-def achieved(calibration: Calibration, channel: str, force_N: np.ndarray) -> float:
+def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
     """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
-    nothing, or what its noise makes over these forces, if that is more. NaN where it says neither."""
+    nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.
+
+    Args:
+        force_N: clamp forces of the judging logs.
+        rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
+    """
     figures = calibration.provenance.figures if calibration.provenance else {}
     noise, motor = calibration.noise, calibration.motor
     # Without a reference the current is held against the stiffness path: its error comes on top.
@@ -108,5 +116,6 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray) -> flo
         total += max([*stated, float(np.sqrt(np.mean(own[path] ** 2)))]) ** 2
     if channel == "temperature":
         stated = [value for name, value in figures.items() if name.endswith(" K") and "thesis" not in name]
-        total = max([*stated, calibration.thermal.sigma_K]) ** 2
+        heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0
+        total = max([*stated, calibration.thermal.sigma_K]) ** 2 + heated**2
     return float(np.sqrt(total)) if total else float("nan")
