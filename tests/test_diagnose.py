@@ -21,6 +21,7 @@ from emb_daemon.diagnose.evidence import Moments, false_discovery, judge, leave_
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.diagnose.unexplained import Left
 from emb_daemon.effects import REGISTRY
@@ -236,6 +237,10 @@ def test_report_keeps_the_contract(uneven_disc):
         keys = {"name", "path", "accepted", "share_explained", "gain_N", "q_value", "parameters", "equation", "reason"}
         assert keys <= effect.keys()
         assert effect["reason"], effect["name"]
+    declared = {effect.name: {placebo.text for placebo in effect.placebos} for effect in REGISTRY}
+    run = {effect["name"]: set(effect["placebos"]) for effect in report["effects"] if "placebos" in effect}
+    assert {"disc_thickness_variation", "disc_thermal_expansion", "gear_mesh_ripple"} <= run.keys()
+    assert all(run[name] == declared[name] for name in run)
     accepted = [effect["accepted"] for effect in report["effects"]]
     assert accepted == sorted(accepted, reverse=True)
     page = (folder / "out" / "report.html").read_text()
@@ -444,6 +449,17 @@ def test_a_recalibrated_parameter_stands_with_before_value_sigma_unit_and_gain(c
     # A parameter that is zero is found as well.
     assert load["before"] == 0.0 and load["gain_N"] > 100.0
     assert load["value"] == pytest.approx(calibration.friction.load_m_per_rad, rel=0.2)
+
+
+def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
+    """What the torque path leaves is current: a function of the current explains it whatever its cause."""
+    gains = {"current": 900.0, "motor_acceleration": 800.0, "motor_speed": 700.0}
+    shadows = {name: (np.array([1000.0]), np.array([1000.0 - gain])) for name, gain in gains.items()}
+    monkeypatch.setattr(Screening, "dependence", lambda self, model, channel: shadows)
+    screening = Screening.__new__(Screening)
+    assert screening.rival(None, "torque", {}) == (700.0, "motor_speed")
+    assert screening.rival(None, "innovation", {}) == (800.0, "motor_acceleration")
+    assert screening.rival(None, "stiffness", {}) == (900.0, "current")
 
 
 def test_validation_has_a_veto(calibration):

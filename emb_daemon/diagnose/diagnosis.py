@@ -97,7 +97,7 @@ class Diagnosis:
 
     @property
     def whole(self) -> str:
-        return whole(self.bench)
+        return whole(self.judges)
 
     def figures(self) -> dict:
         """RMSE before and after with intervals, by path and condition."""

@@ -191,7 +191,7 @@ class Screening:
                 f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
             )
             return replace(candidate, reason=shadow)
-        candidate = replace(candidate, placebos=self.placebos(model, candidate))
+        candidate = self.with_placebos(model, candidate)
         for text, share in candidate.placebos.items():
             if share > _OF_PLACEBO:
                 return replace(candidate, reason=f"its placebo ({text}) explains {100 * share:.0f} % of the same")
@@ -230,15 +230,17 @@ class Screening:
 
     # -- placebos -----------------------------------------------------------------------------------------------------
 
-    def placebos(self, model: Model, candidate: Candidate) -> dict[str, float]:
-        """Share of a candidate's gain that it reaches with what it rests on disturbed, by what is disturbed."""
+    def with_placebos(self, model: Model, candidate: Candidate) -> Candidate:
+        """With the share of its gain that it reaches with what it rests on disturbed, if it gains anything."""
+        if candidate.evidence.gain <= 0.0:
+            return candidate
         random, result = np.random.default_rng(0), {}
         for placebo in candidate.effect.placebos:
             tables = self._disturbed(model, candidate, placebo, random)
             gains = [model.evidence(candidate.channel, own).gain for own in tables]
             if gains:
                 result[placebo.text] = max(0.0, *gains) / candidate.evidence.gain
-        return result
+        return replace(candidate, placebos=result)
 
     def _disturbed(self, model: Model, candidate: Candidate, placebo: Placebo, random) -> list[list[np.ndarray]]:
         """Regressors of a candidate under a placebo, drawn a few times."""

@@ -181,6 +181,9 @@ def _round(selection: Selection) -> Selection:
             winner, beaten = _settled(model, passed)
             winners.append(winner)
             losers += beaten
+    if not winners:
+        # The report states every placebo as a number, also of what fell for another reason.
+        tested = [screening.with_placebos(model, c) for c in tested]
     confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
     selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
     return selection._entered(winners) if winners else _tried(selection, tested, rivals)
@@ -233,12 +236,13 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
         and c.q_value > Q_VALUE
         and c.gain**2 > _LARGE * model.noise(c.channel)
     ]
-    large = [c for c in large if not selection.screening.plausible(model, c, rivals).reason]
-    if not large:
+    plausible = [(c, selection.screening.plausible(model, c, rivals)) for c in large]
+    plausible = [pair for pair in plausible if not pair[1].reason]
+    if not plausible:
         return selection
-    candidate = max(large, key=lambda c: c.gain**2 / model.noise(c.channel))
+    candidate, winner = max(plausible, key=lambda pair: pair[0].gain ** 2 / model.noise(pair[0].channel))
     name, shapes = candidate.effect.name, candidate.p_value / max(candidate.evidence.p_value, 1e-300)
-    entered = selection._entered([selection.screening.plausible(model, candidate, rivals)])
+    entered = selection._entered([winner])
     if name not in entered.accepted:
         return entered
     amplitudes = [c for c in entered.model.of_effect(name) if not is_shape(c)]
