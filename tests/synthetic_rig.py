@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from emb_daemon.estimator.records import SAMPLE
-from emb_daemon.identify.stiffness import Pads, simulate, with_dynamics
-from emb_daemon.identify.torque import friction_means
+from emb_daemon.identify.dynamics import Pads, with_dynamics
+from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
+from emb_daemon.offline.run import stiffness_force
 from emb_daemon.pipeline import CYCLE_S
 
 GEAR_GAIN = 4e-5
@@ -92,9 +93,12 @@ def _log(truth: Truth, thickness: float, path: np.ndarray, name: str, rng: np.ra
     samples["brake_torque"] = samples["ambient"] = np.nan
     parameters = with_dynamics(truth.dynamics)
     parameters["curve"][0, :3] = truth.curves[thickness]
-    force = simulate(samples, truth.clearance, parameters)
+    parameters["clearance"] = truth.clearance
+    force = stiffness_force(samples, parameters)
     t = truth.torque
-    mean, _ = friction_means(path, t["presliding_angle_rad"], flicker=0.0)
+    mean, state = np.zeros(len(path)), 0.0
+    for row, travel in enumerate(np.diff(path), 1):
+        state, mean[row], _ = friction_state(state, 0.0, travel, t["presliding_angle_rad"], 0.0, CYCLE_S)
     half = np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     # What the estimator sees of force: without the delay of the reference's clock, a detail of half a millisecond.
     torque = GEAR_GAIN * half + t["inertia_kg_m2"] * np.r_[0.0, np.diff(speed)] / CYCLE_S

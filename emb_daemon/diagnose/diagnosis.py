@@ -278,7 +278,7 @@ def _with_noise(calibration: Calibration, bench: Bench, attribution: Attribution
     """The calibration with the stiffness path's noise as it now is, if what it states contains what has been explained.
 
     The filter would go on trusting the worse path. It is only ever lowered: a rest that nothing explains is no noise."""
-    from emb_daemon.identify.noise import force_error_levels, integral_time
+    from emb_daemon.identify.steps.noise import force_error_levels, integral_time
 
     noise = calibration.noise
     if not any(v != 0.0 and knob.channel == "stiffness" for knob, v in attribution.values.items()):
