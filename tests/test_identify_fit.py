@@ -4,59 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_rig import COUNT_RAD, GEAR_GAIN, draw, pads
+from synthetic_rig import datasheet, draw, pads
 
-from emb_daemon.identify.campaign import (
-    Actuator,
-    Campaign,
-    CampaignFile,
-    Datasheet,
-    DiscNominal,
-    PadNominal,
-    Resolver,
-)
+from emb_daemon.identify.campaign import Campaign, CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import CurveFit, fit_dynamics, regress_free, with_dynamics
 from emb_daemon.identify.steps import noise
 from emb_daemon.identify.steps.thickness import predict_curve, thickness_laws
 from emb_daemon.identify.steps.torque import fit_torque
 
 
-def _datasheet(torque_constant: float, inertia: float, tolerance: float = 0.3) -> Datasheet:
-    """Of an actuator with the synthetic rig's geometry; pads and disc play no part here."""
-    return Datasheet(
-        actuator=Actuator(
-            gear_gain_m_per_rad=GEAR_GAIN,
-            motor_torque_constant_Nm_per_A=torque_constant,
-            motor_torque_constant_tolerance=tolerance,
-            lumped_inertia_kg_m2=inertia,
-            lumped_inertia_tolerance=tolerance,
-            max_motor_speed_rad_per_s=200.0,
-            rated_clamp_force_N=20e3,
-            pad_clearance_rad=5.0,
-        ),
-        resolver=Resolver(counts_per_revolution=round(2.0 * np.pi / COUNT_RAD)),
-        pad=PadNominal(
-            thickness_mm=10.0,
-            frontal_area_m2=0.0046,
-            density_kg_per_m3=2450.0,
-            specific_heat_J_per_kgK=1200.0,
-            conductivity_W_per_mK=1.2,
-        ),
-        disc=DiscNominal(
-            mass_kg=5.6,
-            specific_heat_J_per_kgK=480.0,
-            effective_radius_m=0.131,
-            cooling_area_m2=0.19,
-            conductivity_W_per_mK=50.0,
-        ),
-        friction_coefficient=0.39,
-    )
-
-
 def _datasheet_of(truth, rng) -> Datasheet:
     """What a supplier would state of a rig, each value off by its tolerance's standard deviation."""
     constant, inertia = (truth.torque[name] for name in ("torque_constant_Nm_per_A", "inertia_kg_m2"))
-    return _datasheet(constant * (1.0 + 0.15 * rng.normal()), inertia * (1.0 + 0.15 * rng.normal()))
+    return datasheet(constant * (1.0 + 0.15 * rng.normal()), inertia * (1.0 + 0.15 * rng.normal()))
 
 
 def _deviations(seed):
@@ -81,15 +41,15 @@ def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_t
     truth = draw(rng)
     logs = [log for group in pads(truth, rng) for log in group.logs]
     constant, inertia = truth.torque["torque_constant_Nm_per_A"], truth.torque["inertia_kg_m2"]
-    certain = fit_torque(logs, _datasheet(1.02 * constant, inertia, tolerance=1e-6))
+    certain = fit_torque(logs, datasheet(1.02 * constant, inertia, tolerance=1e-6))
     assert certain.values["torque_constant_Nm_per_A"] == pytest.approx(1.02 * constant, rel=1e-5)
     assert certain.sigmas["torque_constant_Nm_per_A"] < 1e-6 * constant
-    sheet = _datasheet(1.2 * constant, inertia, tolerance=0.15)
+    sheet = datasheet(1.2 * constant, inertia, tolerance=0.15)
     found = fit_torque(logs, sheet)
     assert found.values["torque_constant_Nm_per_A"] == pytest.approx(constant, rel=0.01)
     campaign = Campaign(Path("campaign.yaml"), CampaignFile(rig="X", datasheet="datasheet.yaml"), sheet)
-    campaign.compare_with_datasheet("motor.torque_constant_Nm_per_A", found.values["torque_constant_Nm_per_A"])
-    campaign.compare_with_datasheet("motor.inertia_kg_m2", inertia)
+    campaign.compare_withdatasheet("motor.torque_constant_Nm_per_A", found.values["torque_constant_Nm_per_A"])
+    campaign.compare_withdatasheet("motor.inertia_kg_m2", inertia)
     (fault,) = campaign.faults
     assert fault.startswith("motor.torque_constant_Nm_per_A: identified") and "within 15 %" in fault
 

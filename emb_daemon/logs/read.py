@@ -16,7 +16,8 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITT
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
 
 
-def _raw(path: Path) -> bytes:
+def read_file(path: Path) -> bytes:
+    """The one place where a log file is read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -98,7 +99,7 @@ def read_with_digest(path: str | Path) -> tuple[np.ndarray, str]:
     ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     if ending != ".log" and ending not in _PYTHON_CAN:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
-    raw = _raw(path)
+    raw = read_file(path)
     content = _unpacked(path, raw)
     frames = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     if not len(frames):
