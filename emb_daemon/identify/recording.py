@@ -129,7 +129,8 @@ def _check(log: Log) -> None:
         ("backing plate temperatures", log.slow.thermocouples["time_ns"]),
         ("wheel speeds", log.slow.wheel_speed["time_ns"]),
         ("vehicle status", log.slow.status["time_ns"]),
-        ("reference clamp force and brake torque", log.reference.time_ns),
+        ("reference clamp force", log.reference.clamp_force_N[np.isfinite(log.reference.clamp_force_N)]),
+        ("reference brake torque", log.reference.brake_torque_Nm[np.isfinite(log.reference.brake_torque_Nm)]),
         ("pad thermocouples", log.reference.pads["inner"][0]),
         ("pad thermocouples", log.reference.pads["outer"][0]),
     ):

@@ -8,8 +8,9 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import MODES, SOURCES
+from emb_daemon.estimator.records import MODES, REASONS, SOURCES
 from emb_daemon.logs.candump import format_candump
+from emb_daemon.logs.columns import References
 from emb_daemon.wire.layout import CORNERS
 
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
@@ -30,6 +31,7 @@ _COMMENTS = {
     "disc": "brake disc, lumped",
     "mode": "mode of the estimator",
     "source": "what clamp_force rests on",
+    "reasons": "why not to trust the row, joined by '; '",
     "corner": "wheel",
 }
 _UNITS = {"N": "N", "rad": "rad", "C": "degC"}
@@ -67,7 +69,26 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
     for code, name in SOURCES.items():
         names[code] = name
     columns["source"] = names[e["source"]].astype(str)
+    raised, codes = np.unique(e["reasons"], return_inverse=True)
+    texts = ["; ".join(text for bit, text in enumerate(REASONS) if int(value) >> bit & 1) for value in raised]
+    columns["reasons"] = np.array(texts)[codes]
     return columns
+
+
+def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.ndarray) -> dict[str, np.ndarray]:
+    """What a rig's instruments measured at the samples, as far as it has them: force and torque of the nearest frame (NaN
+    where none is near), temperatures as last heard."""
+    columns = {
+        "clamp_force_ref_N": force_N,
+        "brake_torque_ref_Nm": reference.at(time_ns, reference.brake_torque_Nm),
+        "disc_ref_C": reference.latest(time_ns, reference.disc_C),
+    }
+    for side, (stamps, depths) in reference.pads.items():
+        row = np.searchsorted(stamps, time_ns, side="right") - 1
+        for depth, values in zip((2, 4, 6, 8), depths, strict=True):
+            known = values[np.maximum(row, 0)] if len(values) else np.nan
+            columns[f"{side}_{depth}mm_ref_C"] = np.where(row >= 0, known, np.nan)
+    return {name: values for name, values in columns.items() if np.isfinite(values).any()}
 
 
 def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:

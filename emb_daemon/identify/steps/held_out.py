@@ -10,7 +10,7 @@ from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps import stiffness as stiffness_step
 from emb_daemon.identify.steps import torque as torque_step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import TorqueFit, fit_torque
+from emb_daemon.identify.steps.torque import Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import Log
 
 #: (error of the stiffness path, reference force) in N on one log, where there is a reference.
@@ -25,13 +25,14 @@ class Fold(Step):
     Attributes:
         judged: its random logs.
         errors: of the stiffness path on each of them.
+        unexplained: of the torque path on each of them.
     """
 
     pads: Pads
     clearance_rad: float
-    torque: TorqueFit
     judged: tuple[Log, ...]
     errors: list[Errors] = field(repr=False)
+    unexplained: list[Unexplained] = field(repr=False)
 
 
 def identify(campaign: Campaign, stiffness: StiffnessStep) -> list[Fold]:
@@ -50,6 +51,7 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
     own = fit_dynamics([slow], chosen, start=fit.values, curves=[joint.curves[index]], fixed=True)
     clearance = float(np.mean(own.curves[0].clearances_rad))
     torque = fit_torque([log for other in others for log in other.logs], campaign.datasheet)
+    gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
     force = stiffness.values["stiffness"].maximum_force_N
     errors = []
     for log in pads.random:
@@ -60,9 +62,9 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
         values=stiffness_step.sections(own, force) | torque_step.sections(torque, campaign.datasheet),
         pads=pads,
         clearance_rad=clearance,
-        torque=torque,
         judged=pads.random,
         errors=errors,
+        unexplained=[unexplained_current(log, torque, gear_gain) for log in pads.random],
     )
 
 

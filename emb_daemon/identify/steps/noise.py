@@ -12,7 +12,7 @@ from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import TorqueFit, TorqueStep, unexplained_current
+from emb_daemon.identify.steps.torque import TorqueStep, Unexplained, unexplained_current
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
@@ -33,6 +33,7 @@ def identify(
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
     """
     logs = [log for pads in stiffness.pads for log in pads.logs]
+    gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
     notes = []
     speed = speed_noise(logs)
     if speed is None:
@@ -40,14 +41,14 @@ def identify(
         notes.append("The motor never stands for 0.2 s: speed noise is one resolver count per sample, not measured.")
     if folds:
         errors = [pair for fold in folds for pair in fold.errors]
-        held_out = [(log, fold.torque) for fold in folds for log in fold.judged]
+        held_out = [left for fold in folds for left in fold.unexplained]
     else:
-        errors, held_out = second_halves(stiffness), [(log, torque.fit) for log in logs]
+        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, gear_gain) for log in logs]
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
             "levels come from the second halves of the random logs."
         )
-    levels = noise_levels(errors, held_out, campaign.datasheet.actuator.gear_gain_m_per_rad, speed, interpolation)
+    levels = noise_levels(errors, held_out, gear_gain, speed, interpolation)
     # The daemon is not told how worn its gear is.
     relative = float(np.hypot(levels.torque_relative, torque.gear_wear()))
     return Step(values={"noise": msgspec.structs.replace(levels, torque_relative=relative)}, notes=tuple(notes))
@@ -141,15 +142,15 @@ def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, flo
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
 
 
-def torque_levels(held_out: list[tuple[Log, TorqueFit]], gear_gain: float, speed_sigma: float) -> dict[str, float]:
-    """Fields of `Noise` that belong to the torque path, from logs each with a fit that did not see it."""
+def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
+    """Fields of `Noise` that belong to the torque path, from what fits leave on logs that they did not see."""
     series, turning, excess, gains = [], [], [], []
-    first = held_out[0][1]
+    first = held_out[0].found
     constant = first.values["torque_constant_Nm_per_A"]
     white = np.sqrt(2.0) * first.values["inertia_kg_m2"] * speed_sigma / CYCLE_S / constant
-    for log, found in held_out:
-        values = found.values
-        rows, current, mean, force = unexplained_current(log, found, gear_gain)
+    for left in held_out:
+        values = left.found.values
+        rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
         torque = values["torque_constant_Nm_per_A"] * current
         series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
         sliding = 1.0 - mean**2
@@ -172,7 +173,7 @@ def torque_levels(held_out: list[tuple[Log, TorqueFit]], gear_gain: float, speed
 
 def noise_levels(
     stiffness: list[Errors],
-    torque: list[tuple[Log, TorqueFit]],
+    torque: list[Unexplained],
     gear_gain: float,
     speed_sigma: float,
     interpolation_relative: float = 0.0,
@@ -181,7 +182,7 @@ def noise_levels(
 
     Args:
         stiffness: for each held-out log (error of the stiffness path in N, reference force in N).
-        torque: for each held-out log, a torque fit that did not see it.
+        torque: for each held-out log, what a torque fit that did not see it leaves.
         interpolation_relative: relative force error that a curve between two measured pad thicknesses adds.
     """
     errors = [e for e, _ in stiffness]

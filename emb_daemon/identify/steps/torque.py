@@ -216,17 +216,31 @@ def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.n
     return values + gain @ (stated[:, 0] - values[:2]), covariance - gain @ seen @ covariance
 
 
-def unexplained_current(log: Log, found: TorqueFit, gear_gain: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a fit leaves on a log that it need not have seen.
+@dataclass(frozen=True)
+class Unexplained:
+    """What a fit leaves on a log that it need not have seen, one entry per cycle.
 
-    Returns:
-        (rows of the log, current in A left unexplained, mean friction state, mean force in N), one entry per cycle.
+    Attributes:
+        rows: of the log.
+        current_A: left unexplained.
+        friction_mean: friction state, -1 to 1.
+        force_N: mean force.
     """
+
+    found: TorqueFit
+    rows: np.ndarray
+    current_A: np.ndarray
+    friction_mean: np.ndarray
+    force_N: np.ndarray
+
+
+def unexplained_current(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
+    """Current of a log that a fit does not explain."""
     part, values = _Regression(log), found.values
     regressors, _, use = part.matrices(values["presliding_angle_rad"])
     coefficients = np.array([gear_gain, *(values[name] for name in NAMES[1:4])]) / values["torque_constant_Nm_per_A"]
     residual = part.current - regressors @ coefficients
-    return part.rows[use], residual[use], regressors[use, 2], part.force[use]
+    return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
 
 
 _ROWS = (
