@@ -14,13 +14,13 @@ import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.estimator import records as r
-from emb_daemon.estimator.records import ESTIMATE, MODES, REASONS, SAMPLE, SOURCES, new_state
+from emb_daemon.estimator.answer import answer
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping as Mapping
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline import load_log as load_log
-from emb_daemon.pipeline import answer
 from emb_daemon.resources import resource
+from emb_daemon.wire import contract
 
 _NAN = float("nan")
 
@@ -94,7 +94,7 @@ class Estimator:
         speed_rad_per_s: float,
         current_A: float | None = None,
         *,
-        dt_s: float = 0.004,
+        dt_s: float = contract.CYCLE_S,
         backplates_C: tuple[float, float] | None = None,
         caliper_C: float | None = None,
         ambient_C: float = 20.0,
@@ -126,18 +126,18 @@ class Estimator:
         row["wheel_speed"] = 0.0 if wheel_speed_rad_per_s is None else wheel_speed_rad_per_s
         row["has_wheel_pulse"], row["wheel_pulse"] = wheel_pulse is not None, 0.0 if wheel_pulse is None else wheel_pulse
         row["reasons"] = (
-            r.CURRENT_LOST * (current_A is None)
-            | r.THERMOCOUPLE_LOST * (backplates_C is None)
-            | r.WHEEL_SPEED_LOST * (wheel_speed_rad_per_s is None)
-            | r.WHEEL_PULSE_LOST * (wheel_pulse is None)
+            contract.CURRENT_LOST * (current_A is None)
+            | contract.THERMOCOUPLE_LOST * (backplates_C is None)
+            | contract.WHEEL_SPEED_LOST * (wheel_speed_rad_per_s is None)
+            | contract.WHEEL_PULSE_LOST * (wheel_pulse is None)
         )
         answer(self._sample, 1, self._state, self._parameters, self._estimate)
         e = self._estimate[0]
         return Answer(
             force_N=float(e["force"]),
             sigma_N=float(e["sigma"]),
-            source=SOURCES[int(e["source"])],
-            mode=MODES[int(e["mode"])],
+            source=contract.SOURCES[int(e["source"])],
+            mode=contract.MODES[int(e["mode"])],
             stiffness_force_N=float(e["stiffness_force"]),
             torque_force_N=float(e["torque_force"]),
             contact_angle_rad=float(e["contact_angle"]),
@@ -146,5 +146,5 @@ class Estimator:
             inner_mean_C=float(e["mean"][0]),
             outer_surface_C=float(e["surface"][1]),
             outer_mean_C=float(e["mean"][1]),
-            reasons=tuple(text for bit, text in enumerate(REASONS) if int(e["reasons"]) >> bit & 1),
+            reasons=contract.reason_words(e["reasons"]),
         )

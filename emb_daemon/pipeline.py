@@ -10,36 +10,38 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_daemon.adapt.records import LIMITS
-from emb_daemon.estimator import records as r
+from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.estimator.step import predict, step
 from emb_daemon.jit import njit
+from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import pack
 from emb_daemon.wire.receive import ACCEPTED, SECOND_SENDER, new_reception, receive
 
-CYCLE_NS = 4_000_000
-CYCLE_S = 0.004
-#: A resolver sample waits this long for its current before it is answered without.
+#: A resolver sample waits this long for its current before it is answered without: senders put both on the bus together, and
+#: half a cycle leaves as much for the answer.
 _PAIRING_NS = CYCLE_NS // 2
-#: Without a resolver sample for this many cycles the daemon predicts, once a cycle.
+#: Without a resolver sample for this many cycles the daemon predicts, once a cycle; two frames lost in a row are
+#: made up for by the next.
 LATE_CYCLES = 3
-#: Deviation of arrival from the counter's clock up to which the counter is believed.
+#: Deviation of arrival from the counter's clock up to which the counter is believed: two cycles, the longest that a bus
+#: which keeps its schedule holds a frame up.
 _JITTER_NS = 2 * CYCLE_NS
 #: Samples on which counter and clock must have agreed before the counter is believed against the clock.
 _AGREED = 3
-#: Age up to which a slow input still feeds the models, and ages from which its absence is reported.
-_USABLE_NS = 2_500_000_000
-_REPORTED_CYCLES = 25
-_REFUSED_NS = 1_000_000_000
-_OK, _DEGRADED, _FAULT, _NOT_AVAILABLE = 0, 1, 2, 15
+#: Cycles of its message after which the absence of an input is reported, and the age up to which an input still feeds the
+#: models: so many cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
+_REPORTED_CYCLES, _USABLE_NS = 25, 2_500_000_000
+#: How long a frame that was refused, or somebody else's of our messages, shows in the reasons: ten EMB_c_EstimatorStatus.
+_SHOWN_NS = 1_000_000_000
 
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
 #: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
-#: ``agreed`` how many samples in a row counter and clock agreed on; ``stranger_ns`` when somebody else
+#: ``agreed`` how many samples in a row counter and clock agreed on; ``second_sender_ns`` when somebody else
 #: last sent one of our messages.
 CORNER = np.dtype(
     [
@@ -57,7 +59,7 @@ CORNER = np.dtype(
         ("clock_ns", "i8"),
         ("late_ns", "i8"),
         ("agreed", "i8"),
-        ("stranger_ns", "i8"),
+        ("second_sender_ns", "i8"),
     ],
     align=True,
 )
@@ -104,7 +106,7 @@ class Pipeline:
         self.corners = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
-        self.corners["stranger_ns"] = -2 * _REFUSED_NS
+        self.corners["second_sender_ns"] = -2 * _SHOWN_NS
         self.samples = np.zeros(capacity, SAMPLE)
         self.estimates = np.zeros(capacity, ESTIMATE)
         self.frames = np.zeros(4 * capacity, FRAME)
@@ -131,7 +133,7 @@ class Pipeline:
     def overdue(self, time_ns: int, count: int = 0) -> int:
         """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then.
 
-        A corner that owes several predictions gives the newest alone: the others would be news of the past."""
+        A corner that owes several predictions gives the newest alone: the others are out of date."""
         return _overdue(self._buffers, time_ns, _NEWEST, count)
 
     def answer(self, count: int) -> None:
@@ -162,7 +164,7 @@ def _collect(b, frames, start, predictions, count):
         start += 1
         slot, verdict = receive(frame, b.receptions, b.layout[0])
         if verdict == SECOND_SENDER:
-            _note_stranger(b, frame)
+            _record_second_sender(b, frame)
         if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES == wire.THERMOCOUPLE:
             continue
         index = slot // wire.CORNER_MESSAGES
@@ -190,11 +192,11 @@ def _paired(b, index):
 
 
 @njit
-def _note_stranger(b, frame):
+def _record_second_sender(b, frame):
     for kind in range(len(b.layout[0].sent_cycle_ns)):
         for index in range(4):
             if b.layout[0].sent_id[kind, index] == frame.can_id:
-                b.corners[index].stranger_ns = frame.time_ns
+                b.corners[index].second_sender_ns = frame.time_ns
 
 
 @njit
@@ -302,7 +304,7 @@ def _complete(b, index, count):
 
 @njit
 def _head(b, row, index, age):
-    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and what is amiss around it."""
+    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and its reasons outside the estimator."""
     corner = b.corners[index]
     now = corner.sample_ns + age * CYCLE_NS
     row.corner = index
@@ -317,59 +319,25 @@ def _head(b, row, index, age):
     reasons = b.disturbed[index]
     base = wire.CORNER_MESSAGES * index
     if age >= LATE_CYCLES:
-        reasons |= r.RESOLVER_LOST
+        reasons |= contract.RESOLVER_LOST
     if now - b.receptions[base + wire.CURRENT].time_ns >= LATE_CYCLES * CYCLE_NS:
-        reasons |= r.CURRENT_LOST
+        reasons |= contract.CURRENT_LOST
     for slot, reason in (
-        (base + wire.THERMOCOUPLE, r.THERMOCOUPLE_LOST),
-        (wire.WHEEL_SPEED, r.WHEEL_SPEED_LOST),
-        (wire.WHEEL_PULSE, r.WHEEL_PULSE_LOST),
-        (wire.VEHICLE_STATUS, r.VEHICLE_STATUS_LOST),
+        (base + wire.THERMOCOUPLE, contract.THERMOCOUPLE_LOST),
+        (wire.WHEEL_SPEED, contract.WHEEL_SPEED_LOST),
+        (wire.WHEEL_PULSE, contract.WHEEL_PULSE_LOST),
+        (wire.VEHICLE_STATUS, contract.VEHICLE_STATUS_LOST),
     ):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
-        if now - b.receptions[slot].refused_ns < _REFUSED_NS:
-            reasons |= r.E2E_ERROR
-        if now - b.receptions[slot].range_ns < _REFUSED_NS:
-            reasons |= r.OUT_OF_RANGE
-    if now - corner.stranger_ns < _REFUSED_NS:
-        reasons |= r.SECOND_SENDER
+        if now - b.receptions[slot].refused_ns < _SHOWN_NS:
+            reasons |= contract.E2E_ERROR
+        if now - b.receptions[slot].range_ns < _SHOWN_NS:
+            reasons |= contract.OUT_OF_RANGE
+    if now - corner.second_sender_ns < _SHOWN_NS:
+        reasons |= contract.SECOND_SENDER
     row.reasons = reasons
-
-
-@njit
-def answer(samples, count, states, parameters, estimates):
-    """Estimate ``samples[:count]``.
-
-    ``states`` and ``parameters`` have one record for each corner, or one in all.
-    """
-    for number in range(count):
-        corner = samples[number].corner
-        answer_row(samples[number], states[corner % len(states)], parameters[corner % len(parameters)], estimates[number])
-
-
-@njit
-def answer_row(row, state, p, estimate):
-    """Estimate one SAMPLE into one ESTIMATE: the one place from which the estimator is run."""
-    estimate.time_ns = row.time_ns
-    estimate.cycle = row.cycle
-    estimate.elapsed_cycles = row.elapsed_cycles
-    estimate.age_cycles = row.age_cycles
-    estimate.corner = row.corner
-    estimate.counter = row.counter
-    estimate.is_sample = not row.is_prediction
-    if row.is_prediction:
-        predict(state, p, row.age_cycles * CYCLE_S, estimate)
-    else:
-        step(state, p, row, estimate)
-    estimate.reasons |= row.reasons
-    if not state.started:
-        estimate.mode = r.INIT
-    elif estimate.source == r.INVALID:
-        estimate.mode = r.FAULT
-    elif estimate.reasons and estimate.mode == r.RUNNING:
-        estimate.mode = r.DEGRADED
 
 
 @njit
@@ -384,8 +352,13 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             period = wires.sent_cycle_ns[kind] // CYCLE_NS
             if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
                 continue
-            usable = e.source != r.INVALID and e.mode != r.INIT
-            status = _NOT_AVAILABLE if e.mode == r.INIT else _FAULT if not usable else _DEGRADED if e.reasons else _OK
+            usable = e.source != contract.INVALID and e.mode != contract.INIT
+            if e.mode == contract.INIT:
+                status = contract.STATUS_NOT_AVAILABLE
+            elif not usable:
+                status = contract.STATUS_FAULT
+            else:
+                status = contract.STATUS_DEGRADED if e.reasons else contract.STATUS_OK
             if kind == wire.CLAMP_FORCE:
                 values[0] = 1e-3 * e.force
                 values[1] = 1e-3 * e.sigma if usable else np.inf
@@ -396,7 +369,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
                 values[0], values[1] = e.surface[0], e.mean[0]
                 values[2], values[3] = e.surface[1], e.mean[1]
                 if np.isnan(e.surface[0]):
-                    status = _NOT_AVAILABLE
+                    status = contract.STATUS_NOT_AVAILABLE
             elif kind == wire.ESTIMATOR_STATUS:
                 values[0] = e.mode
                 values[1] = e.stiffness_factor

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.offline import Log
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Harmonics fitted beside the fundamental: the curve is not straight.
 _HARMONICS = 4

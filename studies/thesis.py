@@ -33,7 +33,7 @@ from emb_daemon.identify.steps.torque import NAMES, TorqueFit, Unexplained
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.score import rmse
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 from studies.frequency import response
 from studies.thesis_pad import thesis_profiles
 

@@ -12,7 +12,7 @@ from emb_daemon.identify.dynamics import Pads, with_dynamics
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
 from emb_daemon.offline.run import stiffness_force
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 GEAR_GAIN = 4e-5
 COUNT_RAD = 2.0 * np.pi / 4096

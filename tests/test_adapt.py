@@ -171,7 +171,7 @@ def test_the_request_says_what_it_wants(tmp_path):
     values = message.decode(payloads[0], decode_choices=False)
     limits = loop.calibration.adaptation
     assert values["Request"] == 1 and values["Result"] == 0
-    assert values["HighForce"] == pytest.approx(1e-3 * limits.high_force_N, abs=0.25)
+    assert values["HighForce"] == pytest.approx(1e-3 * loop.calibration.training_force_N, abs=0.25)
     assert values["DitherAmplitude"] == pytest.approx(limits.dither_amplitude_rad, abs=0.02)
     assert values["DitherFrequency"] == pytest.approx(limits.dither_frequency_Hz, abs=0.1)
 

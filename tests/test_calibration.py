@@ -1,6 +1,5 @@
 """Calibration and configuration files: every fault found at once, with its line; what is saved is what is loaded."""
 
-import math
 import re
 
 import msgspec
@@ -10,10 +9,23 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_daemon.adapt.limits import to_limits
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash, dump_calibration, load_calibration, save_calibration
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import Calibration, Provenance, Source, Struct, curve_at, to_parameters
+from emb_daemon.calibration.types import (
+    Calibration,
+    Curve,
+    Provenance,
+    Source,
+    Stiffness,
+    Struct,
+    curve_at,
+    rising_force,
+    thickness_range,
+    to_parameters,
+)
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.resources import resource
 
@@ -269,6 +281,81 @@ def test_curves_between_measured_thicknesses():
         curve_at(curves, 40.0)
 
 
+def _stiffness(*coefficients: list[float], **changes) -> Stiffness:
+    """Curves of pads 4 and 8 mm (and 12 mm) thick."""
+    curves = tuple(Curve(pad_thickness_mm=4.0 * k, coefficients=tuple(c)) for k, c in enumerate(coefficients, 1))
+    return Stiffness(**{"curves": curves, "relaxation_time_s": 0.03, "maximum_force_N": 30000.0} | changes)
+
+
+@pytest.mark.parametrize("softer", [[300.0, 12.0], [100.0, 4.0], [60.0, 2.0], [10.0, 0.1]])
+def test_a_compliance_carried_on_beyond_the_measured_never_reaches_zero(softer):
+    """Straight on, these reciprocals cross zero: the coefficients would pass through infinity to the other sign."""
+    curves = _stiffness([360.0, 15.0], softer).curves
+    low, high = thickness_range(curves)
+    for thickness in np.linspace(low, high, 201):
+        curve = curve_at(curves, thickness)[:2]
+        assert np.all(curve > 0.0) and np.all(curve <= 2.0 * np.array([360.0, 15.0]) * (1.0 + 1e-12))
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "force"),
+    [
+        ([100.0], np.inf),
+        ([100.0, 10.0, 1.0], np.inf),
+        ([100.0, -1.0], 2500.0),
+        ([300.0, 40.0, -128.0], None),
+        ([100.0, -20.0, 2.0], np.inf),
+        ([-1.0, 20.0], 0.0),
+    ],
+)
+def test_force_up_to_which_a_curve_rises(coefficients, force):
+    """Against the same polynomial on a fine grid."""
+    coefficients = np.array(coefficients)
+    found = rising_force(coefficients)
+    if force is not None:
+        assert found == pytest.approx(force)
+    x = np.linspace(0.0, 100.0, 200_001)
+    values = np.polyval([*coefficients[::-1], 0.0], x)
+    falls = np.flatnonzero(np.diff(values) < 0.0)
+    assert found == np.inf if not len(falls) else found == pytest.approx(values[falls[0]], rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "expected"),
+    [
+        (([346.0, 48.0, 0.98], [300.0, -128.0, 0.7]), r"curves: with pads of \S+ mm the force stops rising at \d+ N, below"),
+        (([100.0, -1.0],), "with pads of 4 mm the force stops rising at 2500 N"),
+        # Both rise for ever; half an interval beyond the thicker, the straight line of the second coefficient is at -18.
+        (([300.0, 30.0], [200.0, 0.0]), "with pads of 8"),
+    ],
+)
+def test_a_curve_that_falls_before_the_largest_force_is_refused(coefficients, expected):
+    with pytest.raises(ValueError, match=expected):
+        _stiffness(*coefficients)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "value", "expected"),
+    [
+        (r"(?m)^  maximum_force_N:.*$", "  maximum_force_N: 8000.0\nadaptation:\n  high_force_N: 18000.0",
+         "adaptation.high_force_N: 18000 exceeds stiffness.maximum_force_N (8000)"),
+        (r"(?m)^actuator:.*$", "actuator: a\nadaptation: {minimum_ambient_C: 50.0}", "maximum_ambient_C: expected more than"),
+        (r"(?m)^pad_thickness_mm:.*$", "pad_thickness_mm: 77.0", "pad_thickness_mm: 77.0 is too far"),
+    ],
+)  # fmt: skip
+def test_ranges_that_contradict_each_other(tmp_path, pattern, value, expected):
+    text, count = re.subn(pattern, value, _TEXT, count=1)
+    assert count == 1
+    (fault,) = _faults(tmp_path, text)
+    assert expected in fault and re.match(r":\d+: ", fault)
+
+
+@pytest.mark.parametrize(("maximum_N", "training_N"), [(8000.0, 4800.0), (30000.0, 18000.0), (42000.0, 18000.0)])
+def test_training_asks_no_brake_for_more_than_it_has(maximum_N, training_N):
+    calibration = moved(_CALIBRATION, {"stiffness.maximum_force_N": maximum_N}, checked=True)
+    assert to_limits(calibration)["high_force"] == pytest.approx(training_N)
+
+
 def test_shipped_configuration_is_valid():
     setup = Setup(resource("config/emb.yaml"))
     assert set(setup.calibrations) == {"FL", "FR", "RL", "RR"} and np.all(setup.parameters["gear_gain"] > 0.0)
@@ -288,30 +375,38 @@ def test_setup_lists_the_faults_of_all_files(tmp_path):
         "missing.dbc: no such file",
         "a.yaml:",
         "b.yaml: no such file",
-        "c.yaml: pad_thickness_mm: 77.0 is too far",
+        "c.yaml:3: pad_thickness_mm: 77.0 is too far",
     ):
         assert expected in faults
     assert len(caught.value.faults) == 4
 
 
 def test_configuration_faults(tmp_path):
+    """All at once, unknown corner and interface included, each with its line."""
     path = tmp_path / "emb.yaml"
     path.write_text(
         "format: 1\ncorners: {XX: {calibration: c}, FL: {calibraton: c}}\n"
-        "realtime: {fifo_priority: 100, cpu: on}\nlog_level: loud\n"
+        "realtime: {fifo_priority: 100, cpu: on}\nlog_level: loud\nbus: {interface: sockcan}\n"
     )
     with pytest.raises(InputErrors) as caught:
         Setup(path)
-    faults = "\n".join(caught.value.faults)
-    for expected in (
+    expected = (
+        ":2: corners.XX: Expected `str` matching regex '^(FL|FR|RL|RR)$'",
         ":2: corners.FL.calibraton: unknown key",
+        ":2: corners.FL.calibration: missing",
         ":3: realtime.fifo_priority",
         ":3: realtime.cpu",
         ":4: log_level",
-    ):
-        assert expected in faults
-    path.write_text("format: 1\ncorners: {XX: {calibration: c}, YY: {calibration: c}}\n")
-    with pytest.raises(InputErrors) as caught:
+        ":5: bus.interface: python-can knows no sockcan; near are ",
+    )
+    for text in expected:
+        assert sum(text in fault for fault in caught.value.faults) == 1, text
+    assert len(caught.value.faults) == len(expected) and "socketcan" in caught.value.faults[-1]
+
+
+@pytest.mark.parametrize("corners", ["{}", "[FL]", "FL"])
+def test_a_configuration_without_corners(tmp_path, corners):
+    path = tmp_path / "emb.yaml"
+    path.write_text(f"format: 1\ncorners: {corners}\n")
+    with pytest.raises(InputErrors, match=r":2: corners: expected at least 1 key"):
         Setup(path)
-    assert [fault.split(": ", 2)[1] for fault in caught.value.faults] == ["corners.XX", "corners.YY"]
-    assert math.prod(fault.count(":2: ") for fault in caught.value.faults) == 1

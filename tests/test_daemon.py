@@ -12,14 +12,15 @@ import pytest
 
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import load_calibration, save_calibration
-from emb_daemon.estimator import records
-from emb_daemon.pipeline import CYCLE_NS, Pipeline
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import socket_pair
 from emb_daemon.runtime.systemd import ServiceManager
+from emb_daemon.wire import contract
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
 
 CONFIG = Path(__file__).parent.parent / "config"
@@ -81,7 +82,7 @@ def answers(frames: np.ndarray) -> np.ndarray:
     """Payloads of FL's clamp force frames that answer a resolver sample."""
     mine = frames[frames["can_id"] == CLAMP_FORCE_FL]
     source = (mine["data"] >> np.uint64(52)) & np.uint64(15)
-    return mine["data"][source < records.PREDICTED] >> np.uint64(16)
+    return mine["data"][source < contract.PREDICTED] >> np.uint64(16)
 
 
 def status_of(frames: np.ndarray) -> set[int]:
@@ -110,7 +111,7 @@ def test_silence_is_told_from_the_first_tick(setup: Setup):
         frames = running.wait_for(lambda frames: np.sum(frames["can_id"] == CLAMP_FORCE_FL) > 3)
     data = frames["data"][frames["can_id"] == CLAMP_FORCE_FL]
     assert status_of(frames) == {NOT_AVAILABLE}, "a force that nobody knows"
-    assert set((data >> np.uint64(52)) & np.uint64(15)) == {records.INVALID}
+    assert set((data >> np.uint64(52)) & np.uint64(15)) == {contract.INVALID}
 
 
 def test_a_good_calibration_is_taken_and_a_bad_one_is_not(setup: Setup, tmp_path: Path):

@@ -7,8 +7,9 @@ import wirekit
 from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
-from emb_daemon.estimator import records as r
-from emb_daemon.pipeline import CYCLE_NS
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.wire import contract as r
+from emb_daemon.wire.contract import CYCLE_NS
 
 #: Cycles before the fault, in it, and after it; the last E2E error is shown for a second.
 _BEFORE, _DURING, _AFTER = 150, 100, 300
@@ -336,7 +337,7 @@ def _heated(parameters, change, seconds=150.0):
     from emb_daemon.offline import estimate
 
     time = np.arange(0.0, seconds, 0.004)
-    rows = np.zeros(len(time), r.SAMPLE)
+    rows = np.zeros(len(time), SAMPLE)
     rows["dt"] = np.where(time > 0.0, 0.004, 0.0)
     rows["angle"] = 17.5 * np.clip(time / 0.5, 0.0, 1.0)
     rows["speed"] = np.where(time < 0.5, 35.0, 0.0)

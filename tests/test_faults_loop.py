@@ -16,10 +16,10 @@ from test_pipeline import _run, _sliding, car  # noqa: F401
 from emb_daemon.adapt import memory
 from emb_daemon.adapt.memory import Memory, Store
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.estimator import records as r
-from emb_daemon.pipeline import CYCLE_NS
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
+from emb_daemon.wire import contract as r
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, FRAME
 
 CONFIG = Path(__file__).parent.parent / "config" / "emb.yaml"

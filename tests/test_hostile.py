@@ -8,9 +8,9 @@ import wirekit
 from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
-from emb_daemon.estimator import records as r
 from emb_daemon.logs.read import read_frames
-from emb_daemon.pipeline import CYCLE_NS
+from emb_daemon.wire import contract as r
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import default_layout
 from emb_daemon.wire.receive import ACCEPTED, new_reception, receive

@@ -11,9 +11,9 @@ import pytest
 import wirekit
 
 from emb_daemon.cli.main import main
-from emb_daemon.estimator.records import REASONS
 from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener
 from emb_daemon.monitor.view import render, sparkline, summary
+from emb_daemon.wire.contract import REASONS
 
 S = SECOND_NS
 

@@ -10,11 +10,11 @@ import pytest
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator import records as r
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, simulate_log
 from emb_daemon.resources import resource
+from emb_daemon.wire import contract as r
 
 #: Rows of the simulated city drive: standing released, clamping, holding 7 kN, holding until it is released at 2150.
 _RELEASED, _CLAMPING, _HOLDING, _BEFORE_RELEASE = 400, 1300, 1500, 2000

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from wirekit import MS, frame, record
 
 from emb_daemon.errors import InputErrors
-from emb_daemon.estimator.records import MODES, REASONS
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
 from emb_daemon.wire.e2e import crc, protect
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
 from emb_daemon.wire.layout import CORNERS, default_layout, load_layout, pack, unpack
@@ -88,8 +88,8 @@ def test_dbc_states_what_numbers_mean():
     assert choices("EMB_FL_ClampForce", "ForceSource") == {
         0: "Fused", 1: "StiffnessOnly", 2: "TorqueOnly", 3: "Predicted", 15: "Invalid"}  # fmt: skip
     assert choices("EMB_RR_EstimatorStatus", "Mode") == {number: mode.capitalize() for number, mode in enumerate(MODES)}
-    assert choices("EMB_FL_AdaptRequest", "Request") == {0: "None", 1: "Run", 2: "Abort"}
-    assert choices("EMB_FL_AdaptRequest", "Result") == {0: "None", 1: "Accepted", 2: "Rejected", 3: "Aborted"}
+    assert choices("EMB_FL_AdaptRequest", "Request") == {number: word.capitalize() for number, word in enumerate(REQUESTS)}
+    assert choices("EMB_FL_AdaptRequest", "Result") == {number: word.capitalize() for number, word in enumerate(RESULTS)}
     reasons = wirekit.database().get_message_by_name("EMB_FL_EstimatorStatus").get_signal_by_name("DegradedReasons").comment
     for bit, reason in enumerate(REASONS):
         assert f"bit {bit} (0x{1 << bit:04X}) {reason}" in reasons
@@ -303,9 +303,79 @@ def test_value_out_of_range_changes_nothing_of_its_frame():
 def test_layout_lists_every_fault_of_a_dbc(tmp_path):
     text = resource("dbc/emb.dbc").read_text()
     path = tmp_path / "broken.dbc"
-    path.write_text(text.replace(" SG_ MotorSpeed", " SG_ RotorSpeed", 1).replace("VEH_WheelPulse", "VEH_Pulses"))
+    text = text.replace(" SG_ MotorSpeed", " SG_ RotorSpeed", 1).replace("VEH_WheelPulse", "VEH_Pulses")
+    path.write_text(text.replace('"GenMsgCycleTime" BO_ 256 4;', '"GenMsgCycleTime" BO_ 256 5;'))
     with pytest.raises(InputErrors) as caught:
         load_layout(path)
     faults = "\n".join(caught.value.faults)
     assert "signal MotorSpeed is missing" in faults and "message VEH_WheelPulse is missing" in faults
-    assert faults.count(str(path)) == len(caught.value.faults) == 2
+    assert "EMB_FL_Resolver: GenMsgCycleTime is 5 ms" in faults, "a missing signal hides no other fault of its message"
+    assert faults.count(str(path)) == len(caught.value.faults) == 3
+
+
+def _altered(tmp_path, *replacements: tuple[str, str]):
+    """The shipped DBC with texts replaced."""
+    text = resource("dbc/emb.dbc").read_text()
+    for old, new in replacements:
+        assert old in text, old
+        text = text.replace(old, new)
+    path = tmp_path / "own.dbc"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "offset", "value"), [("deg", "0.01", "0", 0.01 * np.pi / 180.0), ("mrad", "0.2", "5", 0.2e-3)]
+)
+def test_a_dbc_of_ones_own_is_read_in_its_units(tmp_path, unit, factor, offset, value):
+    line = next(line for line in resource("dbc/emb.dbc").read_text().splitlines() if "SG_ MotorAngle" in line).strip()
+    other = re.sub(r"\(.*?\) \[.*?\]", f"({factor},{offset}) [-80000|80000]", line).replace('"rad"', f'"{unit}"')
+    signal = load_layout(_altered(tmp_path, (line, other)))[0]["received"][wire.RESOLVER, wire.MOTOR_ANGLE]
+    per_unit = value / float(factor)
+    assert unpack(np.uint64(1000 << 16), signal) == pytest.approx(1000.0 * value + float(offset) * per_unit)
+    assert (signal["low"], signal["high"]) == (pytest.approx(-80000 * per_unit), pytest.approx(80000 * per_unit))
+
+
+def test_what_is_sent_is_in_the_units_of_a_dbc_of_ones_own(tmp_path):
+    path = _altered(
+        tmp_path, ('SG_ ClampForce : 16|16@1+ (0.001,0) [0|65.535] "kN"', 'SG_ ClampForce : 16|16@1+ (2,0) [0|131070] "N"')
+    )
+    signal = load_layout(path)[0]["sent"][wire.CLAMP_FORCE, 0]
+    assert int(pack(12.0, signal)) >> 16 == 6000
+
+
+@pytest.mark.parametrize("unit", ["", "A", "furlong"])
+def test_a_unit_that_cannot_be_converted_is_refused(tmp_path, unit):
+    line = next(line for line in resource("dbc/emb.dbc").read_text().splitlines() if "SG_ MotorAngle" in line).strip()
+    with pytest.raises(InputErrors) as caught:
+        load_layout(_altered(tmp_path, (line, line.replace('"rad"', f'"{unit}"'))))
+    assert len(caught.value.faults) == 4
+    assert all("_Resolver.MotorAngle: " in fault and "expected rad" in fault for fault in caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('BA_ "GenMsgCycleTime" BO_ 256 4;', 'BA_ "GenMsgCycleTime" BO_ 256 10;', "GenMsgCycleTime is 10 ms; expected 4 ms"),
+        (" 256 ", " 2147483904 ", "expected an 11-bit id and 8 bytes"),
+    ],
+)
+def test_a_dbc_may_not_contradict_the_contract(tmp_path, old, new, expected):
+    with pytest.raises(InputErrors) as caught:
+        load_layout(_altered(tmp_path, (old, new)))
+    assert any(f"EMB_FL_Resolver: {expected}" in fault for fault in caught.value.faults)
+
+
+def test_a_counter_elsewhere_is_refused(tmp_path):
+    text = resource("dbc/emb.dbc").read_text()
+    at = text.index("BO_ 256 ")
+    path = tmp_path / "own.dbc"
+    path.write_text(text[:at] + text[at:].replace("SG_ Counter : 8|4@", "SG_ Counter : 8|3@", 1))
+    with pytest.raises(InputErrors, match=r"EMB_FL_Resolver\.Counter: expected 4 bits from bit 8"):
+        load_layout(path)
+
+
+@given(st.integers(0, 0xFFFF))
+def test_reasons_in_words_are_the_bits(bits):
+    words = reason_words(bits)
+    assert sum(1 << REASONS.index(word) for word in words) == bits

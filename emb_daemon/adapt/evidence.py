@@ -27,8 +27,9 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
-from emb_daemon.pipeline import CYCLE_S, Pipeline
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_S
 
 
 @njit

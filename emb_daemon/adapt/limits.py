@@ -12,7 +12,7 @@ def to_limits(calibration: Calibration) -> np.void:
     limits["enabled"] = a.enabled
     limits["minimum_ambient"], limits["maximum_ambient"] = a.minimum_ambient_C, a.maximum_ambient_C
     limits["maximum_rise"] = a.maximum_rise_K
-    limits["high_force"], limits["coverage"] = a.high_force_N, a.coverage
+    limits["high_force"], limits["coverage"] = calibration.training_force_N, a.coverage
     limits["dither_amplitude"], limits["dither_frequency"] = a.dither_amplitude_rad, a.dither_frequency_Hz
     limits["settling_time"], limits["answer_time"] = a.settling_time_s, a.answer_time_s
     limits["longest_training"] = a.longest_training_s

@@ -10,6 +10,7 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.torque import friction_state, unexplained_torque
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Width of an angle bin, as a share of the travel, and how far friction must have turned over for a sample to count.
 _BINS = 100
@@ -18,8 +19,6 @@ _TURNED_OVER = 0.97
 _SAMPLES = 4
 #: Samples so many standard deviations from their bin's mean are left out.
 _FAR = 8.0
-#: The current is averaged over this time, s (wire contract).
-CYCLE_S = 0.004
 #: Contact is searched below the angle at which this share of the largest force is reached.
 _SEARCHED_SHARE = 0.2
 _CANDIDATES = 60

@@ -8,10 +8,10 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import settle, unexplained_step
-from emb_daemon.estimator import records as e
+from emb_daemon.estimator.answer import answer_row
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import OFFSET
-from emb_daemon.pipeline import answer_row
+from emb_daemon.wire import contract as e
 
 _NONE, _RUN = 0, 1
 _PARK_APPLIED = 1.0

@@ -1,5 +1,6 @@
 """The daemon's configuration file: bus, corners, folders, real-time settings."""
 
+import difflib
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +24,13 @@ class Bus(Struct, kw_only=True):
     channel: str | None = None
     #: In bit/s, for interfaces that set it.
     bitrate: Annotated[int, Meta(gt=0)] | None = None
+
+    def __post_init__(self):
+        from can.interfaces import VALID_INTERFACES
+
+        if self.interface is not None and self.interface not in VALID_INTERFACES:
+            near = difflib.get_close_matches(self.interface, VALID_INTERFACES, 3, 0.4) or sorted(VALID_INTERFACES)
+            raise ValueError(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
 
 
 class Corner(Struct, kw_only=True):
@@ -50,20 +58,15 @@ class Configuration(Struct, kw_only=True):
     format: Annotated[int, Meta(ge=1, le=1)]
     bus: Bus = Bus()
     #: FL, FR, RL, RR: those that this process estimates.
-    corners: dict[str, Corner]
-    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same.
+    corners: Annotated[dict[Annotated[str, Meta(pattern="^(FL|FR|RL|RR)$")], Corner], Meta(min_length=1)]
+    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same,
+    #: units are converted.
     dbc: str | None = None
     #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
     state_directory: str | None = None
     realtime: Realtime = Realtime()
     #: What the journal gets: debug, info, warning or error.
     log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"
-
-    def __post_init__(self):
-        if not self.corners:
-            raise ValueError("corners: expected at least one of FL, FR, RL, RR")
-        if faults := [f"corners.{name}: expected FL, FR, RL or RR" for name in self.corners if name not in CORNERS]:
-            raise ValueError("\n".join(faults))
 
 
 class Setup:
@@ -97,14 +100,10 @@ class Setup:
                 loaded[file] = None
                 try:
                     loaded[file] = load_calibration(file)
-                    to_parameters(loaded[file])
                 except InputErrors as error:
                     faults += error.faults
-                except InputError as error:
-                    faults.append(f"{file}: {error}")
             if loaded[file] is not None:
                 self.calibrations[name] = loaded[file]
-                if not faults:
-                    self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
+                self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
         if faults:
             raise InputErrors(faults)

@@ -84,15 +84,21 @@ class _Reader:
             return None
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             return self.struct(node, kind, path)
-        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+        container, least = _strip_length(kind)
+        origin, arguments = typing.get_origin(container), typing.get_args(container)
         if origin is tuple and arguments[-1] is Ellipsis and _holds_struct(arguments[0]):
-            if not isinstance(node, yaml.SequenceNode):
-                return self.fault(node, path, "expected a list")
+            if not isinstance(node, yaml.SequenceNode) or len(node.value) < least:
+                return self.fault(node, path, f"expected a list of at least {least}" if least else "expected a list")
             return tuple(self.convert(item, arguments[0], f"{path}[{index}]") for index, item in enumerate(node.value))
         if origin is dict:
-            if not isinstance(node, yaml.MappingNode):
-                return self.fault(node, path, "expected keys and values")
+            if not isinstance(node, yaml.MappingNode) or len(node.value) < least:
+                return self.fault(node, path, f"expected at least {least} key" if least else "expected keys and values")
             entries = self.entries(node, path)
+            for key, value in entries.items():
+                try:
+                    msgspec.convert(key, arguments[0])
+                except msgspec.ValidationError as error:
+                    self.fault(value, _join(path, key), str(error))
             return {key: self.convert(value, arguments[1], _join(path, key)) for key, value in entries.items()}
         before = len(self.faults)
         value = self.plain(node, path)
@@ -127,8 +133,11 @@ class _Reader:
             return kind(**values)
         except ValueError as error:
             for line in str(error).splitlines():
-                key = line.partition(": ")[0]
-                self.fault(_child(node, key), path, line)
+                key, colon, text = line.partition(": ")
+                if not colon or " " in key:
+                    self.fault(node, path, line)
+                else:
+                    self.fault(_child(node, key), _join(path, key), text)
 
 
 def _child(node: yaml.Node, key: str) -> yaml.Node:
@@ -150,6 +159,14 @@ def _strip_optional(kind: Any) -> tuple[bool, Any]:
         if len(rest) == 1:
             return True, rest[0]
     return False, kind
+
+
+def _strip_length(kind: Any) -> tuple[Any, int]:
+    """A container's type without the annotation of its length, and its least length."""
+    if typing.get_origin(kind) is not typing.Annotated:
+        return kind, 0
+    container, *metas = typing.get_args(kind)
+    return container, max((meta.min_length or 0 for meta in metas if isinstance(meta, msgspec.Meta)), default=0)
 
 
 def _holds_struct(kind: Any) -> bool:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.curves import curve_at, rising_force, thickness_range
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import (
@@ -24,6 +25,15 @@ from emb_daemon.models.thermal import mesh
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+#: Training reaches the forces that hold a parked car: 18 kN, 60 % of what the brake of the shipped calibration can do, and on
+#: weaker brakes the same share.
+_TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
+
+
+def usual(size: float) -> Meta:
+    """Size that is usual of a number which may be zero; from there a relative step leads nowhere (`parameters`)."""
+    return Meta(extra={"usual": size})
 
 
 class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -47,11 +57,11 @@ class Friction(Struct, kw_only=True):
     """Friction of the reduction gear at the motor shaft (thesis 4.1)."""
 
     #: Friction torque per clamp force (mu_g).
-    load_m_per_rad: NonNegative
+    load_m_per_rad: Annotated[NonNegative, usual(1e-5)]
     #: Friction torque without clamp force (eta_g).
-    offset_Nm: NonNegative
+    offset_Nm: Annotated[NonNegative, usual(0.03)]
     #: Motor angle over which friction turns over after a reversal; near zero it is the thesis's sign function.
-    presliding_angle_rad: Annotated[float, Meta(ge=1e-6)]
+    presliding_angle_rad: Annotated[float, Meta(ge=1e-6), usual(0.03)]
 
 
 class Curve(Struct, kw_only=True):
@@ -60,7 +70,7 @@ class Curve(Struct, kw_only=True):
     #: Thickness of the pads, friction material alone.
     pad_thickness_mm: Positive
     #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
-    coefficients: Annotated[tuple[float, ...], Meta(min_length=1, max_length=CURVE_TERMS)]
+    coefficients: Annotated[tuple[Annotated[float, usual(1e-3)], ...], Meta(min_length=1, max_length=CURVE_TERMS)]
 
     def __post_init__(self):
         if self.coefficients[0] <= 0.0:
@@ -73,7 +83,7 @@ class Stiffness(Struct, kw_only=True):
     #: One curve for each pad thickness that was measured, thinnest first.
     curves: Annotated[tuple[Curve, ...], Meta(min_length=1)]
     #: Time constant of the first-order dynamics.
-    relaxation_time_s: NonNegative
+    relaxation_time_s: Annotated[NonNegative, usual(0.03)]
     #: Largest force that the curves were identified for.
     maximum_force_N: Positive
 
@@ -81,17 +91,25 @@ class Stiffness(Struct, kw_only=True):
         thicknesses = [curve.pad_thickness_mm for curve in self.curves]
         if thicknesses != sorted(set(thicknesses)):
             raise ValueError("curves: expected ascending, distinct pad thicknesses")
+        between = np.linspace(*thickness_range(self.curves), 8 * len(thicknesses)) if len(thicknesses) > 1 else ()
+        for thickness in np.union1d(thicknesses, between):
+            reached = rising_force(curve_at(self.curves, thickness))
+            if reached < self.maximum_force_N:
+                raise ValueError(
+                    f"curves: with pads of {thickness:g} mm the force stops rising at {reached:.0f} N, "
+                    f"below maximum_force_N ({self.maximum_force_N:g})"
+                )
 
 
 class Contact(Struct, kw_only=True):
     """Where the pads touch."""
 
     #: Motor angle from the released position to contact.
-    clearance_rad: NonNegative
+    clearance_rad: Annotated[NonNegative, usual(10.0)]
     #: Its standard deviation at power-on.
     clearance_sigma_rad: Positive
     #: Random walk of the contact angle, by wear and heat.
-    walk_rad_per_sqrt_s: NonNegative
+    walk_rad_per_sqrt_s: Annotated[NonNegative, usual(1e-4)]
 
 
 class Noise(Struct, kw_only=True):
@@ -100,7 +118,7 @@ class Noise(Struct, kw_only=True):
     #: Error of the stiffness path that does not grow with force.
     stiffness_N: Positive
     #: Error of the stiffness path that grows with force, as a share of it.
-    stiffness_relative: NonNegative
+    stiffness_relative: Annotated[NonNegative, usual(0.01)]
     #: Time over which the stiffness path's error stays the same.
     stiffness_correlation_s: Positive
     #: Noise of the current.
@@ -110,9 +128,9 @@ class Noise(Struct, kw_only=True):
     #: White noise of the motor speed.
     speed_rad_per_s: Positive
     #: Error of the friction state in the middle of a reversal, as a share of full friction.
-    presliding: NonNegative
+    presliding: Annotated[NonNegative, usual(0.1)]
     #: Relative error of the torque path that stays.
-    torque_relative: NonNegative
+    torque_relative: Annotated[NonNegative, usual(0.05)]
 
 
 class Pad(Struct, kw_only=True):
@@ -125,21 +143,21 @@ class Pad(Struct, kw_only=True):
     #: Heat conductivity k0 at 20 degC.
     conductivity_W_per_mK: Positive
     #: Its relative rise with temperature.
-    conductivity_rise_per_K: float = 0.0
+    conductivity_rise_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Specific heat C0 at 20 degC.
     specific_heat_J_per_kgK: Positive
     #: Its relative rise with temperature.
-    specific_heat_rise_per_K: float = 0.0
+    specific_heat_rise_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Share of the friction power that enters the inner pad directly (thesis p).
-    inner_heat_share: Share
+    inner_heat_share: Annotated[Share, usual(0.04)]
     #: Share of the friction power that enters the outer pad directly.
-    outer_heat_share: Share
+    outer_heat_share: Annotated[Share, usual(0.04)]
     #: Between pad surface and disc while they touch.
-    contact_conductance_W_per_m2K: NonNegative
+    contact_conductance_W_per_m2K: Annotated[NonNegative, usual(1000.0)]
     #: Between pad surface and disc when the brake is released.
-    gap_conductance_W_per_m2K: NonNegative
+    gap_conductance_W_per_m2K: Annotated[NonNegative, usual(300.0)]
     #: From the released pad surface to the air that the wheel stirs, per wheel speed.
-    surface_cooling_per_speed_J_per_rad_m2K: NonNegative = 0.0
+    surface_cooling_per_speed_J_per_rad_m2K: Annotated[NonNegative, usual(0.1)] = 0.0
     #: Between pad and the thermocouple on its backing plate.
     backplate_conductance_W_per_m2K: Positive
 
@@ -156,24 +174,28 @@ class Disc(Struct, kw_only=True):
     #: At which the pads' friction acts.
     effective_radius_m: Positive
     #: Loss to the air at standstill.
-    cooling_W_per_K: NonNegative
+    cooling_W_per_K: Annotated[NonNegative, usual(2.0)]
     #: Loss to the air per wheel speed.
-    cooling_per_speed_J_per_rad_K: NonNegative
+    cooling_per_speed_J_per_rad_K: Annotated[NonNegative, usual(0.4)]
     #: Area times emissivity; radiation follows the fourth power of temperature.
-    radiating_area_m2: NonNegative = 0.0
+    radiating_area_m2: Annotated[NonNegative, usual(0.1)] = 0.0
 
 
 class FrictionTable(Struct, kw_only=True):
     """Pad-on-disc friction coefficient for service without a brake torque sensor (thesis 8.5)."""
 
     #: Clamp forces of the table's grid.
-    force_N: Annotated[tuple[float, ...], Meta(min_length=FORCE_GRID, max_length=FORCE_GRID)]
+    force_N: Annotated[tuple[Annotated[float, usual(1000.0)], ...], Meta(min_length=FORCE_GRID, max_length=FORCE_GRID)]
     #: Disc speeds of the grid.
-    disc_speed_rad_per_s: Annotated[tuple[float, ...], Meta(min_length=SPEED_GRID, max_length=SPEED_GRID)]
+    disc_speed_rad_per_s: Annotated[
+        tuple[Annotated[float, usual(10.0)], ...], Meta(min_length=SPEED_GRID, max_length=SPEED_GRID)
+    ]
     #: Pad surface temperatures of the grid.
-    surface_temperature_C: Annotated[tuple[float, ...], Meta(min_length=TEMPERATURE_GRID, max_length=TEMPERATURE_GRID)]
+    surface_temperature_C: Annotated[
+        tuple[Annotated[float, usual(100.0)], ...], Meta(min_length=TEMPERATURE_GRID, max_length=TEMPERATURE_GRID)
+    ]
     #: coefficient[force][speed][temperature]
-    coefficient: tuple[tuple[tuple[Share, ...], ...], ...]
+    coefficient: tuple[tuple[tuple[Annotated[Share, usual(0.4)], ...], ...], ...]
 
     def __post_init__(self):
         for name in ("force_N", "disc_speed_rad_per_s", "surface_temperature_C"):
@@ -190,11 +212,11 @@ class Softening(Struct, kw_only=True):
     that at which the curves were identified (thesis 8.4)."""
 
     #: Mean pad temperature at which the curves were identified.
-    reference_C: float = 20.0
+    reference_C: Annotated[float, usual(100.0)] = 20.0
     #: Loss of stiffness per kelvin now.
-    per_K: float = 0.0
+    per_K: Annotated[float, usual(5e-4)] = 0.0
     #: Loss of stiffness per kelvin of the rise's history.
-    history_per_K: float = 0.0
+    history_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Time constant of that history.
     history_time_s: Positive = 1000.0
 
@@ -216,21 +238,21 @@ class Adaptation(Struct, kw_only=True):
     #: Whether training is asked for and learned from at all.
     enabled: bool = True
     #: Lowest ambient temperature at which training teaches something.
-    minimum_ambient_C: float = -10.0
+    minimum_ambient_C: Annotated[float, usual(100.0)] = -10.0
     #: Highest such ambient temperature.
-    maximum_ambient_C: float = 45.0
+    maximum_ambient_C: Annotated[float, usual(100.0)] = 45.0
     #: Largest rise of the pads over ambient at which training teaches something.
     maximum_rise_K: Positive = 25.0
-    #: Clamp force up to which training motion is asked for.
-    high_force_N: Positive = 18000.0
+    #: Clamp force up to which training motion is asked for; left out, 18 kN or 60 % of the largest force, what is less.
+    high_force_N: Positive | None = None
     #: Share of that force that must be reached.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
     #: Amplitude of the small fast sinusoid on top.
-    dither_amplitude_rad: NonNegative = 0.9
+    dither_amplitude_rad: Annotated[NonNegative, usual(1.0)] = 0.9
     #: Its frequency.
     dither_frequency_Hz: Positive = 5.0
     #: Standing quietly with the park brake applied before training is asked for.
-    settling_time_s: NonNegative = 5.0
+    settling_time_s: Annotated[NonNegative, usual(5.0)] = 5.0
     #: Waiting for the motion that was asked for.
     answer_time_s: Positive = 10.0
     #: Longest training.
@@ -246,13 +268,17 @@ class Adaptation(Struct, kw_only=True):
     #: Largest change of the clearance, for one training.
     clearance_change_rad: Positive = 5.0
     #: Friction torque over clamp torque that a gear can have.
-    maximum_friction_share: Share = 0.6
+    maximum_friction_share: Annotated[Share, usual(0.5)] = 0.6
     #: Largest standard deviation of the learned force.
     maximum_sigma_N: Positive = 200.0
     #: Largest RMS difference of the pairs of passes from the learned curve, as a share of the largest force.
     pairs_difference: Positive = 0.04
     #: Relative standard deviation of torque constant and gear gain: an error that training cannot see.
-    torque_constant_relative: NonNegative = 0.002
+    torque_constant_relative: Annotated[NonNegative, usual(0.002)] = 0.002
+
+    def __post_init__(self):
+        if self.minimum_ambient_C >= self.maximum_ambient_C:
+            raise ValueError("maximum_ambient_C: expected more than minimum_ambient_C")
 
 
 class Source(Struct, kw_only=True):
@@ -318,37 +344,23 @@ class Calibration(Struct, kw_only=True):
                     )
             if missing := bounds.keys() - values.keys():
                 faults.append(f"effects.{name}: missing {', '.join(sorted(missing))}")
+        try:
+            curve_at(self.stiffness.curves, self.pad_thickness_mm)
+        except InputError as error:
+            faults.append(str(error))
+        if self.training_force_N > self.stiffness.maximum_force_N:
+            faults.append(
+                f"adaptation.high_force_N: {self.training_force_N:g} exceeds stiffness.maximum_force_N "
+                f"({self.stiffness.maximum_force_N:g})"
+            )
         if faults:
             raise ValueError("\n".join(faults))
 
-
-def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
-    """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
-
-    The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
-    nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
-
-    Raises:
-        InputError: the thickness is too far outside of what was measured.
-    """
-    table = np.zeros((len(curves), CURVE_TERMS))
-    for row, curve in enumerate(curves):
-        table[row, : len(curve.coefficients)] = curve.coefficients
-    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
-    if len(curves) == 1:
-        return table[0]
-    low, high = thicknesses[0], thicknesses[-1]
-    margin = 0.5 * np.diff(thicknesses)[[0, -1]]
-    if not low - margin[0] <= pad_thickness_mm <= high + margin[1]:
-        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured {low} to {high} mm")
-    upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
-    share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
-    below, above = table[upper - 1], table[upper]
-    if np.all(below * above > 0.0) or np.all((below * above > 0.0) | ((below == 0.0) & (above == 0.0))):
-        inverse = np.divide(1.0, below, out=np.zeros_like(below), where=below != 0.0) * (1.0 - share)
-        inverse += np.divide(1.0, above, out=np.zeros_like(above), where=above != 0.0) * share
-        return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse != 0.0)
-    return below + share * (above - below)
+    @property
+    def training_force_N(self) -> float:
+        """Clamp force up to which training motion is asked for."""
+        share_of_maximum = _TRAINING_SHARE * self.stiffness.maximum_force_N
+        return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
 
 
 def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:

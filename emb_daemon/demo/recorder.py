@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_daemon.estimator.records import INVALID
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
-from emb_daemon.wire.e2e import COUNTER_MODULO
+from emb_daemon.wire.contract import INVALID
+from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, default_layout
 
@@ -91,7 +91,7 @@ class Recorder:
     def status(self, row: int) -> int:
         """Status of the clamp force as last heard, 15 before."""
         data = self.latest.get(int(self._ids[CLAMP_FORCE, CORNERS.index(self.corners[row])]))
-        return 15 if data is None else data >> 12 & 0xF
+        return 15 if data is None else int(status_of(np.uint64(data)))
 
     def progress(self, row: int) -> float:
         """Progress of adaptation in percent while the daemon asks for training motion, NaN otherwise."""
@@ -113,7 +113,7 @@ class Recorder:
         known = (answered < COUNTER_MODULO) & (age <= np.minimum(newest, _LATEST_CYCLES))
         known &= self.sent_ns[np.where(known, newest - age, 0)] > 0
         frames, at = frames[known], (newest - age)[known]
-        status = (frames["data"] >> np.uint64(12) & np.uint64(0xF)).astype(np.int64)
+        status = status_of(frames["data"]).astype(np.int64)
         return frames, at, status, 1e-9 * (frames["time_ns"] - self.sent_ns[at])
 
     def compare(self, row: int) -> Comparison:

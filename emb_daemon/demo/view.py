@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.estimator.records import MODES, REASONS, SOURCES
-from emb_daemon.plant.records import PARK_RELEASED
+from emb_daemon.wire.contract import MODES, PARK_RELEASED, SOURCES, reason_words
 from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
@@ -66,7 +65,7 @@ def _remark(recorder: Recorder, row: int) -> str:
         return f"adapting, {progress:.0f} %"
     if math.isnan(reasons):
         return ""
-    return ", ".join(text for bit, text in enumerate(REASONS) if int(reasons) >> bit & 1)
+    return ", ".join(reason_words(reasons))
 
 
 def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:

@@ -4,11 +4,11 @@ import numpy as np
 
 from emb_daemon.diagnose.channels import Bench, wheel_angle
 from emb_daemon.offline import estimate
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
 _APPLIED_N = 150.0
-_CYCLE_S = 0.004
 
 
 def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
@@ -31,7 +31,7 @@ def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
             "disc_angle": np.mod(wheel_angle(samples), 2.0 * np.pi),
             "motor_angle": samples["angle"] - samples["angle"][0],
             "motor_speed": samples["speed"],
-            "motor_acceleration": _around(samples["speed"], np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])) / (6.0 * _CYCLE_S),
+            "motor_acceleration": _around(samples["speed"], np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])) / (6.0 * CYCLE_S),
             "current": _around(np.nan_to_num(samples["current_q"]), np.full(6, 0.5)),
             "clamp_force": force,
             "pad_temperature": np.nan_to_num(estimates["mean"].mean(axis=1), nan=20.0),

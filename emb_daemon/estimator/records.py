@@ -7,37 +7,24 @@ from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
-
-#: What the estimate rests on (wire: ForceSource).
-FUSED, STIFFNESS_ONLY, TORQUE_ONLY, PREDICTED, INVALID = 0, 1, 2, 3, 15
-SOURCES = {FUSED: "fused", STIFFNESS_ONLY: "stiffness", TORQUE_ONLY: "torque", PREDICTED: "predicted", INVALID: "invalid"}
-
-#: Mode of a corner (wire: Mode).
-INIT, RUNNING, ADAPTING, DEGRADED, FAULT = range(5)
-MODES = ("init", "running", "adapting", "degraded", "fault")
-
-#: Bits of DegradedReasons, as the DBC documents them.
-RESOLVER_LOST = 1 << 0
-CURRENT_LOST = 1 << 1
-THERMOCOUPLE_LOST = 1 << 2
-WHEEL_SPEED_LOST = 1 << 3
-WHEEL_PULSE_LOST = 1 << 4
-VEHICLE_STATUS_LOST = 1 << 5
-E2E_ERROR = 1 << 6
-OUT_OF_RANGE = 1 << 7
-STUCK = 1 << 8
-PATHS_DISAGREE = 1 << 9
-CONTACT_UNCERTAIN = 1 << 10
-TEMPERATURE_UNCERTAIN = 1 << 11
-BUS_DISTURBED = 1 << 12
-DEADLINE_MISSED = 1 << 13
-OUTSIDE_RANGE = 1 << 14
-SECOND_SENDER = 1 << 15
-REASONS = (
-    "resolver lost", "current lost", "thermocouple lost", "wheel speed lost", "wheel pulse lost", "vehicle status lost",
-    "E2E error", "signal out of range", "signal stuck", "paths disagree", "contact angle uncertain",
-    "pad temperature uncertain", "bus disturbed", "deadline missed", "outside calibrated range", "second sender",
-)  # fmt: skip
+from emb_daemon.wire.contract import (  # noqa: F401
+    ADAPTING,
+    CONTACT_UNCERTAIN,
+    DEGRADED,
+    FAULT,
+    FUSED,
+    INIT,
+    INVALID,
+    OUT_OF_RANGE,
+    OUTSIDE_RANGE,
+    PATHS_DISAGREE,
+    PREDICTED,
+    RUNNING,
+    STIFFNESS_ONLY,
+    STUCK,
+    TEMPERATURE_UNCERTAIN,
+    TORQUE_ONLY,
+)
 
 CURVE_TERMS = 5
 FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID = 6, 6, 8

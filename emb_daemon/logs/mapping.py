@@ -5,7 +5,6 @@ on the wire as our messages with counters that count resolver cycles, so that th
 way into the estimator.
 """
 
-import math
 from pathlib import Path
 from typing import Annotated
 
@@ -18,31 +17,18 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.read import read_frames
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+from emb_daemon.wire.units import UNITS
 
-CYCLE_NS = 4_000_000
 #: Deviation of a foreign rig's sampling period from ours up to which its samples are taken as they are.
 _SAME_PERIOD = 0.05
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
 _CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
-
-#: Unit: (the SI-like unit of the same quantity that our DBC uses, factor, offset); ours = factor * theirs + offset.
-_UNITS = {
-    "rad": ("rad", 1.0, 0.0), "deg": ("rad", math.pi / 180.0, 0.0), "°": ("rad", math.pi / 180.0, 0.0),
-    "mrad": ("rad", 1e-3, 0.0), "rev": ("rad", 2.0 * math.pi, 0.0), "turn": ("rad", 2.0 * math.pi, 0.0),
-    "rad/s": ("rad/s", 1.0, 0.0), "deg/s": ("rad/s", math.pi / 180.0, 0.0), "°/s": ("rad/s", math.pi / 180.0, 0.0),
-    "rpm": ("rad/s", math.pi / 30.0, 0.0), "1/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
-    "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
-    "degC": ("degC", 1.0, 0.0), "°C": ("degC", 1.0, 0.0), "C": ("degC", 1.0, 0.0), "deg C": ("degC", 1.0, 0.0),
-    "K": ("degC", 1.0, -273.15), "degF": ("degC", 5.0 / 9.0, -160.0 / 9.0), "°F": ("degC", 5.0 / 9.0, -160.0 / 9.0),
-    "m/s": ("m/s", 1.0, 0.0), "km/h": ("m/s", 1.0 / 3.6, 0.0), "kph": ("m/s", 1.0 / 3.6, 0.0), "mph": ("m/s", 0.44704, 0.0),
-    "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "kNm": ("Nm", 1e3, 0.0),
-    "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
-}  # fmt: skip
 
 
 class Mapped(Struct, kw_only=True):
@@ -180,9 +166,9 @@ class Mapping:
         except KeyError:
             return self._fault(name, f"{mapped.signal}: the rig's DBC has no such message and signal")
         unit = (found.unit or "" if mapped.unit is None else mapped.unit).strip()
-        if unit not in _UNITS:
-            return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {', '.join(_UNITS)[:-2]}")
-        target, factor, shift = _UNITS[unit]
+        if unit not in UNITS:
+            return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {', '.join(UNITS)[:-2]}")
+        target, factor, shift = UNITS[unit]
         if target != (ours.unit or ""):
             hint = "" if unit else "; state `unit:`"
             return self._fault(

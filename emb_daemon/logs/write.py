@@ -8,9 +8,9 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import MODES, REASONS, SOURCES
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import References
+from emb_daemon.wire.contract import MODES, SOURCES, reason_words
 from emb_daemon.wire.layout import CORNERS
 
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
@@ -70,8 +70,7 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
         names[code] = name
     columns["source"] = names[e["source"]].astype(str)
     raised, codes = np.unique(e["reasons"], return_inverse=True)
-    texts = ["; ".join(text for bit, text in enumerate(REASONS) if int(value) >> bit & 1) for value in raised]
-    columns["reasons"] = np.array(texts)[codes]
+    columns["reasons"] = np.array(["; ".join(reason_words(value)) for value in raised])[codes]
     return columns
 
 

@@ -1,20 +1,27 @@
 """Broadcasts off the bus: last values, gaps in the E2E counters, and the forces of the last minute."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.estimator.records import MODES, REASONS, SOURCES
-from emb_daemon.wire.e2e import COUNTER_MODULO, crc
+from emb_daemon.wire.contract import (
+    MODES,
+    REQUESTS,
+    RESULTS,
+    SOURCES,
+    STATUS_DEGRADED,
+    STATUS_NOT_AVAILABLE,
+    STATUSES,
+    reason_words,
+)
+from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
 from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP, default_layout
 
 HISTORY_S = 60
 SECOND_NS = 1_000_000_000
-STATUSES = {0: "ok", 1: "degraded", 2: "fault", 15: "not available"}
-REQUESTS = ("none", "run", "abort", "?")
-RESULTS = {0: "none", 1: "accepted", 2: "rejected", 3: "aborted"}
 
 
 @dataclass
@@ -29,7 +36,7 @@ class Stream:
 
     cycle_ns: int
     values: list[float] = field(default_factory=list)
-    status: int = 15
+    status: int = STATUS_NOT_AVAILABLE
     counter: int = -1
     time_ns: int = 0
     received: int = 0
@@ -39,7 +46,7 @@ class Stream:
     @property
     def usable(self) -> bool:
         """Whether the sender says that the values may be used."""
-        return self.status <= 1
+        return self.status <= STATUS_DEGRADED
 
     def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
         """Count a frame with a good CRC; returns whether its values are new."""
@@ -104,11 +111,10 @@ class Corner:
         """Time since any good frame, s."""
         return max(0.0, 1e-9 * (now_ns - max(stream.time_ns for stream in self.streams)))
 
-    def reasons(self) -> list[str]:
+    def reasons(self) -> tuple[str, ...]:
         """Why the estimate is degraded, in words."""
         status = self.streams[ESTIMATOR_STATUS]
-        bits = int(status.values[3]) if status.values else 0
-        return [text for bit, text in enumerate(REASONS) if bits >> bit & 1]
+        return reason_words(status.values[3]) if status.values else ()
 
     def state(self, now_ns: int) -> dict:
         """Everything known, for scripts. None: not heard yet, or the sender says not to use it."""
@@ -123,10 +129,10 @@ class Corner:
             "status": STATUSES.get(force.status, "?"),
             "clamp_force_kN": value(force, 0, 3),
             "clamp_force_sigma_kN": value(force, 1, 3),
-            "source": SOURCES.get(int(force.values[3]), "?") if force.values else None,
+            "source": _word(SOURCES, force, 3),
             "input_age_ms": int(force.values[4]) if force.values else None,
-            "mode": mode_name(status),
-            "reasons": self.reasons(),
+            "mode": _word(MODES, status, 0),
+            "reasons": list(self.reasons()),
             "stiffness_factor": value(status, 1, 4),
             "contact_angle_rad": value(status, 2, 1),
             "inner_surface_C": value(heat, 0, 2),
@@ -134,9 +140,9 @@ class Corner:
             "outer_surface_C": value(heat, 2, 2),
             "outer_mean_C": value(heat, 3, 2),
             "adaptation": {
-                "request": REQUESTS[int(request.values[0])] if request.values else None,
+                "request": _word(REQUESTS, request, 0),
                 "progress_percent": int(request.values[1]) if request.values else None,
-                "result": RESULTS.get(int(request.values[2]), "?") if request.values else None,
+                "result": _word(RESULTS, request, 2),
             },
             "forces_per_s": self.rate_Hz(now_ns),
             "received": sum(stream.received for stream in self.streams),
@@ -146,12 +152,12 @@ class Corner:
         }
 
 
-def mode_name(status: Stream) -> str | None:
-    """The mode in words, None before it was heard."""
-    if not status.values:
+def _word(words: Sequence[str] | Mapping[int, str], stream: Stream, column: int) -> str | None:
+    """A code in words: None before it was heard, ``?`` if the contract has no such code."""
+    if not stream.values:
         return None
-    mode = int(status.values[0])
-    return MODES[mode] if mode < len(MODES) else "?"
+    known = words if isinstance(words, Mapping) else dict(enumerate(words))
+    return known.get(int(stream.values[column]), "?")
 
 
 class Listener:
@@ -186,12 +192,13 @@ class Listener:
                 continue
             kind, row = place
             stream = self.corners[row].streams[kind]
-            counter = data >> 8 & 0xF
-            if length != 8 or counter >= COUNTER_MODULO or int(crc(can_id, np.uint64(data))) != data & 0xFF:
+            payload = np.uint64(data)
+            counter = int(counter_of(payload))
+            if length != 8 or counter >= COUNTER_MODULO or crc(can_id, payload) != data & 0xFF:
                 stream.damaged += 1
                 continue
             values = [_physical(data, signal) for signal in self._signals[kind]]
-            fresh = stream.take(values, data >> 12 & 0xF, counter, time_ns)
+            fresh = stream.take(values, int(status_of(payload)), counter, time_ns)
             if fresh and kind == CLAMP_FORCE:
                 self.corners[row].remember(values[0] if stream.usable else math.nan, time_ns)
 

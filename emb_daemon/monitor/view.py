@@ -5,16 +5,16 @@ import math
 from rich.console import Group
 from rich.text import Text
 
-from emb_daemon.estimator.records import MODES, SOURCES
-from emb_daemon.monitor.listener import REQUESTS, RESULTS, STATUSES, Corner, Listener, mode_name
-from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP
+from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.wire.contract import MODES
+from emb_daemon.wire.layout import CORNERS, PAD_TEMP
 
 #: Without a frame for this long the values on the screen are history.
 _SILENT_S = 0.5
 _LINES_PER_CORNER = 5
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MODE_COLOURS = dict(zip(MODES, ("dim", "green", "cyan", "yellow", "bold red"), strict=True))
-_STATUS_COLOURS = {0: "green", 1: "yellow", 2: "bold red", 15: "dim"}
+_STATUS_COLOURS = {"ok": "green", "degraded": "yellow", "fault": "bold red", "not available": "dim"}
 _MISSING = "–"
 
 
@@ -54,30 +54,24 @@ def _two_lines(texts: list[str], width: int) -> list[str]:
     return [*lines, ""][:2]
 
 
-def _adaptation(corner: Corner) -> Text:
-    request = corner.streams[ADAPT_REQUEST]
-    if not request.values:
+def _adaptation(request: str | None, progress_percent: int | None, result: str | None) -> Text:
+    if request == "run":
+        done = round(progress_percent / 20)
+        return Text(f"adapting {'█' * done}{'·' * (5 - done)} {progress_percent} %", style="cyan")
+    if result in (None, "none"):
         return Text("")
-    asked, progress, result = (int(value) for value in request.values[:3])
-    if REQUESTS[asked] == "run":
-        done = round(progress / 20)
-        return Text(f"adapting {'█' * done}{'·' * (5 - done)} {progress} %", style="cyan")
-    if RESULTS.get(result, "?") == "none":
-        return Text("")
-    return Text(f"adaptation {RESULTS.get(result, '?')}", style="green" if result == 1 else "yellow")
+    return Text(f"adaptation {result}", style="green" if result == "accepted" else "yellow")
 
 
 def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
-    force, heat, status = (corner.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS))
     state = corner.state(now_ns)
     silent = corner.silent_s(now_ns)
 
     first = Text(f"{corner.name} ", style="bold")
     first.append(f"{_number(state['clamp_force_kN'], 2):>6} kN", style="bold")
     first.append(f" ± {_number(state['clamp_force_sigma_kN'], 2):<5}")
-    source = SOURCES.get(int(force.values[3]), "?") if force.values else ""
-    first.append(f"{source:<10}")
-    mode = mode_name(status) or ""
+    first.append(f"{state['source'] or '':<10}")
+    mode = state["mode"] or ""
     first.append(f"{mode:<9}", style=_MODE_COLOURS.get(mode, ""))
     history = corner.forces_kN(now_ns)
     known = [value for value in history if not math.isnan(value)]
@@ -91,13 +85,13 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     for name, surface, mean in (("inner", "inner_surface_C", "inner_mean_C"), ("outer", "outer_surface_C", "outer_mean_C")):
         second.append(f"{name} pad {_number(state[surface], 0):>3}/{_number(state[mean], 0):>3} °C  ")
     factor, contact = _number(state["stiffness_factor"], 3), _number(state["contact_angle_rad"], 1)
-    second.append(f"stiffness {factor}  contact {contact} rad", style="dim" if not heat.usable else "")
+    second.append(f"stiffness {factor}  contact {contact} rad", style="" if corner.streams[PAD_TEMP].usable else "dim")
 
     third = Text("   ")
     if silent > _SILENT_S:
         third.append(f"SILENT for {silent:.0f} s; last values shown", style="bold red")
     else:
-        third.append(STATUSES.get(force.status, "?"), style=_STATUS_COLOURS.get(force.status, "red"))
+        third.append(state["status"], style=_STATUS_COLOURS.get(state["status"], "red"))
         if state["input_age_ms"]:
             third.append(f"  {state['input_age_ms']} ms old", style="yellow")
     third.append(f"  {state['forces_per_s']:.0f}/s  ")
@@ -105,7 +99,7 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     third.append("  ")
     third.append(f"{corner.damaged} damaged", style="red" if corner.damaged else "dim")
     third.append("  ")
-    third.append_text(_adaptation(corner))
+    third.append_text(_adaptation(**state["adaptation"]))
 
     reasons = [Text(f"   {line}", style="yellow") for line in _two_lines(state["reasons"], width - 4)]
     return [first, second, third, *reasons]

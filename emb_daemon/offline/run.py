@@ -11,11 +11,11 @@ What fits move are PARAMETERS; records are cheap, so that callers copy and chang
 
 import numpy as np
 
+from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import njit
-from emb_daemon.pipeline import answer
 
 #: The two force paths at each sample. ``force`` N by the stiffness path; ``torque`` N m left to the clamp force over the cycle
 #: that ends here (NaN where the current says nothing), its ``leverage`` m/rad, mean friction state over the cycle (-1 to 1)

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.wire.contract import CYCLE_NS
+
 #: Integration steps in one 4 ms cycle.
 SUBSTEPS = 16
-CYCLE_NS = 4_000_000
 SUBSTEP_S = 1e-9 * CYCLE_NS / SUBSTEPS
 #: Cells through one pad at most.
 CELLS = 30
@@ -212,9 +213,6 @@ PLANT_STATE = np.dtype(
 #: moving at ``rate`` rad/s) or FORCE (``target`` N).
 RELEASE, ANGLE, FORCE = range(3)
 COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=True)
-
-#: Wire values of ParkBrake.
-PARK_RELEASED, PARK_APPLIED, PARK_IN_TRANSITION = range(3)
 
 #: What the driver (or the rig) does for one cycle. ``wheel_speed`` rad/s prescribes the discs' speed as a rig's drive does,
 #: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.

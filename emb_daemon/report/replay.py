@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.estimator.records import MODES, REASONS, SOURCES
 from emb_daemon.offline.score import PATHS, figures, share_inside
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
+from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
 #: Shortest stretch that is still seen on the whole time axis, as a share of it; closer stretches are drawn as one.
 _SEEN = 1.0 / 1000.0
-_CYCLE_S = 0.004
 _BINS = 120
 #: More than the travel of any brake past contact.
 _TRAVEL_RAD = 100.0
@@ -41,7 +40,7 @@ def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.nd
     begin, end = time_s[np.flatnonzero(edges == 1)], time_s[np.flatnonzero(edges == -1) - 1]
     if not len(begin):
         return begin, end
-    least = max(_CYCLE_S, _SEEN * float(time_s[-1] - time_s[0]))
+    least = max(CYCLE_S, _SEEN * float(time_s[-1] - time_s[0]))
     apart = np.concatenate([[True], begin[1:] - end[:-1] > least])
     first = np.flatnonzero(apart)
     last = np.concatenate([first[1:] - 1, [len(begin) - 1]])

@@ -19,12 +19,13 @@ from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.errors import InputError
-from emb_daemon.estimator import records
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import compile_beside, njit
-from emb_daemon.pipeline import CYCLE_NS, LATE_CYCLES, Pipeline
+from emb_daemon.pipeline import LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.systemd import ServiceManager
+from emb_daemon.wire import contract
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, FRAME
 from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 
@@ -35,7 +36,7 @@ _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
-_OF_THE_LOOP = records.BUS_DISTURBED | records.DEADLINE_MISSED
+_OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
 
 def _date(_time_ns: int) -> str:
@@ -81,7 +82,7 @@ def _scan(estimates, count, receptions, arrivals, reported):
         if estimate.is_sample:
             base = CORNER_MESSAGES * corner
             arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
-        if estimate.is_sample and estimate.source == records.INVALID:
+        if estimate.is_sample and estimate.source == contract.INVALID:
             invalid += 1
         # What disturbs the loop is logged once, not for each corner.
         state = estimate.mode << 16 | estimate.reasons & ~_OF_THE_LOOP
@@ -115,7 +116,7 @@ class Daemon:
         self._stop = threading.Event()
         self._reload = threading.Event()
         self._reloaded: tuple[Setup, list] | None = None
-        self._disturbed_ns = dict.fromkeys((records.BUS_DISTURBED, records.DEADLINE_MISSED), -_SHOWN_NS)
+        self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
         self._arrivals = np.zeros(len(CORNERS), np.int64)
@@ -212,12 +213,12 @@ class Daemon:
 
     def _report(self, corner: int, state: int) -> None:
         mode, reasons = state >> 16, state & 0xFFFF
-        words = [text for bit, text in enumerate(records.REASONS) if reasons >> bit & 1]
-        amiss = mode in (records.DEGRADED, records.FAULT)
+        words = contract.reason_words(reasons)
+        amiss = mode in (contract.DEGRADED, contract.FAULT)
         level = 30 if amiss else 20
         # Bus and loop are reported once for all corners; here they are only referred to.
         none = "bus or loop" if amiss else "none"
-        fields = {"corner": CORNERS[corner], "mode": records.MODES[mode], "reasons": ", ".join(words) or none}
+        fields = {"corner": CORNERS[corner], "mode": contract.MODES[mode], "reasons": ", ".join(words) or none}
         log.log(level, "corner %(corner)s: %(mode)s (%(reasons)s)", fields, extra={"fields": fields})
 
     def _count(self, now_ns: int, pacer: Pacer) -> None:
@@ -226,18 +227,18 @@ class Daemon:
         self.ticks += 1
         if late >= 1.0:
             self.missed += math.floor(late)
-            self._disturb(records.DEADLINE_MISSED, now_ns)
+            self._disturb(contract.DEADLINE_MISSED, now_ns)
 
     def _disturb(self, reason: int, now_ns: int) -> None:
         if now_ns - self._disturbed_ns[reason] >= _SHOWN_NS:
-            log.warning("%s", records.REASONS[reason.bit_length() - 1], extra={"fields": {"reason": reason}})
+            log.warning("%s", contract.reason_words(reason)[0], extra={"fields": {"reason": reason}})
         self._disturbed_ns[reason] = now_ns
 
     def _watch_bus(self, frames: np.ndarray, now_ns: int) -> None:
         losses = (self._bus.dropped, self._bus.unsent)
         if losses != self._losses or self._bus.down or (len(frames) and np.any(frames["flags"] & ERROR)):
             self._losses = losses
-            self._disturb(records.BUS_DISTURBED, now_ns)
+            self._disturb(contract.BUS_DISTURBED, now_ns)
         bits = 0
         for reason, at in self._disturbed_ns.items():
             if now_ns - at < _SHOWN_NS:

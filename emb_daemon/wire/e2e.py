@@ -37,6 +37,18 @@ def crc(can_id, data):
 
 
 @njit
+def counter_of(data):
+    """Counter of payloads, integers or uint64 arrays."""
+    return (data >> np.uint64(8)) & np.uint64(0xF)
+
+
+@njit
+def status_of(data):
+    """Status of payloads, integers or uint64 arrays."""
+    return (data >> np.uint64(12)) & np.uint64(0xF)
+
+
+@njit
 def protect(can_id, payload, counter, status):
     """``payload`` (bits 16 to 63 set) with Status, Counter and CRC filled in, as an unsigned 64-bit integer."""
     data = np.uint64(payload) | (np.uint64(counter) << np.uint64(8)) | (np.uint64(status) << np.uint64(12))

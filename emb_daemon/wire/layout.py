@@ -12,6 +12,8 @@ import numpy as np
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_NS
+from emb_daemon.wire.units import conversion
 
 CORNERS = ("FL", "FR", "RL", "RR")
 
@@ -47,6 +49,11 @@ _SENT = (
     ("EMB_{}_AdaptRequest", ("Request", "Progress", "Result", "LowForce", "HighForce", "DitherAmplitude", "DitherFrequency")),
 )
 SENT_SIGNALS = 7
+
+#: Where AUTOSAR E2E profile 1A has its fields: first bit and length.
+_HEADER = {"CRC": (0, 8), "Counter": (8, 4), "Status": (12, 4)}
+#: Messages that the estimator counts its cycles by.
+_EVERY_CYCLE = ("_Resolver", "_Current", "_ClampForce")
 
 SIGNAL = np.dtype(
     [("start", "i8"), ("length", "i8"), ("signed", "i8"), ("factor", "f8"), ("offset", "f8"), ("low", "f8"), ("high", "f8")],
@@ -136,28 +143,68 @@ def load_database(path: Path):
         raise InputError(f"{path}: not a readable DBC: {str(error).splitlines()[0]}") from None
 
 
+def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> list[str]:
+    """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC.
+
+    Returns:
+        Faults: units that are missing, unknown or of another quantity.
+    """
+    faults = []
+    for column, name in zip(columns, names, strict=True):
+        unit, target = ((found.get_signal_by_name(name).unit or "").strip() for found in (message, expected))
+        try:
+            factor, offset = conversion(unit, target)
+        except InputError as error:
+            faults.append(f"{message.name}.{name}: {error}")
+            continue
+        column["factor"] *= factor
+        for field in ("offset", "low", "high"):
+            column[field] = factor * column[field] + offset
+    return faults
+
+
+def _frame_faults(message) -> list[str]:
+    """Deviations from what a DBC may not choose: classic frames with an E2E header, each at its cycle."""
+    faults = []
+    if message.frame_id > 0x7FF or message.is_extended_frame or message.length != 8:
+        faults.append(f"{message.name}: expected an 11-bit id and 8 bytes")
+    if not message.cycle_time:
+        faults.append(f"{message.name}: GenMsgCycleTime is missing")
+    elif message.name.endswith(_EVERY_CYCLE) and message.cycle_time * 1_000_000 != CYCLE_NS:
+        faults.append(f"{message.name}: GenMsgCycleTime is {message.cycle_time} ms; expected {CYCLE_NS // 1_000_000} ms")
+    for signal in message.signals:
+        place = (signal.start, signal.length)
+        if signal.name in _HEADER and place != _HEADER[signal.name]:
+            start, length = _HEADER[signal.name]
+            faults.append(f"{message.name}.{signal.name}: expected {length} bits from bit {start} (AUTOSAR E2E profile 1)")
+    return faults
+
+
 def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
     """The LAYOUT (shape (1,)) of the messages that concern ``corners``, all others being foreign.
 
+    Signals of a DBC of one's own are converted from its units into those of the shipped one.
+
     Raises:
-        InputErrors: the DBC lacks messages, signals or cycle times; every fault is listed.
+        InputErrors: the DBC lacks messages, signals, units or cycle times, or contradicts the contract; every fault is listed.
     """
+    shipped = load_database(resource("dbc/emb.dbc"))
+    database = load_database(path) if path else shipped
     path = path or resource("dbc/emb.dbc")
-    database = load_database(path)
     layout, faults = np.zeros(1, LAYOUT), []
     record = layout[0]
     record["slot"] = FOREIGN
 
     def fill(message, names, columns, count_of, where):
+        found = next((known for known in database.messages if known.name == message), None)
+        here = _frame_faults(found) if found else []
         try:
             signals = signal_columns(database, message, names)
-            found = database.get_message_by_name(message)
-            if found.frame_id > 0x7FF or found.length != 8:
-                raise InputErrors([f"{message}: expected an 11-bit id and 8 bytes"])
-            if not found.cycle_time:
-                raise InputErrors([f"{message}: GenMsgCycleTime is missing"])
+            here += _convert(signals, names, found, shipped.get_message_by_name(message))
         except InputErrors as error:
-            faults.extend(f"{path}: {fault}" for fault in error.faults)
+            here += error.faults
+        if here:
+            faults.extend(f"{path}: {fault}" for fault in here)
             return None
         columns[where][: len(names)] = signals
         count_of[where] = len(names)

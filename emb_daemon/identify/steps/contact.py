@@ -6,7 +6,7 @@ from emb_daemon.calibration.types import Contact
 from emb_daemon.identify.dynamics import simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.pipeline import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Samples over which one contact angle is estimated: ten seconds, in which it hardly wanders.
 _ROWS = 2500

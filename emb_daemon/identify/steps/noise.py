@@ -17,8 +17,8 @@ from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
 from emb_daemon.offline.score import rmse
-from emb_daemon.pipeline import CYCLE_S
 from emb_daemon.report import Page
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3

@@ -23,8 +23,8 @@ from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.run import run_paths
 from emb_daemon.offline.score import rmse
-from emb_daemon.pipeline import CYCLE_S
 from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Parameters in the order of every covariance.
 NAMES = ("torque_constant_Nm_per_A", "inertia_kg_m2", "offset_Nm", "load_m_per_rad", "presliding_angle_rad")

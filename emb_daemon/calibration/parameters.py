@@ -1,0 +1,240 @@
+"""The calibration as the one parameter space: whatever fits, learns or perturbs moves numbers by their keys.
+
+A key is the dotted path of a number in the calibration file: ``motor.torque_constant_Nm_per_A``,
+``stiffness.curves[0].coefficients[1]``, ``effects.second_relaxation.share``. Records are only ever derived from a
+calibration (`types.to_parameters`); what adaptation learns is a partial calibration, ``{key: value}``, applied by `moved`.
+"""
+
+import copy
+import difflib
+import math
+import re
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, reduce
+from typing import Any
+
+import msgspec
+
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.effects import REGISTRY
+from emb_daemon.errors import InputError, InputErrors
+
+#: Step of a numerical derivative over the size of what moves: errors of rounding and of curvature are both far below
+#: the residuals of a fit, and few samples cross a switch such as contact or a reversal.
+_STEP = 1e-3
+
+#: Units of keys, by the ending that states them.
+_UNITS = {
+    "Nm_per_A": "N·m/A",
+    "kg_m2": "kg·m²",
+    "m_per_rad": "m/rad",
+    "rad_per_s": "rad/s",
+    "rad_per_sqrt_s": "rad/√s",
+    "kg_per_m3": "kg/m³",
+    "W_per_mK": "W/(m·K)",
+    "W_per_K": "W/K",
+    "W_per_m2K": "W/(m²·K)",
+    "J_per_K": "J/K",
+    "J_per_kgK": "J/(kg·K)",
+    "J_per_rad_K": "J/(rad·K)",
+    "J_per_rad_m2K": "J/(rad·m²·K)",
+    "per_K": "1/K",
+    "Nm": "N·m",
+    "Hz": "Hz",
+    "mm": "mm",
+    "m2": "m²",
+    "rad": "rad",
+    "A": "A",
+    "C": "°C",
+    "K": "K",
+    "N": "N",
+    "m": "m",
+    "s": "s",
+}
+_UNIT = re.compile(r"(?:^|_)(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")(?:\[\d+\])*$")
+_PART = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
+
+_EFFECTS = {effect.name: {parameter.name: parameter for parameter in effect.parameters} for effect in REGISTRY}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a calibration.
+
+    Attributes:
+        key: its path in the file.
+        value: as it stands, in ``unit``; that of an effect which is switched off is what switching it on would set.
+        step: for numerical derivatives, in ``unit``; positive at any value, zero included.
+        relative: whether the step is a share of the value; it is not where the value is small beside its usual size, nor
+            for positions and effects, whose zero is a value like any other.
+        low, high: bounds of what the file may state, in ``unit``.
+    """
+
+    key: str
+    value: float
+    step: float
+    relative: bool
+    low: float
+    high: float
+    unit: str
+
+
+def parameter(calibration: Calibration, key: str) -> Parameter:
+    """What is known of a key.
+
+    Raises:
+        InputError: no number has that key; names near ones.
+    """
+    value = value_of(calibration, key)
+    parts = _parts(key)
+    if parts[0] == "effects":
+        entry = _EFFECTS[parts[1]][parts[2]]
+        return Parameter(key, value, _STEP * (abs(entry.prior) or 1.0), False, entry.low, entry.high, entry.unit)
+    low, high, usual = _bounds(tuple(part for part in parts if isinstance(part, str)))
+    if key.endswith("coefficients[0]"):
+        low = math.nextafter(0.0, math.inf)  # Force rises from contact.
+    relative = abs(value) >= usual
+    return Parameter(key, value, _STEP * (abs(value) if relative else usual), relative, low, high, _unit(key))
+
+
+def value_of(calibration: Calibration, key: str) -> float:
+    """The number at a key, in the key's unit.
+
+    Raises:
+        InputError: no number has that key; names near ones.
+    """
+    found: Any = calibration
+    try:
+        parts = _parts(key)
+        for depth, part in enumerate(parts):
+            if depth == 1 and parts[0] == "effects" and part not in found:
+                found = _neutral(part)
+            else:
+                found = getattr(found, part) if isinstance(found, msgspec.Struct) else found[part]
+    except (AttributeError, IndexError, KeyError, TypeError):
+        found = None
+    if type(found) is not float:
+        raise InputError(f"{key}: no number of the calibration{_near(calibration, key)}")
+    return found
+
+
+def moved(calibration: Calibration, values: Mapping[str, float], *, checked: bool = False) -> Calibration:
+    """The calibration with the numbers at ``values``' keys set, in the keys' units.
+
+    An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where
+    ``values`` does not set them. Unless ``checked``, bounds and cross-checks are left to the caller: a fit asks often.
+
+    Raises:
+        InputError: no number has a key; names near ones.
+        InputErrors: ``checked``, and the result is not what a calibration file may hold; lists every fault.
+    """
+    for key in values:
+        value_of(calibration, key)
+    changed = reduce(lambda result, key: _set(result, _parts(key), float(values[key])), values, calibration)
+    return _revalidated(changed, values) if checked else changed
+
+
+def keys(calibration: Calibration) -> list[str]:
+    """Keys of every number that the calibration states, in the file's order."""
+    found: list[str] = []
+
+    def walk(value: Any, path: str) -> None:
+        if isinstance(value, msgspec.Struct):
+            for name in value.__struct_fields__:
+                walk(getattr(value, name), f"{path}.{name}" if path else name)
+        elif isinstance(value, tuple):
+            for index, item in enumerate(value):
+                walk(item, f"{path}[{index}]")
+        elif isinstance(value, dict):
+            for name, item in value.items():
+                walk(item, f"{path}.{name}")
+        elif type(value) is float:
+            found.append(path)
+
+    walk(msgspec.structs.replace(calibration, provenance=None), "")
+    return found
+
+
+@cache
+def _parts(key: str) -> tuple[str | int, ...]:
+    """Names and indices of a key; empty for what is no key."""
+    parts: list[str | int] = []
+    for piece in key.split("."):
+        match = _PART.fullmatch(piece)
+        if match is None:
+            return ()
+        parts += [match[1], *(int(index) for index in re.findall(r"\d+", match[2]))]
+    return () if parts[0] == "provenance" else tuple(parts)
+
+
+def _near(calibration: Calibration, key: str) -> str:
+    effects = [f"effects.{effect}.{name}" for effect, parameters in _EFFECTS.items() for name in parameters]
+    near = difflib.get_close_matches(key, dict.fromkeys([*keys(calibration), *effects]), 3, 0.6)
+    return f"; near are {', '.join(near)}" if near else ""
+
+
+def _neutral(effect: str) -> dict[str, float]:
+    """Parameters of an effect that does nothing yet."""
+    return {
+        parameter.name: float(min(max(parameter.prior if parameter.starts else 0.0, parameter.low), parameter.high))
+        for parameter in _EFFECTS[effect].values()
+    }
+
+
+def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
+    """A copy of ``node`` with the number at ``parts`` below it set; what lies beside the path is shared."""
+    if not parts:
+        return value
+    part, rest = parts[0], parts[1:]
+    if isinstance(node, msgspec.Struct):
+        # No __post_init__: validity as a whole is for `_revalidated` to judge.
+        result = copy.copy(node)
+        msgspec.structs.force_setattr(result, part, _set(getattr(node, part), rest, value))
+        return result
+    if isinstance(node, dict):
+        return {**node, part: _set(node[part] if part in node else _neutral(part), rest, value)}
+    return (*node[:part], _set(node[part], rest, value), *node[part + 1 :])
+
+
+def _revalidated(calibration: Calibration, values: Mapping[str, float]) -> Calibration:
+    faults = []
+    for key, value in values.items():
+        limits = parameter(calibration, key)
+        if not limits.low <= value <= limits.high or not math.isfinite(value):
+            faults.append(f"{key}: {value} outside [{limits.low}, {limits.high}] {limits.unit}")
+    if faults:
+        raise InputErrors(faults)
+    try:
+        return msgspec.convert(msgspec.to_builtins(calibration), Calibration)
+    except msgspec.ValidationError as error:
+        raise InputErrors(str(error).splitlines()) from None
+
+
+@cache
+def _bounds(names: tuple[str, ...]) -> tuple[float, float, float]:
+    """(lowest, highest, usual size) of a number by the names on its path, from the types' annotations."""
+    kind: Any = Calibration
+    for name in names:
+        while typing.get_origin(kind) in (tuple, typing.Annotated):
+            kind = typing.get_args(kind)[0]
+        kind = typing.get_type_hints(kind, include_extras=True)[name]
+    low, high, usual = -math.inf, math.inf, 0.0
+    while typing.get_origin(kind) in (tuple, typing.Annotated):
+        for meta in typing.get_args(kind)[1:]:
+            if isinstance(meta, msgspec.Meta):
+                low = max(low, -math.inf if meta.ge is None else meta.ge)
+                low = max(low, -math.inf if meta.gt is None else math.nextafter(meta.gt, math.inf))
+                high = min(high, math.inf if meta.le is None else meta.le)
+                usual = max(usual, (meta.extra or {}).get("usual", 0.0))
+        kind = typing.get_args(kind)[0]
+    return low, high, usual
+
+
+def _unit(key: str) -> str:
+    if coefficient := re.search(r"coefficients\[(\d+)\]$", key):
+        power = int(coefficient[1]) + 1
+        return "N/rad" if power == 1 else f"N/rad^{power}"
+    match = _UNIT.search(key.rpartition(".")[2])
+    return _UNITS[match[1]] if match else "1"

@@ -1,0 +1,39 @@
+"""A sample in, an estimate out: the one place from which the estimator is run."""
+
+from emb_daemon.estimator.step import predict, step
+from emb_daemon.jit import njit
+from emb_daemon.wire.contract import CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
+
+
+@njit
+def answer(samples, count, states, parameters, estimates):
+    """Estimate ``samples[:count]``.
+
+    ``states`` and ``parameters`` have one record for each corner, or one in all.
+    """
+    for number in range(count):
+        corner = samples[number].corner
+        answer_row(samples[number], states[corner % len(states)], parameters[corner % len(parameters)], estimates[number])
+
+
+@njit
+def answer_row(row, state, p, estimate):
+    """Estimate one SAMPLE into one ESTIMATE."""
+    estimate.time_ns = row.time_ns
+    estimate.cycle = row.cycle
+    estimate.elapsed_cycles = row.elapsed_cycles
+    estimate.age_cycles = row.age_cycles
+    estimate.corner = row.corner
+    estimate.counter = row.counter
+    estimate.is_sample = not row.is_prediction
+    if row.is_prediction:
+        predict(state, p, row.age_cycles * CYCLE_S, estimate)
+    else:
+        step(state, p, row, estimate)
+    estimate.reasons |= row.reasons
+    if not state.started:
+        estimate.mode = INIT
+    elif estimate.source == INVALID:
+        estimate.mode = FAULT
+    elif estimate.reasons and estimate.mode == RUNNING:
+        estimate.mode = DEGRADED

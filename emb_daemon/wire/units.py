@@ -1,0 +1,37 @@
+"""Units as DBC files spell them, and how one becomes another of the same quantity."""
+
+import math
+
+from emb_daemon.errors import InputError
+
+_DEGREE = math.pi / 180.0
+#: Unit: (unit of the same quantity that others are converted over, factor, offset); that = factor * this + offset.
+UNITS = {
+    "rad": ("rad", 1.0, 0.0), "deg": ("rad", _DEGREE, 0.0), "°": ("rad", _DEGREE, 0.0), "mrad": ("rad", 1e-3, 0.0),
+    "rev": ("rad", 2.0 * math.pi, 0.0), "turn": ("rad", 2.0 * math.pi, 0.0),
+    "rad/s": ("rad/s", 1.0, 0.0), "deg/s": ("rad/s", _DEGREE, 0.0), "°/s": ("rad/s", _DEGREE, 0.0),
+    "rpm": ("rad/s", math.pi / 30.0, 0.0), "1/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
+    "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
+    "degC": ("degC", 1.0, 0.0), "°C": ("degC", 1.0, 0.0), "C": ("degC", 1.0, 0.0), "deg C": ("degC", 1.0, 0.0),
+    "K": ("degC", 1.0, -273.15), "degF": ("degC", 5.0 / 9.0, -160.0 / 9.0), "°F": ("degC", 5.0 / 9.0, -160.0 / 9.0),
+    "m/s": ("m/s", 1.0, 0.0), "km/h": ("m/s", 1.0 / 3.6, 0.0), "kph": ("m/s", 1.0 / 3.6, 0.0), "mph": ("m/s", 0.44704, 0.0),
+    "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "kNm": ("Nm", 1e3, 0.0),
+    "Hz": ("Hz", 1.0, 0.0), "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "%": ("%", 1.0, 0.0),
+    "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
+}  # fmt: skip
+
+
+def conversion(unit: str, target: str) -> tuple[float, float]:
+    """(factor, offset) by which a value in ``unit`` becomes one in ``target``.
+
+    Raises:
+        InputError: the unit is unknown, missing, or of another quantity.
+    """
+    if unit == target:
+        return 1.0, 0.0
+    if unit not in UNITS:
+        raise InputError(f"unit {unit!r} is unknown; expected {target or 'none'}")
+    (base, factor, offset), (target_base, target_factor, target_offset) = UNITS[unit], UNITS[target]
+    if base != target_base:
+        raise InputError(f"is in {unit or 'no unit'}; expected {target or 'none'}, or what can become that")
+    return factor / target_factor, (offset - target_offset) / target_factor
