@@ -45,8 +45,8 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
     if not arguments.output.parent.is_dir():
         raise InputError(f"{arguments.output}: no such folder: {arguments.output.parent}")
-    if arguments.output.is_dir():
-        raise InputError(f"{arguments.output}: is a folder, expected a file to write the calibration to")
+    if arguments.output.exists() and not arguments.output.is_file():
+        raise InputError(f"{arguments.output}: is no regular file, which writing would replace")
     if arguments.output.resolve() == arguments.campaign.resolve():
         raise InputError(f"{arguments.output}: is the campaign itself")
     if arguments.report and arguments.report.exists() and not arguments.report.is_dir():

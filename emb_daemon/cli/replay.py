@@ -78,8 +78,8 @@ def _check(arguments: argparse.Namespace) -> None:
     for path in (output, report):
         if path and not path.absolute().parent.is_dir():
             raise InputError(f"{path}: no such folder: {path.absolute().parent}")
-        if path and path.is_dir():
-            raise InputError(f"{path}: is a folder, expected a file")
+        if path and path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no regular file, which writing would replace")
         if path and path.resolve() in inputs:
             raise InputError(f"{path}: is one of the inputs, which it would overwrite")
     if output and ending_of(output) not in TABLE_ENDINGS + FRAME_ENDINGS:

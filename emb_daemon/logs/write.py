@@ -32,9 +32,12 @@ _COMMENTS = {
     "mode": "mode of the estimator",
     "source": "what clamp_force rests on",
     "reasons": "why not to trust the row, joined by '; '",
+    "clamp_force_ref": "reference instrument of the rig",
+    "brake_torque_ref": "reference instrument of the rig",
+    "disc_ref": "reference instrument of the rig",
     "corner": "wheel",
 }
-_UNITS = {"N": "N", "rad": "rad", "C": "degC"}
+_UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
 
 
 def ending_of(path: Path) -> str:
@@ -111,9 +114,10 @@ def _unit_and_comment(name: str) -> tuple[str, str]:
     stem, _, last = name.rpartition("_")
     unit = _UNITS.get(last, "")
     quantity = stem if unit else name
-    if quantity.endswith("mm"):
-        side, depth = quantity.split("_")
-        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface"
+    if quantity.removesuffix("_ref").endswith("mm"):
+        side, depth = quantity.removesuffix("_ref").split("_")
+        by = ", reference instrument of the rig" if quantity.endswith("_ref") else ""
+        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface{by}"
     pad = f"{quantity.split('_')[0]} pad, " if quantity.startswith(("inner_", "outer_")) else ""
     return unit, pad + _COMMENTS.get(quantity, _COMMENTS.get(quantity.rpartition("_")[2], ""))
 
