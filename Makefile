@@ -28,7 +28,7 @@ wheel: $(READY)
 # What a user gets: the wheel in an environment with nothing else in it.
 wheel-demo: wheel
 	$(PYTHON) -m venv --clear build/empty
-	build/empty/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	build/empty/bin/pip install --quiet --disable-pip-version-check "$$(echo dist/*.whl)[offline]"
 	cd build && empty/bin/emb-daemon demo --corners 1 --seconds 8
 
 # Needs the extra fuzz, which the lock file leaves out: $(VENV)/bin/pip install --editable '.[fuzz]'.
@@ -61,7 +61,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra mf4 --extra docs --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra docs --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 
 clean:

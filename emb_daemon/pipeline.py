@@ -21,23 +21,27 @@ from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import pack
 from emb_daemon.wire.receive import ACCEPTED, SECOND_SENDER, new_reception, receive
 
-#: A resolver sample waits this long for its current before it is answered without.
+#: A resolver sample waits this long for its current before it is answered without: senders put both on the bus together, and
+#: half a cycle leaves as much for the answer.
 _PAIRING_NS = CYCLE_NS // 2
-#: Without a resolver sample for this many cycles the daemon predicts, once a cycle.
+#: Without a resolver sample for this many cycles the daemon predicts, once a cycle; two frames lost in a row are
+#: made up for by the next.
 LATE_CYCLES = 3
-#: Deviation of arrival from the counter's clock up to which the counter is believed.
+#: Deviation of arrival from the counter's clock up to which the counter is believed: two cycles, the longest that a bus
+#: which keeps its schedule holds a frame up.
 _JITTER_NS = 2 * CYCLE_NS
 #: Samples on which counter and clock must have agreed before the counter is believed against the clock.
 _AGREED = 3
-#: Age up to which a slow input still feeds the models, and ages from which its absence is reported.
-_USABLE_NS = 2_500_000_000
-_REPORTED_CYCLES = 25
-_REFUSED_NS = 1_000_000_000
+#: Cycles of its message after which the absence of an input is reported, and the age up to which an input still feeds the
+#: models: so many cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
+_REPORTED_CYCLES, _USABLE_NS = 25, 2_500_000_000
+#: How long a frame that was refused, or somebody else's of our messages, shows in the reasons: ten EMB_c_EstimatorStatus.
+_SHOWN_NS = 1_000_000_000
 
 #: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
 #: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
-#: ``agreed`` how many samples in a row counter and clock agreed on; ``stranger_ns`` when somebody else
+#: ``agreed`` how many samples in a row counter and clock agreed on; ``second_sender_ns`` when somebody else
 #: last sent one of our messages.
 CORNER = np.dtype(
     [
@@ -55,7 +59,7 @@ CORNER = np.dtype(
         ("clock_ns", "i8"),
         ("late_ns", "i8"),
         ("agreed", "i8"),
-        ("stranger_ns", "i8"),
+        ("second_sender_ns", "i8"),
     ],
     align=True,
 )
@@ -102,7 +106,7 @@ class Pipeline:
         self.corners = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
-        self.corners["stranger_ns"] = -2 * _REFUSED_NS
+        self.corners["second_sender_ns"] = -2 * _SHOWN_NS
         self.samples = np.zeros(capacity, SAMPLE)
         self.estimates = np.zeros(capacity, ESTIMATE)
         self.frames = np.zeros(4 * capacity, FRAME)
@@ -129,7 +133,7 @@ class Pipeline:
     def overdue(self, time_ns: int, count: int = 0) -> int:
         """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then.
 
-        A corner that owes several predictions gives the newest alone: the others would be news of the past."""
+        A corner that owes several predictions gives the newest alone: the others are out of date."""
         return _overdue(self._buffers, time_ns, _NEWEST, count)
 
     def answer(self, count: int) -> None:
@@ -160,7 +164,7 @@ def _collect(b, frames, start, predictions, count):
         start += 1
         slot, verdict = receive(frame, b.receptions, b.layout[0])
         if verdict == SECOND_SENDER:
-            _note_stranger(b, frame)
+            _record_second_sender(b, frame)
         if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES == wire.THERMOCOUPLE:
             continue
         index = slot // wire.CORNER_MESSAGES
@@ -188,11 +192,11 @@ def _paired(b, index):
 
 
 @njit
-def _note_stranger(b, frame):
+def _record_second_sender(b, frame):
     for kind in range(len(b.layout[0].sent_cycle_ns)):
         for index in range(4):
             if b.layout[0].sent_id[kind, index] == frame.can_id:
-                b.corners[index].stranger_ns = frame.time_ns
+                b.corners[index].second_sender_ns = frame.time_ns
 
 
 @njit
@@ -300,7 +304,7 @@ def _complete(b, index, count):
 
 @njit
 def _head(b, row, index, age):
-    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and what is amiss around it."""
+    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and its reasons outside the estimator."""
     corner = b.corners[index]
     now = corner.sample_ns + age * CYCLE_NS
     row.corner = index
@@ -327,11 +331,11 @@ def _head(b, row, index, age):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
-        if now - b.receptions[slot].refused_ns < _REFUSED_NS:
+        if now - b.receptions[slot].refused_ns < _SHOWN_NS:
             reasons |= contract.E2E_ERROR
-        if now - b.receptions[slot].range_ns < _REFUSED_NS:
+        if now - b.receptions[slot].range_ns < _SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE
-    if now - corner.stranger_ns < _REFUSED_NS:
+    if now - corner.second_sender_ns < _SHOWN_NS:
         reasons |= contract.SECOND_SENDER
     row.reasons = reasons
 

@@ -1,13 +1,18 @@
 """Buses that python-can drives: what others send is heard, what we send ourselves is not."""
 
+import argparse
 import os
 
+import can
 import numpy as np
 import pytest
 import wirekit
 
+from emb_daemon.calibration.configuration import Bus
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.errors import Unavailable
 from emb_daemon.runtime.bus import open_bus
+from emb_daemon.wire.frames import ERROR
 
 #: Of its own for each run, so that two test runs on one machine do not hear each other.
 _GROUP = f"239.74.163.{os.getpid() % 250 + 3}"
@@ -52,3 +57,51 @@ def test_a_frame_of_ours_that_comes_once_more_is_somebody_elses(ends):
     assert len(_heard(theirs, 1)) == 1 and _heard(ours, 0) == []
     theirs.send(mine)
     assert len(_heard(ours, 1)) == 1
+
+
+@pytest.fixture
+def virtual():
+    """Our end of an in-process bus, and python-can's of somebody who sends what does not concern us too."""
+    channel = f"test_bus {os.getpid()}"
+    ours, theirs = open_bus("virtual", channel, _OURS), can.Bus(interface="virtual", channel=channel)
+    yield ours, theirs
+    ours.close()
+    theirs.shutdown()
+
+
+def test_one_drain_takes_all_that_is_there_whatever_lies_between(virtual):
+    ours, theirs = virtual
+    for number in range(20):
+        theirs.send(can.Message(arbitration_id=0x555, data=bytes(8), is_extended_id=False))
+        theirs.send(can.Message(arbitration_id=0x100, data=bytes(8), is_extended_id=True))
+        theirs.send(can.Message(arbitration_id=0x100, data=bytes([number] * 8), is_extended_id=False))
+    assert [int(data) & 0xFF for data in ours.drain()["data"]] == list(range(20))
+    assert len(ours.drain()) == 0
+
+
+def test_error_frames_are_heard(virtual):
+    ours, theirs = virtual
+    theirs.send(can.Message(arbitration_id=0x20, is_error_frame=True, is_extended_id=False))
+    assert ours.drain()["flags"].tolist() == [ERROR]
+
+
+def _options(command_line: str, defaults=None) -> dict:
+    parser = argparse.ArgumentParser()
+    add_bus_arguments(parser)
+    return bus_options(parser.parse_args(command_line.split()), defaults)
+
+
+def test_command_line_before_environment_before_configuration(monkeypatch):
+    configured = Bus(interface="socketcan", channel="can0", bitrate=500_000)
+    for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
+    assert _options("", configured) == {"interface": "socketcan", "channel": "can0", "bitrate": 500_000}
+    monkeypatch.setenv("CAN_CHANNEL", "can7")
+    assert _options("", configured)["channel"] == "can7"
+    assert _options("-c can3", configured)["channel"] == "can3"
+
+
+def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
+    monkeypatch.setattr(can, "rc", {"interface": "virtual", "channel": f"test_bus rc {os.getpid()}"})
+    bus = open_bus(**_options(""), ids=_OURS)
+    bus.close()

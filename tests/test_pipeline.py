@@ -270,3 +270,20 @@ def test_logs_at_a_reduced_rate(car, every):
     assert count == 40
     assert np.allclose(pipeline.samples["dt"][1:40], 0.004 * every)
     assert np.all(np.isfinite(pipeline.estimates["force"][:40])) and np.all(pipeline.estimates["sigma"][:40] > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("can_id", "flag"),
+    [(0x120, "has_thermocouple"), (0x180, "has_wheel_speed"), (0x181, "has_wheel_pulse"), (0x182, "has_status")],
+)
+def test_a_slow_input_feeds_the_models_for_two_and_a_half_seconds_after_its_last_frame(car, can_id, flag):
+    frames = np.concatenate(
+        [frame for frame in _sliding(800) if frame["can_id"][0] != can_id or frame["time_ns"][0] < 100 * MS]
+    )
+    last_ns = frames["time_ns"][frames["can_id"] == can_id][-1]
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    _, count = pipeline.collect(frames[np.argsort(frames["time_ns"], kind="stable")])
+    age = pipeline.samples["time_ns"][:count] - last_ns
+    fed = pipeline.samples[flag][:count]
+    assert np.all(fed[(age >= 0) & (age < 2500 * MS)]) and not np.any(fed[age >= 2500 * MS]) and age[-1] > 3000 * MS

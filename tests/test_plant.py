@@ -19,9 +19,10 @@ from emb_daemon.plant.car import CYCLE_S, Car, idle
 from emb_daemon.plant.derive import plant_from_calibration, wear_pads
 from emb_daemon.plant.heat import cell_count
 from emb_daemon.plant.live import LiveCar
-from emb_daemon.plant.records import EFFECTS, FORCE, PARK_APPLIED, PARK_RELEASED, PLANT_STATE, SUBSTEP_S
+from emb_daemon.plant.records import EFFECTS, FORCE, PLANT_STATE, SUBSTEP_S
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.wire.contract import PARK_APPLIED, PARK_RELEASED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import ADAPT_REQUEST, CORNERS, default_layout, pack

@@ -303,12 +303,14 @@ def test_value_out_of_range_changes_nothing_of_its_frame():
 def test_layout_lists_every_fault_of_a_dbc(tmp_path):
     text = resource("dbc/emb.dbc").read_text()
     path = tmp_path / "broken.dbc"
-    path.write_text(text.replace(" SG_ MotorSpeed", " SG_ RotorSpeed", 1).replace("VEH_WheelPulse", "VEH_Pulses"))
+    text = text.replace(" SG_ MotorSpeed", " SG_ RotorSpeed", 1).replace("VEH_WheelPulse", "VEH_Pulses")
+    path.write_text(text.replace('"GenMsgCycleTime" BO_ 256 4;', '"GenMsgCycleTime" BO_ 256 5;'))
     with pytest.raises(InputErrors) as caught:
         load_layout(path)
     faults = "\n".join(caught.value.faults)
     assert "signal MotorSpeed is missing" in faults and "message VEH_WheelPulse is missing" in faults
-    assert faults.count(str(path)) == len(caught.value.faults) == 2
+    assert "EMB_FL_Resolver: GenMsgCycleTime is 5 ms" in faults, "a missing signal hides no other fault of its message"
+    assert faults.count(str(path)) == len(caught.value.faults) == 3
 
 
 def _altered(tmp_path, *replacements: tuple[str, str]):

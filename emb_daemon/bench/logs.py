@@ -1,4 +1,4 @@
-"""The log path: read, decode, estimate; and the step beside the same in C and in plain Python."""
+"""The log path: read, decode, estimate; and the step beside the same in plain Python."""
 
 import os
 import subprocess
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.bench.twin import Twin
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import PARAMETERS
@@ -30,7 +29,7 @@ _ONE_BY_ONE = 20_000
 _PLAIN = 2000
 
 
-def _medians_s(*functions: Callable[[], object]) -> list[float]:
+def medians_s(*functions: Callable[[], object]) -> list[float]:
     """Median CPU time of each: what else the machine does is not theirs, and meets them alike because they take turns."""
     taken = np.zeros((_REPEATS, len(functions)))
     for repeat in range(_REPEATS):
@@ -65,7 +64,7 @@ def measure_logs(seconds: float = 120.0) -> dict:
         path = Path(folder) / "drive.log"
         write_frames(path, frames)
         Replay(calibration).run(path)
-        read, replay = _medians_s(lambda: read_frames(path), lambda: Replay(calibration).run(path))
+        read, replay = medians_s(lambda: read_frames(path), lambda: Replay(calibration).run(path))
     bulk, one_by_one = _decoders(frames)
     return {
         "seconds": seconds,
@@ -95,30 +94,19 @@ def _decoders(frames: np.ndarray) -> tuple[float, float]:
         for can_id, data in pairs:
             database.decode_message(can_id, data)
 
-    return tuple(len(some) / taken for taken in _medians_s(bulk, one_by_one))
+    return tuple(len(some) / taken for taken in medians_s(bulk, one_by_one))
 
 
 def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict:
-    """The compiled step over SAMPLE rows, PARAMETERS of shape (1,), beside the same in C and in plain Python.
+    """The compiled step over SAMPLE rows, PARAMETERS of shape (1,), beside the same in plain Python.
 
     Returns:
-        ``compiled_us``, ``c_us`` and ``plain_us`` of one step, and ``c_difference``, ``plain_difference`` as `difference`
-        has it. Plain Python may be off by the last bit: its x ** 2 goes through pow(), which need not round as a product
-        does. What C needs and is not there is named in ``c_missing``.
+        ``compiled_us`` and ``plain_us`` of one step, and ``plain_difference`` as `difference` has it. Plain Python may be
+        off by the last bit: its x ** 2 goes through pow(), which need not round as a product does.
     """
     compiled = estimate(samples, parameters)
-    result: dict = {"samples": len(samples)}
-    try:
-        twin = Twin()
-    except FileNotFoundError as error:
-        result["c_missing"] = str(error)
-        [taken] = _medians_s(lambda: estimate(samples, parameters))
-    else:
-        taken, c_taken = _medians_s(lambda: estimate(samples, parameters), lambda: twin.estimate(samples, parameters))
-        result["c_us"] = 1e6 * c_taken / len(samples)
-        result["c_difference"] = difference(twin.estimate(samples, parameters), compiled)
-        result["compiler"] = twin.version
-    result["compiled_us"] = 1e6 * taken / len(samples)
+    [taken] = medians_s(lambda: estimate(samples, parameters))
+    result: dict = {"samples": len(samples), "compiled_us": 1e6 * taken / len(samples)}
     with tempfile.TemporaryDirectory() as folder:
         files = [f"{folder}/{name}.npy" for name in ("samples", "parameters", "estimates")]
         np.save(files[0], samples[:_PLAIN])

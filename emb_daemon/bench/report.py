@@ -15,11 +15,9 @@ def verdict(result: dict) -> list[dict]:
     wake = loop["cyclictest"] or empty
     whose = "cyclictest's" if loop["cyclictest"] else "an empty loop's"
     first, last = (value / 1024.0 for value in loop["resident_KiB"])
-    ratio = step["compiled_us"] / step["c_us"] if "c_us" in step else math.nan
     in_time = 100.0 * answers["in_time"] / max(answers["samples"], 1)
     budgets = [
         ("compiled step of one corner, both pads", step["compiled_us"], "<=", 3.0, "us"),
-        ("the same over C", ratio, "<=", 1.5, "times"),
         (f"tick of {corners} corners, p99", loop["tick"]["p99_us"], "<=", 500.0, "us"),
         (
             f"last frame of a sample to answer, p99, above {whose} wake-up",
@@ -94,12 +92,8 @@ def _logs(logs: dict) -> list[str]:
         f"{logs['replay_times_real_time']:.0f} times real time",
         f"  decoded {bulk / 1e6:.1f} with E2E check; {single / 1e6:.2f} by cantools, frame by frame, without",
         f"step: {step['compiled_us']:.2f} us compiled",
+        f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}",
     ]
-    if "c_us" in step:
-        lines.append(f"      {step['c_us']:.2f} us in C ({step['compiler']}, -O2), {_equal(step['c_difference'])}")
-    else:
-        lines.append(f"      in C: not measured: {step['c_missing']}")
-    lines.append(f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}")
     return lines
 
 

@@ -59,7 +59,8 @@ class Configuration(Struct, kw_only=True):
     bus: Bus = Bus()
     #: FL, FR, RL, RR: those that this process estimates.
     corners: Annotated[dict[Annotated[str, Meta(pattern="^(FL|FR|RL|RR)$")], Corner], Meta(min_length=1)]
-    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same.
+    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same,
+    #: units are converted.
     dbc: str | None = None
     #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
     state_directory: str | None = None

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.curves import curve_at, rising_force, thickness_range
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import (
@@ -24,6 +25,10 @@ from emb_daemon.models.thermal import mesh
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+#: Training reaches the forces that hold a parked car: 18 kN, 60 % of what the brake of the shipped calibration can do, and on
+#: weaker brakes the same share.
+_TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
 
 
 def usual(size: float) -> Meta:
@@ -356,69 +361,6 @@ class Calibration(Struct, kw_only=True):
         """Clamp force up to which training motion is asked for."""
         share_of_maximum = _TRAINING_SHARE * self.stiffness.maximum_force_N
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
-
-
-#: Training reaches the forces that hold a parked car, 18 kN in the thesis (3.4) on a brake of 30 kN, and on weaker brakes the
-#: same share.
-_TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
-#: How far curves are carried on beyond the measured thicknesses, as a share of the nearest interval, and to what share of the
-#: nearest measured one a coefficient's compliance may fall there: a straight line would lead it through zero.
-_CARRIED_ON, _LEAST_COMPLIANCE = 0.5, 0.5
-
-
-def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
-    """Thinnest and thickest pads in mm that `curve_at` tells a curve of."""
-    thicknesses = [curve.pad_thickness_mm for curve in curves]
-    if len(curves) == 1:
-        # One curve is taken for the pads that are mounted, whatever their thickness.
-        return 0.0, np.inf
-    below, above = (_CARRIED_ON * (thicknesses[k + 1] - thicknesses[k]) for k in (0, -2))
-    return thicknesses[0] - below, thicknesses[-1] + above
-
-
-def rising_force(coefficients: np.ndarray) -> float:
-    """Force in N up to which a characteristic curve rises from contact; infinite if it never falls."""
-    if coefficients[0] <= 0.0:
-        return 0.0
-    if np.all(coefficients >= 0.0):
-        return np.inf
-    turns = np.roots((coefficients * np.arange(1, len(coefficients) + 1))[::-1])
-    turns = turns.real[(np.abs(turns.imag) <= 1e-9 * np.abs(turns)) & (turns.real > 0.0)]
-    if not len(turns):
-        return np.inf
-    return float(np.polyval([*coefficients[::-1], 0.0], turns.min()))
-
-
-def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
-    """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
-
-    The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
-    nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
-    A coefficient whose sign changes between the two thicknesses runs straight itself, and all others with it.
-
-    Raises:
-        InputError: the thickness is too far outside of what was measured.
-    """
-    table = np.zeros((len(curves), CURVE_TERMS))
-    for row, curve in enumerate(curves):
-        table[row, : len(curve.coefficients)] = curve.coefficients
-    if len(curves) == 1:
-        return table[0]
-    low, high = thickness_range(curves)
-    if not low <= pad_thickness_mm <= high:
-        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured; expected {low:g} to {high:g}")
-    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
-    upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
-    share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
-    below, above = table[upper - 1], table[upper]
-    used = (below != 0.0) | (above != 0.0)
-    if np.any(below[used] * above[used] <= 0.0):
-        return below + share * (above - below)
-    compliance = 1.0 / below[used] * (1.0 - share) + 1.0 / above[used] * share
-    nearest = 1.0 / (below if share < 0.5 else above)[used]
-    curve = np.zeros(CURVE_TERMS)
-    curve[used] = 1.0 / np.where(compliance / nearest < _LEAST_COMPLIANCE, _LEAST_COMPLIANCE * nearest, compliance)
-    return curve
 
 
 def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:

@@ -2,7 +2,10 @@
 
 import argparse
 
+from emb_daemon.errors import InputError
+
 EXAMPLE = "emb-daemon bench --seconds 120"
+_LEAST_S = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import json
 
+    if not arguments.seconds >= _LEAST_S:
+        raise InputError(f"--seconds {arguments.seconds:g}: expected at least {_LEAST_S:g}: the first second does not count")
     from emb_daemon.bench.logs import measure_logs
     from emb_daemon.bench.loop import machine, measure_loop, measure_start
     from emb_daemon.bench.report import text, verdict

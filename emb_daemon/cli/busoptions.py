@@ -17,13 +17,13 @@ def add_bus_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def bus_options(arguments: argparse.Namespace, defaults=None) -> dict:
-    """Keyword arguments for `runtime.bus.open_bus`; ``defaults`` (a configuration's Bus) stand behind the command line."""
-    options = {
-        "interface": arguments.interface or getattr(defaults, "interface", None),
-        "channel": arguments.channel or getattr(defaults, "channel", None),
-    }
-    if bitrate := arguments.bitrate or getattr(defaults, "bitrate", None):
-        options["bitrate"] = bitrate
+    """Keyword arguments for `runtime.bus.open_bus`: the command line, else CAN_* variables, else ``defaults``, a
+    configuration's Bus."""
+    from can.util import load_environment_config
+
+    environment, options = load_environment_config(), {}
+    for name in ("interface", "channel", "bitrate"):
+        options[name] = getattr(arguments, name) or environment.get(name) or getattr(defaults, name, None)
     if arguments.fd:
         options["fd"] = True
     for item in arguments.bus_kwargs:

@@ -1,7 +1,8 @@
 """emb-daemon: dispatch to one module per command, imported only when called."""
 
 import argparse
-import importlib
+import importlib.util
+import io
 import os
 import sys
 
@@ -22,6 +23,11 @@ COMMANDS = {
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
 
+#: Libraries of the extra of the same name.
+_OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
+#: Commands that end in one of them and begin with long work.
+_NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
+
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -38,6 +44,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if what it needs is not
     there now."""
     argv = sys.argv[1:] if argv is None else argv
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without our characters shows others; it is no reason to end.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
     module = importlib.import_module(f"emb_daemon.cli.{chosen.command}")
     parser = argparse.ArgumentParser(
@@ -49,9 +59,17 @@ def main(argv: list[str] | None = None) -> int:
     module.add_arguments(parser)
     arguments = parser.parse_args(argv[1:])
     try:
+        for library in _NEED.get(chosen.command, ()):
+            if importlib.util.find_spec(library) is None:
+                raise ModuleNotFoundError(name=library)
         return module.run(arguments)
     except InputError as error:
         print(error, file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _OFFLINE:
+            raise
+        print(f"emb-daemon {chosen.command} needs {error.name}: pip install 'emb_daemon[offline]'", file=sys.stderr)
         return 2
     except Unavailable as error:
         print(error, file=sys.stderr)
@@ -60,6 +78,10 @@ def main(argv: list[str] | None = None) -> int:
         # The reader of our output has gone; leave nothing for the interpreter to flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        # A file that cannot be used is the user's; a full disk or a device that is gone may be better later.
+        print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
+        return 2 if error.filename else 1
     except KeyboardInterrupt:
         return 130
 

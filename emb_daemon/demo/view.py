@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.plant.records import PARK_RELEASED
-from emb_daemon.wire.contract import MODES, SOURCES, reason_words
+from emb_daemon.wire.contract import MODES, PARK_RELEASED, SOURCES, reason_words
 from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20

@@ -25,7 +25,7 @@ from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, dependen
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
-from emb_daemon.identify.noise import force_error_levels, integral_time
+from emb_daemon.identify.steps.noise import force_error_levels, integral_time
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.score import EpisodeErrors, rmse
 

@@ -243,21 +243,41 @@ class _Problem:
                 score[columns] = own.T @ pull[rows]
                 normals.append(normal)
                 scores.append(score)
-        total = np.sum(normals, axis=0) + prior
-        information = np.diag(total)
-        known = information > 0.0
-        # Scaled to unit diagonal: the parameters' units differ by orders of magnitude.
-        unit = 1.0 / np.sqrt(np.where(known, information, 1.0))
-        scale = np.outer(unit, unit)
-        inverse = np.linalg.pinv(total * scale, rcond=1e-12, hermitian=True)
-        moves = np.array(
-            [
-                np.linalg.lstsq((total - normal) * scale, unit * score, rcond=1e-12)[0]
-                for normal, score in zip(normals, scores, strict=True)
-            ]
-        )
-        moves -= moves.mean(axis=0)
-        share = (len(moves) - 1) / len(moves)
-        covariance = (share * moves.T @ moves + inverse @ (prior * scale) @ inverse) * scale
-        covariance[~known, ~known] = np.inf
-        return covariance, np.diag(prior) / np.where(known, information, 1.0)
+        information = sum(normals) + prior
+        known = np.maximum(np.diag(information), 1e-300)
+        return jackknife(np.array(normals), np.array(scores), prior), np.diag(prior) / known
+
+
+def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None = None) -> np.ndarray:
+    """Covariance of the solution of estimating equations that episodes add up to.
+
+    Each episode is left out in turn, and one Gauss-Newton step taken from the solution of all.
+
+    Args:
+        normals: minus the derivative of each episode's score, shape (episodes, n, n); for least squares J'J.
+        scores: of each episode at the solution, shape (episodes, n); for least squares J'r.
+        prior: inverse covariance of what is known beside the episodes, shape (n, n).
+
+    Returns:
+        Shape (n, n); infinite variance where neither episodes nor prior say anything.
+    """
+    total = normals.sum(axis=0) if prior is None else normals.sum(axis=0) + prior
+    information = np.abs(np.diag(total))
+    known = information > 0.0
+    # Scaled to unit diagonal: the parameters' units differ by orders of magnitude.
+    unit = 1.0 / np.sqrt(np.where(known, information, 1.0))
+    scale = np.outer(unit, unit)
+    moves = np.array(
+        [
+            np.linalg.lstsq((total - normal) * scale, unit * score, rcond=1e-12)[0]
+            for normal, score in zip(normals, scores, strict=True)
+        ]
+    )
+    moves -= moves.mean(axis=0)
+    covariance = (len(moves) - 1) / len(moves) * moves.T @ moves
+    if prior is not None:
+        inverse = np.linalg.pinv(total * scale, rcond=1e-12)
+        covariance += inverse @ (prior * scale) @ inverse.T
+    covariance *= scale
+    covariance[~known, ~known] = np.inf
+    return covariance

@@ -85,22 +85,28 @@ def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
     return log_of(read(path), corner, Path(path))
 
 
-def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames"), pipeline: Pipeline | None = None) -> Log:
+def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:
     """A FRAME array as samples; ``path`` is what messages call it.
-
-    ``pipeline`` goes on from the log before, its clock included; a new one begins with the first frame.
 
     Raises:
         InputError: no resolver sample of that corner in it.
     """
-    if pipeline is None:
-        pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
-        pipeline.begin(int(frames["time_ns"][0]))
+    pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
+    pipeline.begin(int(frames["time_ns"][0]))
+    return make_log(collect(frames, pipeline), frames, corner, path)
+
+
+def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
+    """All samples that a pipeline finds in frames, going on from where it was."""
     parts, start = [], 0
     while start < len(frames):
         start, count = pipeline.collect(frames, start, predictions=False)
         parts.append(pipeline.samples[:count].copy())
-    samples = np.concatenate(parts)
+    return np.concatenate(parts)
+
+
+def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -> Log:
+    """A corner's samples with what its frames say beside them; errors as in `log_of`."""
     if not len(samples):
         raise InputError(f"{path}: no resolver sample of corner {corner} that passes its CRC and counter check")
     reference = References(frames, corner)

@@ -16,8 +16,6 @@ from emb_daemon.plant.records import (
     DRIVE,
     HISTORY,
     PAD_DEPTHS_M,
-    PARK_APPLIED,
-    PARK_RELEASED,
     PLANT,
     PLANT_STATE,
     RELEASE,
@@ -28,12 +26,12 @@ from emb_daemon.plant.records import (
 )
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import PARK_APPLIED, PARK_RELEASED, PULSE_MODULO, PULSES_PER_TURN
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import SIGNAL, pack, unpack
 
 CYCLE_S = 1e-9 * CYCLE_NS
-PULSES_PER_TURN = 96
 #: Period of the slow clamp and release of training motion, and the time in which a corner joins it from where it stands.
 TRAINING_PERIOD_S = 20.0
 _JOINING_S = 1.0
@@ -182,7 +180,7 @@ def _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, c
             if corners[row] == corner:
                 angle = states[row].wheel_angle
         angle += elapsed * car.wheel_speed
-        pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % 4096
+        pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % PULSE_MODULO
         pulses |= pack(float(pulse), wires.received[wire.WHEEL_PULSE, corner])
     sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
     count = _say(car, wire.WHEEL_SPEED, speeds, ids, frames, count, sent)
@@ -372,7 +370,7 @@ class Car:
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
         motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
-        self.states["wheel_angle"] = self._rng.uniform(0.0, 4096 / PULSES_PER_TURN * 2.0 * pi, len(plants))
+        self.states["wheel_angle"] = self._rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
         motion["counter"] = self._rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
         for corner in range(4):
             # Both frames of a sample share their counter.

@@ -7,6 +7,7 @@ daemon is judged on its own.
 from emb_daemon.jit import njit
 from emb_daemon.plant.brake import static_angle
 from emb_daemon.plant.records import ANGLE, FORCE, SUBSTEP_S
+from emb_daemon.wire.contract import CYCLE_S
 
 _POSITION_GAIN = 40.0
 _SPEED_GAIN = 250.0
@@ -32,7 +33,7 @@ def set_target(p, s, mode, target, rate):
         error = target - s.force
         band = _FORCE_BAND_N + _FORCE_BAND * target
         if abs(error) > band and abs(s.position_target - s.angle) < 0.5:
-            correction = s.force_correction + 0.004 * _FORCE_INTEGRAL * error / slope
+            correction = s.force_correction + CYCLE_S * _FORCE_INTEGRAL * error / slope
             s.force_correction = min(max(correction, -_LARGEST_CORRECTION_RAD), _LARGEST_CORRECTION_RAD)
         # Wear and growth are followed, as a controller does that finds contact at each application; the disc's thickness
         # over the turn is not, or it would not show in the force.

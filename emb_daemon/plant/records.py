@@ -214,9 +214,6 @@ PLANT_STATE = np.dtype(
 RELEASE, ANGLE, FORCE = range(3)
 COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=True)
 
-#: Wire values of ParkBrake.
-PARK_RELEASED, PARK_APPLIED, PARK_IN_TRANSITION = range(3)
-
 #: What the driver (or the rig) does for one cycle. ``wheel_speed`` rad/s prescribes the discs' speed as a rig's drive does,
 #: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.
 DRIVE = np.dtype(

@@ -12,11 +12,9 @@ from emb_daemon.plant.records import (
     COMMAND,
     DRIVE,
     FORCE,
-    PARK_APPLIED,
-    PARK_IN_TRANSITION,
-    PARK_RELEASED,
     RELEASE,
 )
+from emb_daemon.wire.contract import PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
 
 #: A request is signalled while the demanded force is above this, N.
 _REQUEST_N = 200.0

@@ -18,12 +18,16 @@ class PythonCanBus:
     """A bus that python-can drives, frame by frame; same interface as RawCanSocket.
 
     Args:
+        ids: of the frames to receive, all of them 11 bits long; error frames come too.
         echoes: the bus gives a sender its own frames back, which `drain` then leaves out. A frame of somebody else that is
             equal to one just sent is taken for its echo.
     """
 
-    def __init__(self, bus, echoes: bool = False):
+    def __init__(self, bus, ids: list[int], echoes: bool = False):
         self._bus = bus
+        # Not python-can's own filters: where it applies them in software, recv(0) says of a frame that it leaves out what it
+        # says of an empty queue.
+        self._ids = frozenset(ids)
         self._early = deque()
         self._echoes = deque(maxlen=_ECHOES) if echoes else None
         self._frames = np.zeros(4096, FRAME)
@@ -57,7 +61,7 @@ class PythonCanBus:
                 break
             if message is None:
                 break
-            if self._is_echo(message):
+            if not self._concerns_us(message) or self._is_echo(message):
                 continue
             frame = self._frames[count]
             # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
@@ -74,6 +78,9 @@ class PythonCanBus:
             )
             count += 1
         return self._frames[:count]
+
+    def _concerns_us(self, message) -> bool:
+        return message.is_error_frame or (message.arbitration_id in self._ids and not message.is_extended_id)
 
     def _is_echo(self, message) -> bool:
         # They come in the order in which they were sent, so the first is nearly always the one.
@@ -112,14 +119,15 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
     import can
 
     try:
-        chosen = can.util.load_config(config={"interface": interface, "channel": channel, **options})
+        # None would hide what can.conf and the CAN_* variables say.
+        given = {"interface": interface, "channel": channel, **options}
+        chosen = can.util.load_config(config={key: value for key, value in given.items() if value is not None})
     except (can.CanInterfaceNotImplementedError, ValueError) as error:
         raise InputError(f"bus: {error}; name one with --interface and --channel") from None
     if chosen["interface"] == "socketcan":
         return open_socketcan(str(chosen["channel"]), ids)
-    filters = [{"can_id": can_id, "can_mask": 0x7FF, "extended": False} for can_id in ids]
     try:
         # Its multicast loops back, or programs on one machine could not hear each other.
-        return PythonCanBus(can.Bus(**chosen, can_filters=filters), echoes=chosen["interface"] == "udp_multicast")
+        return PythonCanBus(can.Bus(**chosen), ids, echoes=chosen["interface"] == "udp_multicast")
     except Exception as error:
         raise Unavailable(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None

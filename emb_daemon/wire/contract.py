@@ -1,8 +1,8 @@
 """The wire contract's codes, words and cycle: what numbers on the bus mean, in one place.
 
 Ids, bit positions, scales and ranges stand in the DBC alone and are read from it (`wire.layout`). What stands here too is
-what compiled code (`emb_daemon.jit`) freezes and what programs call by name; `wire.layout.load_layout` refuses a DBC that
-says otherwise.
+what compiled code (`emb_daemon.jit`) freezes and what programs call by name; `wire.layout.load_layout` refuses a DBC with
+another cycle, and tests hold the shipped DBC's value names to the words here.
 """
 
 #: Cycle of the resolver's and the current's messages, and of the clamp force.

@@ -143,11 +143,11 @@ def load_database(path: Path):
         raise InputError(f"{path}: not a readable DBC: {str(error).splitlines()[0]}") from None
 
 
-def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> None:
+def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> list[str]:
     """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC.
 
-    Raises:
-        InputErrors: a unit is missing, unknown or of another quantity.
+    Returns:
+        Faults: units that are missing, unknown or of another quantity.
     """
     faults = []
     for column, name in zip(columns, names, strict=True):
@@ -160,16 +160,11 @@ def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> 
         column["factor"] *= factor
         for field in ("offset", "low", "high"):
             column[field] = factor * column[field] + offset
-    if faults:
-        raise InputErrors(faults)
+    return faults
 
 
-def _check_frame(message) -> None:
-    """What the DBC may not choose: classic frames with an E2E header, each at its cycle.
-
-    Raises:
-        InputErrors: every deviation.
-    """
+def _frame_faults(message) -> list[str]:
+    """Deviations from what a DBC may not choose: classic frames with an E2E header, each at its cycle."""
     faults = []
     if message.frame_id > 0x7FF or message.is_extended_frame or message.length != 8:
         faults.append(f"{message.name}: expected an 11-bit id and 8 bytes")
@@ -182,8 +177,7 @@ def _check_frame(message) -> None:
         if signal.name in _HEADER and place != _HEADER[signal.name]:
             start, length = _HEADER[signal.name]
             faults.append(f"{message.name}.{signal.name}: expected {length} bits from bit {start} (AUTOSAR E2E profile 1)")
-    if faults:
-        raise InputErrors(faults)
+    return faults
 
 
 def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
@@ -202,13 +196,15 @@ def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) ->
     record["slot"] = FOREIGN
 
     def fill(message, names, columns, count_of, where):
+        found = next((known for known in database.messages if known.name == message), None)
+        here = _frame_faults(found) if found else []
         try:
             signals = signal_columns(database, message, names)
-            found = database.get_message_by_name(message)
-            _check_frame(found)
-            _convert(signals, names, found, shipped.get_message_by_name(message))
+            here += _convert(signals, names, found, shipped.get_message_by_name(message))
         except InputErrors as error:
-            faults.extend(f"{path}: {fault}" for fault in error.faults)
+            here += error.faults
+        if here:
+            faults.extend(f"{path}: {fault}" for fault in here)
             return None
         columns[where][: len(names)] = signals
         count_of[where] = len(names)

@@ -12,12 +12,12 @@ from emb_daemon.wire.layout import OURS, SIGNALS, SLOTS, unpack
 ACCEPTED, IGNORED, SECOND_SENDER, BAD_LENGTH, BAD_CRC, BAD_COUNTER, BAD_STATUS, BAD_RANGE = range(8)
 VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", "sender's status", "range")
 
-#: Counter steps tolerated after a gap: this many, plus those that the time passed accounts for.
+#: Counter steps tolerated after a gap: one frame lost, plus those that the time passed accounts for.
 _TOLERATED_LOSS = 2
 #: Frames over which a sender must have been late throughout before its schedule is believed to be later: at first, and once
 #: it is known. A bus or sender that was held up for less catches up and is not early; clocks that run apart are followed.
 _FIRST_WINDOW, _WINDOW = 128, 1024
-#: Cycles behind its schedule from which a sender has a new one.
+#: Cycles behind its schedule from which a sender has a new one: a second of the resolver's, longer than any bus holds it up.
 _NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
 _LONG = np.iinfo(np.int64).max
@@ -62,10 +62,10 @@ def new_reception() -> np.ndarray:
 def _in_sequence(counter, time_ns, reception, cycle_ns):
     """Whether a counter follows the last one, and no sooner than its sender can have sent it.
 
-    Time passed explains lost frames; a counter that stands still or runs ahead of the clock is a repetition or a stranger.
-    So is one that comes half a cycle before its time: a bus holds frames up, and they may then come in a burst, but none
-    comes early. Two frames that follow each other after half a cycle or more, with none in sequence between them, are a
-    sender that has started anew. After a whole turn of silence the counter may stand where it stood.
+    Time passed explains lost frames; a counter that stands still or runs ahead of the clock is a repetition, or sent by
+    somebody else. So is one that comes half a cycle before its time: a bus holds frames up, and they may then come in a
+    burst, but none comes early. Two frames that follow each other after half a cycle or more, with none in sequence between
+    them, are a sender that has started anew. After a whole turn of silence the counter may stand where it stood.
     """
     if reception.sequence < 0:
         return _start_schedule(counter, time_ns, reception, cycle_ns)
@@ -92,8 +92,11 @@ def _in_sequence(counter, time_ns, reception, cycle_ns):
 
 @njit
 def _start_schedule(counter, time_ns, reception, cycle_ns):
-    """Believe a sender; always True. One frame tells little of its schedule: it may itself be the first of a burst that was
-    held up, so how early others may come is left open for a turn of the counter, until a first window has shown it."""
+    """Take this frame for the first of its sender's schedule; always True.
+
+    One frame tells little of a schedule: it may itself be the first of a burst that was held up, so how early others may come
+    is left open for a turn of the counter, until a first window has shown it.
+    """
     reception.sequence = counter
     reception.sequence_ns = time_ns
     reception.due_ns = time_ns - COUNTER_MODULO * cycle_ns

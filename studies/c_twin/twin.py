@@ -15,8 +15,9 @@ import numpy as np
 
 from emb_daemon.estimator import records
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE, new_state
-from emb_daemon.resources import resource
+from emb_daemon.wire import contract
 
+_SOURCE = Path(__file__).parent / "step.c"
 _FLAGS = ("-O2", "-std=c11", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 _TYPES = {"f8": "double", "i8": "int64_t", "b1": "bool"}
 
@@ -27,8 +28,9 @@ def compiler() -> str | None:
 
 
 def declarations() -> str:
-    """C declarations of the estimator's records, and the numbers that `records` names."""
-    numbers = {name: value for name, value in vars(records).items() if name.isupper() and type(value) is int}
+    """C declarations of the estimator's records, and the numbers that `records` and the wire contract name."""
+    named = vars(contract) | vars(records)
+    numbers = {name: value for name, value in named.items() if name.isupper() and type(value) is int}
     lines = ["enum {", *(f"    {name} = {value}," for name, value in numbers.items()), "};"]
     for name, record in (("parameters", PARAMETERS), ("state", STATE), ("sample", SAMPLE), ("estimate", ESTIMATE)):
         checks: list[str] = []
@@ -55,7 +57,7 @@ class Twin:
     """The C step.
 
     Raises:
-        FileNotFoundError: no compiler, or an installation without the source.
+        FileNotFoundError: no compiler.
         subprocess.CalledProcessError: it does not compile; what the compiler said is in ``stderr``.
     """
 
@@ -63,11 +65,10 @@ class Twin:
         cc = compiler()
         if cc is None:
             raise FileNotFoundError("no C compiler (cc, gcc or clang)")
-        source = resource("tests/step.c")
         with tempfile.TemporaryDirectory() as folder:
             library = Path(folder) / "step.so"
             (Path(folder) / "records.h").write_text(declarations())
-            command = [cc, *_FLAGS, "-I", folder, "-o", str(library), str(source), "-lm"]
+            command = [cc, *_FLAGS, "-I", folder, "-o", str(library), str(_SOURCE), "-lm"]
             subprocess.run(command, check=True, capture_output=True, text=True)
             self._answer = ctypes.CDLL(str(library)).answer
         self._answer.restype = None

@@ -1,0 +1,70 @@
+"""Characteristic curves over pad thickness: between and beyond the measured ones, and whether they rise."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import CURVE_TERMS
+
+if TYPE_CHECKING:
+    from emb_daemon.calibration.types import Curve
+
+#: How far curves are carried on beyond the measured thicknesses, as a share of the nearest interval, and to what share of the
+#: nearest measured one a coefficient's compliance may fall there: a straight line would lead it through zero.
+_CARRIED_ON, _LEAST_COMPLIANCE = 0.5, 0.5
+
+
+def thickness_range(curves: "tuple[Curve, ...]") -> tuple[float, float]:
+    """Thinnest and thickest pads in mm that `curve_at` tells a curve of."""
+    thicknesses = [curve.pad_thickness_mm for curve in curves]
+    if len(curves) == 1:
+        # One curve is taken for the pads that are mounted, whatever their thickness.
+        return 0.0, np.inf
+    below, above = (_CARRIED_ON * (thicknesses[k + 1] - thicknesses[k]) for k in (0, -2))
+    return thicknesses[0] - below, thicknesses[-1] + above
+
+
+def rising_force(coefficients: np.ndarray) -> float:
+    """Force in N up to which a characteristic curve rises from contact; infinite if it never falls."""
+    if coefficients[0] <= 0.0:
+        return 0.0
+    if np.all(coefficients >= 0.0):
+        return np.inf
+    turns = np.roots((coefficients * np.arange(1, len(coefficients) + 1))[::-1])
+    turns = turns.real[(np.abs(turns.imag) <= 1e-9 * np.abs(turns)) & (turns.real > 0.0)]
+    if not len(turns):
+        return np.inf
+    return float(np.polyval([*coefficients[::-1], 0.0], turns.min()))
+
+
+def curve_at(curves: "tuple[Curve, ...]", pad_thickness_mm: float) -> np.ndarray:
+    """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
+
+    The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
+    nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
+    A coefficient whose sign changes between the two thicknesses runs straight itself, and all others with it.
+
+    Raises:
+        InputError: the thickness is too far outside of what was measured.
+    """
+    table = np.zeros((len(curves), CURVE_TERMS))
+    for row, curve in enumerate(curves):
+        table[row, : len(curve.coefficients)] = curve.coefficients
+    if len(curves) == 1:
+        return table[0]
+    low, high = thickness_range(curves)
+    if not low <= pad_thickness_mm <= high:
+        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured; expected {low:g} to {high:g}")
+    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
+    upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
+    share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
+    below, above = table[upper - 1], table[upper]
+    used = (below != 0.0) | (above != 0.0)
+    if np.any(below[used] * above[used] <= 0.0):
+        return below + share * (above - below)
+    compliance = 1.0 / below[used] * (1.0 - share) + 1.0 / above[used] * share
+    nearest = 1.0 / (below if share < 0.5 else above)[used]
+    curve = np.zeros(CURVE_TERMS)
+    curve[used] = 1.0 / np.where(compliance / nearest < _LEAST_COMPLIANCE, _LEAST_COMPLIANCE * nearest, compliance)
+    return curve

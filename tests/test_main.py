@@ -1,0 +1,81 @@
+"""The command line's promises for every command: one clear line and an exit status, never a traceback."""
+
+import errno
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+
+from emb_daemon.cli import check
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError, Unavailable
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (InputError("a.yaml:3: motor: missing"), 2, "a.yaml:3: motor: missing"),
+        (Unavailable("bus: vcan0: no such device"), 1, "bus: vcan0: no such device"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "report.html"), 2, "report.html: Is a directory"),
+        (OSError(errno.ENOSPC, "No space left on device"), 1, "emb-daemon check: No space left on device"),
+        (ModuleNotFoundError("x", name="scipy.optimize"), 2,
+         "emb-daemon check needs scipy.optimize: pip install 'emb_daemon[offline]'"),
+        (KeyboardInterrupt(), 130, None),
+    ],
+)  # fmt: skip
+def test_an_error_is_one_line_and_a_status(monkeypatch, capsys, error, status, line):
+    def fail(arguments):
+        raise error
+
+    monkeypatch.setattr(check, "run", fail)
+    assert main(["check", "--config", "emb.yaml"]) == status
+    assert capsys.readouterr().err.splitlines() == ([line] if line else [])
+
+
+def test_a_module_of_our_own_that_is_missing_is_a_defect(monkeypatch):
+    def fail(arguments):
+        raise ModuleNotFoundError("x", name="emb_daemon.nothing")
+
+    monkeypatch.setattr(check, "run", fail)
+    with pytest.raises(ModuleNotFoundError):
+        main(["check", "--config", "emb.yaml"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "library"),
+    [
+        (["identify", "campaign.yaml", "--output", "calibration.yaml"], "scipy"),
+        (["diagnose", "a.log", "--calibration", "c.yaml", "--output", "d"], "plotly"),
+        (["demo"], "matplotlib"),
+    ],
+)
+def test_a_command_of_the_bench_says_what_the_box_lacks_before_it_works(monkeypatch, capsys, arguments, library):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == library else found(name, *rest))
+    assert main(arguments) == 2
+    assert capsys.readouterr().err == f"emb-daemon {arguments[0]} needs {library}: pip install 'emb_daemon[offline]'\n"
+
+
+def test_a_reader_that_has_gone_is_no_error(monkeypatch):
+    def fail(arguments):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(check, "run", fail)
+    monkeypatch.setattr("emb_daemon.cli.main.os.dup2", lambda *_: None)
+    assert main(["check", "--config", "emb.yaml"]) == 0
+
+
+def test_a_terminal_without_our_characters_is_no_reason_to_end():
+    code = "from emb_daemon.cli import check, main; check.run = lambda _: print('3 ± 1 kN') or 0; "
+    code += "raise SystemExit(main.main(['check', '--config', 'x']))"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "3 ? 1 kN\n", "")
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan"])
+def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
+    assert main(["bench", "--seconds", seconds]) == 2
+    assert "expected at least 2" in capsys.readouterr().err
