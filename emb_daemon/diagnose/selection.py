@@ -162,7 +162,7 @@ def _recalibrated(selection: Selection, start: Model) -> dict[str, float]:
         moments = model.moments(channel, [model.columns[c] for c in own], start.residual[channel])
         left_out = leave_out(moments, model.penalty(own, channel)).left_out
         gain = model.rms(float((moments.products[:, -1, -1] - left_out).sum()), channel)
-        if gain >= selection.screening.floor(model, channel):
+        if gain > 0.0 and gain >= selection.screening.floor(model, channel):
             result[channel] = gain
     return result
 
