@@ -52,7 +52,7 @@ class Trial:
     Attributes:
         hidden: effects of the plant with their parameters, beside those of the calibration.
         size: RMS that each makes on its own path, N.
-        found: effects accepted, with their parameters.
+        found: effects accepted, with their parameters; what changed of those in the calibration is recalibration.
         before, after: RMSE of the fused force on the validation log, N.
         unexplained: signal that a rest depends on, or None.
         contribution_error: of what the found effects do on their paths against what the hidden ones do, RMS over RMS; None
@@ -158,7 +158,8 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     result = diagnose([fit_log], start, [val_log])
     seconds = time.process_time() - begin
     left = result.unexplained
-    found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in result.accepted}
+    new = [f for f in result.accepted if not f.in_calibration]
+    found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in new}
     error = None
     if kind in ("single", "pair") and set(found) == set(hidden):
         bench = Bench([val_log], start)

@@ -4,8 +4,6 @@ The magnets' temperature is not measured. It lies between the caliper's, which i
 from the other side: a share says where.
 """
 
-import numpy as np
-
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
 from emb_daemon.jit import njit
 
@@ -20,13 +18,6 @@ def term(p, m, disc, disc_known):
         return 0.0
     temperature = m.caliper + (p.disc_share * (disc - m.caliper) if disc_known else 0.0)
     return -p.fade_per_K * (temperature - RATED_C)
-
-
-def _of_another_episode(samples, episode, random):
-    """Each episode gets another one's caliper temperature."""
-    disturbed = samples.copy()
-    disturbed["caliper"] = of_another_episode(np.nan_to_num(samples["caliper"]), episode, random)
-    return disturbed
 
 
 EFFECT = Effect(
@@ -50,5 +41,5 @@ EFFECT = Effect(
     source="NdFeB −0.09 to −0.12 %/K: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2",
     signal="caliper_temperature",
     manoeuvre="the same strokes with a cold and with a hot caliper",
-    placebos=(Placebo("caliper temperature of another episode", samples=_of_another_episode),),
+    placebos=(Placebo("temperature of another episode", signal=of_another_episode),),
 )
