@@ -13,6 +13,11 @@ class InputErrors(InputError):
         self.faults = faults
 
 
+class InvalidValue(InputError, ValueError):
+    """Values that contradict each other, found where an object is made of them; read from a file, it becomes a fault with its
+    line."""
+
+
 class Unavailable(Exception):
     """Something outside is not there now and may be later, such as a CAN interface. The command line prints it and ends
     with exit status 1, upon which a service manager tries again."""

@@ -26,7 +26,7 @@ from emb_daemon.calibration.types import (
     thickness_range,
     to_parameters,
 )
-from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.resources import resource
 
 _TEXT = resource("config/calibration.yaml").read_text()
@@ -330,7 +330,7 @@ def test_force_up_to_which_a_curve_rises(coefficients, force):
     ],
 )
 def test_a_curve_that_falls_before_the_largest_force_is_refused(coefficients, expected):
-    with pytest.raises(ValueError, match=expected):
+    with pytest.raises(InvalidValue, match=expected):
         _stiffness(*coefficients)
 
 

@@ -10,7 +10,7 @@ from msgspec import Meta
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration, Struct, to_parameters
-from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.wire.layout import CORNERS, load_layout
 
@@ -30,7 +30,7 @@ class Bus(Struct, kw_only=True):
 
         if self.interface is not None and self.interface not in VALID_INTERFACES:
             near = difflib.get_close_matches(self.interface, VALID_INTERFACES, 3, 0.4) or sorted(VALID_INTERFACES)
-            raise ValueError(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
+            raise InvalidValue(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
 
 
 class Corner(Struct, kw_only=True):

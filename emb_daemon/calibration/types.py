@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from emb_daemon.calibration.curves import curve_at, rising_force, thickness_range
 from emb_daemon.effects import REGISTRY
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, InvalidValue
 from emb_daemon.estimator.records import (
     CURVE_TERMS,
     FORCE_GRID,
@@ -74,7 +74,7 @@ class Curve(Struct, kw_only=True):
 
     def __post_init__(self):
         if self.coefficients[0] <= 0.0:
-            raise ValueError("the first coefficient (N/rad) must be positive: force rises from contact")
+            raise InvalidValue("the first coefficient (N/rad) must be positive: force rises from contact")
 
 
 class Stiffness(Struct, kw_only=True):
@@ -90,12 +90,12 @@ class Stiffness(Struct, kw_only=True):
     def __post_init__(self):
         thicknesses = [curve.pad_thickness_mm for curve in self.curves]
         if thicknesses != sorted(set(thicknesses)):
-            raise ValueError("curves: expected ascending, distinct pad thicknesses")
+            raise InvalidValue("curves: expected ascending, distinct pad thicknesses")
         between = np.linspace(*thickness_range(self.curves), 8 * len(thicknesses)) if len(thicknesses) > 1 else ()
         for thickness in np.union1d(thicknesses, between):
             reached = rising_force(curve_at(self.curves, thickness))
             if reached < self.maximum_force_N:
-                raise ValueError(
+                raise InvalidValue(
                     f"curves: with pads of {thickness:g} mm the force stops rising at {reached:.0f} N, "
                     f"below maximum_force_N ({self.maximum_force_N:g})"
                 )
@@ -163,7 +163,7 @@ class Pad(Struct, kw_only=True):
 
     def __post_init__(self):
         if self.inner_heat_share + self.outer_heat_share > 1.0:
-            raise ValueError("inner_heat_share and outer_heat_share: their sum exceeds 1")
+            raise InvalidValue("inner_heat_share and outer_heat_share: their sum exceeds 1")
 
 
 class Disc(Struct, kw_only=True):
@@ -201,10 +201,10 @@ class FrictionTable(Struct, kw_only=True):
         for name in ("force_N", "disc_speed_rad_per_s", "surface_temperature_C"):
             grid = getattr(self, name)
             if any(after <= before for before, after in pairwise(grid)):
-                raise ValueError(f"{name}: expected ascending values")
+                raise InvalidValue(f"{name}: expected ascending values")
         shape = (FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID)
         if np.array(self.coefficient, dtype=object).shape != shape:
-            raise ValueError(f"coefficient: expected {shape[0]} x {shape[1]} x {shape[2]} numbers")
+            raise InvalidValue(f"coefficient: expected {shape[0]} x {shape[1]} x {shape[2]} numbers")
 
 
 class Softening(Struct, kw_only=True):
@@ -278,7 +278,7 @@ class Adaptation(Struct, kw_only=True):
 
     def __post_init__(self):
         if self.minimum_ambient_C >= self.maximum_ambient_C:
-            raise ValueError("maximum_ambient_C: expected more than minimum_ambient_C")
+            raise InvalidValue("maximum_ambient_C: expected more than minimum_ambient_C")
 
 
 class Source(Struct, kw_only=True):
@@ -354,7 +354,7 @@ class Calibration(Struct, kw_only=True):
                 f"({self.stiffness.maximum_force_N:g})"
             )
         if faults:
-            raise ValueError("\n".join(faults))
+            raise InvalidValue("\n".join(faults))
 
     @property
     def training_force_N(self) -> float:
