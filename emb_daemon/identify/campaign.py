@@ -12,10 +12,10 @@ from msgspec import Meta
 
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Positive, Struct
-from emb_daemon.effects.disc_thickness_variation import PULSES_PER_TURN
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
 from emb_daemon.logs.read import read_with_digest
+from emb_daemon.models.wheel import PULSES_PER_TURN
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
