@@ -122,7 +122,8 @@ def _catalogue() -> str:
             out += ["| parameter | unit | from | to | usual size | meaning |", "| --- | --- | --- | --- | --- | --- |"]
             for p in effect.parameters:
                 out.append(f"| `{p.name}` | {p.unit} | {p.low:g} | {p.high:g} | {p.prior:g} | {_cell(p.meaning)} |")
-            out += ["", f"Shown by: {effect.manoeuvre}. Source: {effect.source}.", ""]
+            placebos = f" Placebo: {'; '.join(p.text for p in effect.placebos)}." if effect.placebos else ""
+            out += ["", f"Enters at `{effect.hook}`. Shown by: {effect.manoeuvre}.{placebos} Source: {effect.source}.", ""]
     return "\n".join(out).rstrip() + "\n"
 
 

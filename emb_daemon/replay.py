@@ -10,11 +10,16 @@ from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
-from emb_daemon.judging import force_figures, temperature_figures
-from emb_daemon.logs.columns import References
+from emb_daemon.logs.columns import Decoder, References
 from emb_daemon.logs.read import read_frames
-from emb_daemon.offline import corner_index
+from emb_daemon.offline import corner_index, estimate
+from emb_daemon.offline.log import CAPACITY, collect, make_log
+from emb_daemon.offline.score import force_figures, temperature_figures
 from emb_daemon.pipeline import Pipeline
+from emb_daemon.wire.layout import CORNERS
+
+#: Stands for every corner in a log.
+ALL = "all"
 
 #: Pause between two logs of which the second's clock does not go on from the first's.
 _PAUSE_NS = 1_000_000_000
@@ -22,7 +27,10 @@ _PAUSE_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Result:
-    """One replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock."""
+    """One corner of a replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock.
+
+    Those in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which goes on from log to log.
+    """
 
     path: Path
     time_ns: np.ndarray
@@ -35,10 +43,11 @@ class Result:
         """Error figures against the log's reference instruments, as far as it has any."""
         return {
             "log": str(self.path),
+            "corner": CORNERS[self.samples["corner"][0]],
             "samples": len(self.estimates),
             "seconds": 1e-9 * float(self.time_ns[-1] - self.time_ns[0]),
             "force_N": force_figures(self.samples, self.estimates, self.force_N),
-            "temperature_K": temperature_figures(self.time_ns, self.estimates, self.reference),
+            "temperature_K": temperature_figures(self.estimates["time_ns"], self.estimates, self.reference),
         }
 
 
@@ -46,8 +55,8 @@ class Replay:
     """A drive made of logs.
 
     Args:
-        calibration: of the corner's actuator.
-        corner: FL, FR, RL or RR.
+        calibration: of the corners' actuators.
+        corner: FL, FR, RL, RR, or ``all`` for every corner in the first log.
         measured_torque: heat the pads with the rig's brake torque sensor instead of the estimated force.
         state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
             learned.
@@ -62,18 +71,25 @@ class Replay:
         state: Path | None = None,
         read=read_frames,
     ):
-        self._read = read
-        self._corner = corner
-        self._index = corner_index(corner)
-        self._parameters = np.zeros(4, PARAMETERS)
-        self._parameters[self._index] = to_parameters(calibration)
-        self._measured_torque = measured_torque
-        self.adaptation = Adaptation({corner: calibration}, Memory(state), int) if state else None
-        self._pipeline = Pipeline(self._parameters, (corner,), capacity=1 << 14, adaptation=self.adaptation)
+        self._calibration, self._measured_torque, self._read = calibration, measured_torque, read
+        self._memory = Memory(state) if state else None
         self._end_ns: int | None = None
+        self._pipeline: Pipeline | None = None
+        self.corners: tuple[str, ...] = ()
+        if corner != ALL:
+            self._build((CORNERS[corner_index(corner)],))
 
-    def _on_the_drive(self, frames: np.ndarray) -> int:
+    def _build(self, corners: tuple[str, ...]) -> None:
+        self.corners = corners
+        parameters = np.full(4, to_parameters(self._calibration), PARAMETERS)
+        calibrations = dict.fromkeys(corners, self._calibration)
+        adaptation = Adaptation(calibrations, self._memory, int) if self._memory else None
+        self._pipeline = Pipeline(parameters, corners, capacity=CAPACITY, adaptation=adaptation)
+
+    def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
         """Put a log's times on the drive's clock, in place; returns what was added."""
+        if self._pipeline is None:
+            self._build(_corners_in(frames, path))
         first = int(frames["time_ns"][0])
         if self._end_ns is None:
             self._pipeline.begin(first)
@@ -87,33 +103,42 @@ class Replay:
     def frames(self, path: Path):
         """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
         frames = self._read(path)
-        self._on_the_drive(frames)
+        self._on_the_drive(frames, path)
         start = 0
         while start < len(frames):
             start, count = self._pipeline.consume(frames, start)
             yield self._pipeline.broadcast(count).copy()
 
     def run(self, path: Path) -> Result:
-        """Replay one log.
+        """Replay one log; of several corners, the first's result.
 
         Raises:
-            InputError: unreadable, or without a usable resolver sample of the corner.
+            InputError: unreadable, or without a usable resolver sample of a corner.
         """
+        return self.run_corners(path)[0]
+
+    def run_corners(self, path: Path) -> list[Result]:
+        """Replay one log; a result for each corner, errors as in `run`."""
         frames = self._read(path)
-        shift = self._on_the_drive(frames)
-        reference = References(frames, self._corner)
-        pipeline, estimates, samples, start = self._pipeline, [], [], 0
-        while start < len(frames):
-            start, count = pipeline.collect(frames, start, predictions=False)
-            rows = pipeline.samples[:count]
-            if self._measured_torque:
-                rows["brake_torque"] = reference.latest(rows["time_ns"], reference.brake_torque_Nm)
-            pipeline.answer(count)
-            samples.append(rows.copy())
-            estimates.append(pipeline.estimates[:count].copy())
-        estimates, samples = np.concatenate(estimates), np.concatenate(samples)
-        if not len(estimates):
-            raise InputError(f"{path}: no resolver sample of corner {self._corner} that passes its CRC and counter check")
-        times = estimates["time_ns"]
-        force = reference.at(times, reference.clamp_force_N)
-        return Result(Path(path), times - shift, estimates, samples, reference, force)
+        shift = self._on_the_drive(frames, path)
+        pipeline = self._pipeline
+        samples = collect(frames, pipeline)
+        mine = {corner: samples["corner"] == corner_index(corner) for corner in self.corners}
+        logs = {corner: make_log(samples[rows], frames, corner, Path(path)) for corner, rows in mine.items()}
+        if self._measured_torque:
+            for corner, log in logs.items():
+                samples["brake_torque"][mine[corner]] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
+        estimates = estimate(samples, pipeline.parameters, pipeline.states, pipeline.adaptation)
+        return [
+            Result(log.path, log.time_ns - shift, estimates[mine[corner]], samples[mine[corner]], log.reference, log.force_N)
+            for corner, log in logs.items()
+        ]
+
+
+def _corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:
+    decoder = Decoder()
+    heard = set(np.unique(frames["can_id"]).tolist())
+    found = tuple(corner for corner in CORNERS if decoder.can_id(f"EMB_{corner}_Resolver") in heard)
+    if not found:
+        raise InputError(f"{path}: no resolver frame of any corner")
+    return found

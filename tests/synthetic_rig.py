@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 
 from emb_daemon.estimator.records import SAMPLE
-from emb_daemon.identify.stiffness import Pads, simulate, with_dynamics
-from emb_daemon.identify.torque import friction_means
+from emb_daemon.identify.campaign import Actuator, Datasheet, DiscNominal, PadNominal, Resolver
+from emb_daemon.identify.dynamics import Pads, with_dynamics
+from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
+from emb_daemon.offline.run import stiffness_force
 from emb_daemon.wire.contract import CYCLE_S
 
 GEAR_GAIN = 4e-5
@@ -59,6 +61,38 @@ def draw(rng: np.random.Generator, thicknesses=(4.0, 9.0)) -> Truth:
     )
 
 
+def datasheet(torque_constant: float, inertia: float, tolerance: float = 0.3) -> Datasheet:
+    """Of an actuator with the synthetic rig's geometry, and of usual pads and disc."""
+    return Datasheet(
+        actuator=Actuator(
+            gear_gain_m_per_rad=GEAR_GAIN,
+            motor_torque_constant_Nm_per_A=torque_constant,
+            motor_torque_constant_tolerance=tolerance,
+            lumped_inertia_kg_m2=inertia,
+            lumped_inertia_tolerance=tolerance,
+            max_motor_speed_rad_per_s=200.0,
+            rated_clamp_force_N=20e3,
+            pad_clearance_rad=5.0,
+        ),
+        resolver=Resolver(counts_per_revolution=round(2.0 * np.pi / COUNT_RAD)),
+        pad=PadNominal(
+            thickness_mm=10.0,
+            frontal_area_m2=0.0046,
+            density_kg_per_m3=2450.0,
+            specific_heat_J_per_kgK=1200.0,
+            conductivity_W_per_mK=1.2,
+        ),
+        disc=DiscNominal(
+            mass_kg=5.6,
+            specific_heat_J_per_kgK=480.0,
+            effective_radius_m=0.131,
+            cooling_area_m2=0.19,
+            conductivity_W_per_mK=50.0,
+        ),
+        friction_coefficient=0.39,
+    )
+
+
 def _slow(travel: float, seconds: float = 24.0) -> np.ndarray:
     """Two clamps and releases from rest, each of half the time."""
     time = np.arange(round(seconds / CYCLE_S)) * CYCLE_S
@@ -92,9 +126,12 @@ def _log(truth: Truth, thickness: float, path: np.ndarray, name: str, rng: np.ra
     samples["brake_torque"] = samples["ambient"] = np.nan
     parameters = with_dynamics(truth.dynamics)
     parameters["curve"][0, :3] = truth.curves[thickness]
-    force = simulate(samples, truth.clearance, parameters)
+    parameters["clearance"] = truth.clearance
+    force = stiffness_force(samples, parameters)
     t = truth.torque
-    mean, _ = friction_means(path, t["presliding_angle_rad"], flicker=0.0)
+    mean, state = np.zeros(len(path)), 0.0
+    for row, travel in enumerate(np.diff(path), 1):
+        state, mean[row], _ = friction_state(state, 0.0, travel, t["presliding_angle_rad"], 0.0, CYCLE_S)
     half = np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     # What the estimator sees of force: without the delay of the reference's clock, a detail of half a millisecond.
     torque = GEAR_GAIN * half + t["inertia_kg_m2"] * np.r_[0.0, np.diff(speed)] / CYCLE_S

@@ -1,14 +1,23 @@
 """The catalogue of effects: complete, exactly neutral at zero, and each with the sign and the conditions of its physics."""
 
+import ast
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.diagnose.channels import wheel_angle
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.gear_mesh_ripple import cycle_mean
 from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline import estimate
 from emb_daemon.resources import resource
 
@@ -77,6 +86,84 @@ def drive(seconds=12.0, wheel_speed=20.0):
 
 def test_catalogue_is_that_of_the_contract():
     assert sorted(effect.name for effect in REGISTRY) == sorted(CONTRACT)
+
+
+#: `identify` names what it fits of a campaign; `plant` is a brake of its own, with effects of its own.
+_MAY_NAME = ("effects", "plant", "identify")
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_nothing_else_knows_an_effect_by_name(effect):
+    package = Path(emb_daemon.__file__).parent
+    files = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in _MAY_NAME]
+    assert len(files) > 80
+    assert not [path for path in files if effect.name in path.read_text()]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [({"hook": "gearbox"}, "no hook gearbox"), ({"hook": "current"}, "current does not offer mean_speed")],
+)
+def test_an_effect_that_cannot_be_hooked_in_is_refused(changed, said):
+    viscous = next(effect for effect in REGISTRY if effect.name == "viscous_friction")
+    with pytest.raises(ValueError, match=said):
+        dataclasses.replace(viscous, **changed)
+
+
+#: A caliper that widens as it warms up, so that the motor angle for a clamp force grows: one file more in the package and
+#: one line in its list, then the log of a brake that does so.
+_ONE_MORE = """
+import dataclasses
+import numpy as np
+from emb_daemon import offline
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.offline.run import held
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import simulate_log
+from emb_daemon.resources import resource
+from studies.blind import campaign
+
+calibration = load_calibration(resource("config/calibration.yaml"))
+plant, rng = plant_from_calibration(calibration, seed=5), np.random.default_rng(5)
+log = offline.log_of(simulate_log(plant, campaign(plant, rng, 7), seed=1)[0])
+samples = log.samples.copy()
+knots = np.arange(0.0, log.time_s[-1] + 8.0, 8.0)
+warmth = np.interp(log.time_s, knots, [0.0, *rng.uniform(0.0, 60.0, len(knots) - 1)])
+wider = 1e-6 * 0.8 * warmth / calibration.motor.gear_gain_m_per_rad
+samples["caliper"] += warmth
+samples["angle"] += wider
+samples["speed"] += np.gradient(wider, log.time_s)
+p = held(to_parameters(calibration))
+for widening in (0.0, 0.8):
+    p["effects"]["own_effect"]["widening_um_per_K"] = widening
+    error = offline.estimate(samples, p)["stiffness_force"] - log.force_N
+    print(np.sqrt(np.nanmean(error**2)))
+result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
+print([(f.effect.name, f.values["widening_um_per_K"]) for f in result.accepted])
+"""
+
+
+def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(tmp_path):
+    root = Path(emb_daemon.__file__).parent.parent
+    for folder in ("emb_daemon", "studies", "config", "dbc"):
+        shutil.copytree(root / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    effects = tmp_path / "emb_daemon" / "effects"
+    text = (root / "examples" / "own_effect.py").read_text().replace("caliper_widening", "own_effect")
+    (effects / "own_effect.py").write_text(text.partition('if __name__ == "__main__":')[0])
+    registration = effects / "__init__.py"
+    registration.write_text(
+        registration.read_text().replace('    "thermocouple_lag",\n', '    "thermocouple_lag",\n    "own_effect",\n')
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", _ONE_MORE]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    without, with_, found = done.stdout.splitlines()
+    assert float(without) > 4.0 * float(with_)
+    [(name, value)] = ast.literal_eval(found)
+    assert name == "own_effect" and value == pytest.approx(0.8, rel=0.1)
 
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)

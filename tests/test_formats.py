@@ -1,10 +1,12 @@
 """Logs in and out: every format back and forth on a rig log, other rigs' logs through a mapping file, a truck's MDF4 log."""
 
+import json
 import math
 
 import can
 import cantools
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 from emb_daemon.cli.main import main
@@ -93,13 +95,23 @@ def test_another_rigs_log_gives_the_same_samples(foreign, log, tmp_path):
 
 
 def test_another_rigs_log_is_judged_like_ours(foreign, log, tmp_path, capsys):
-    import json
-
     figures = []
     for arguments in ([str(log)], [str(foreign), "--mapping", str(tmp_path / "mapping.yaml")]):
         assert main(["replay", *arguments, "--json"]) == 0
         figures.append(json.loads(capsys.readouterr().out)["logs"][0]["force_N"]["fused"]["rmse"])
     assert figures[1] == pytest.approx(figures[0], rel=0.05)
+
+
+def test_a_reference_that_is_not_mapped_is_absent_and_not_zero(foreign, tmp_path, capsys):
+    log = load_log(foreign, read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.isfinite(log.reference.clamp_force_N).all() and len(log.reference.clamp_force_N) > 1000
+    assert np.isnan(log.reference.disc_C).all() and np.isnan(log.reference.brake_torque_Nm).all()
+    table = tmp_path / "out.parquet"
+    mapping = str(tmp_path / "mapping.yaml")
+    assert main(["replay", str(foreign), "--mapping", mapping, "--output", str(table), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["logs"][0]["temperature_K"] == {}
+    references = [name for name in pyarrow.parquet.read_table(table).column_names if "_ref_" in name]
+    assert references == ["clamp_force_ref_N"]
 
 
 @pytest.mark.parametrize("period_ms", [1.0, 3.0, 10.0])
@@ -214,8 +226,8 @@ def test_a_measurement_has_units_comments_and_texts(log, tmp_path):
         for name in set(columns.column_names) - {"time_s"}:
             signal = file.get(name)
             assert signal.comment, name
-            assert signal.unit == ("N" if name.endswith("_N") else "degC" if name.endswith("_C") else
-                                   "rad" if name.endswith("_rad") else ""), name  # fmt: skip
+            units = {"N": "N", "Nm": "Nm", "C": "degC", "rad": "rad"}
+            assert signal.unit == units.get(name.rpartition("_")[2], ""), name
             expected = columns[name].to_numpy()
             if expected.dtype.kind == "f":
                 np.testing.assert_array_equal(signal.samples, expected)

@@ -1,5 +1,6 @@
-"""emb-daemon identify on logs of the simulated rig: targets, faults, provenance, report."""
+"""emb-daemon identify on logs of the simulated rig: figures, faults, provenance, report."""
 
+import collections
 import contextlib
 import hashlib
 import io
@@ -13,7 +14,8 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.identify.campaign import load_campaign
+from emb_daemon.identify.campaign import DiscCooling, load_campaign
+from emb_daemon.logs import read
 
 
 def _campaign(folder, rig, text):
@@ -25,7 +27,7 @@ def _campaign(folder, rig, text):
 
 @pytest.fixture(scope="module")
 def identified(rig, tmp_path_factory):
-    """A campaign on three pad thicknesses with a missing, an empty and a wrong log, run once by the command."""
+    """A campaign on three pad thicknesses with an empty and a wrong log, run once by the command; reads by file name."""
     folder = tmp_path_factory.mktemp("identify")
     (folder / "empty.log").write_text("")
     campaign = _campaign(
@@ -39,7 +41,6 @@ random:
   - {log: RIG/static/random_0p5mm.log.gz, pad_thickness_mm: 0.5}
   - {log: RIG/static/random_6p5mm.log.gz}
   - {log: RIG/static/random_11p5mm.log.gz, pad_thickness_mm: 11.5}
-  - {log: gone.log.gz, pad_thickness_mm: 3.5}
   - {log: empty.log, pad_thickness_mm: 3.5}
   - {log: RIG/static/curve_3p5mm.log.gz, pad_thickness_mm: 3.5}
 frequency_response:
@@ -49,14 +50,21 @@ frequency_response:
 """,
     )
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    reads = collections.Counter()
+
+    def counted(path):
+        reads[path.name] += 1
+        return path.read_bytes()
+
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(read, "read_file", counted)
         status = main(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "report")])
-    outputs = {"out": out.getvalue(), "err": err.getvalue()}
+    outputs = {"out": out.getvalue(), "err": err.getvalue(), "reads": reads}
     assert status == 0, outputs["err"]
     return folder, outputs
 
 
-def test_calibration_loads_and_reaches_the_targets_on_logs_that_fitted_nothing(identified):
+def test_calibration_loads_and_is_good_on_logs_that_fitted_nothing(identified):
     folder, outputs = identified
     calibration = load_calibration(folder / "c.yaml")
     assert np.isfinite(to_parameters(calibration)["curve"]).all()
@@ -66,13 +74,20 @@ def test_calibration_loads_and_reaches_the_targets_on_logs_that_fitted_nothing(i
         assert of["stiffness"] <= 120.0 and of["torque"] <= 550.0
         assert of["fused"] <= 1.05 * min(of["stiffness"], of["torque"])
         assert 0.90 <= figures[f"random, {thickness} mm: inside_two_sigma"] <= 0.99
-    assert "MISSED" not in outputs["out"]
+    rows = [line for line in outputs["out"].splitlines() if line.startswith(("random", "sine"))]
+    assert len(rows) == 6 and "thesis" not in outputs["out"]
+
+
+def test_every_log_is_read_once(identified):
+    _, outputs = identified
+    # Ten logs of the rig, and the empty one.
+    assert len(outputs["reads"]) == 11 and set(outputs["reads"].values()) == {1}, outputs["reads"]
 
 
 def test_every_log_that_cannot_serve_is_named_with_what_was_needed(identified):
     _, outputs = identified
     lines = outputs["err"].splitlines()
-    for name in ("gone.log.gz", "empty.log", "curve_3p5mm"):
+    for name in ("empty.log", "curve_3p5mm"):
         (line,) = [line for line in lines if name in line]
         assert "needed" in line
     assert any("nominal" in line for line in lines), "heat without logs must be said to be nominal"
@@ -95,7 +110,8 @@ def test_report_is_one_file_that_fetches_nothing(identified):
     page = (folder / "report/report.html").read_text()
     assert page.count("Plotly.newPlot(place") == 1
     assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="http', page)
-    assert "All" in page and "Frequency response" in page and "gone.log.gz" in page
+    assert "Fused force" in page and "Torque balance" in page and "empty.log" in page
+    assert "missed" not in page and "to reach" not in page
 
 
 @pytest.mark.parametrize(
@@ -107,6 +123,11 @@ def test_report_is_one_file_that_fetches_nothing(identified):
         ("random:\n  - {log: a.log, pad_thickness_mm: -1}\n", "pad_thickness_mm: Expected"),
         ("dbc: nowhere.dbc\n", "nowhere.dbc: no such file"),
         ("curves: []\n", "curves, random: no usable log; needed: slow clamp"),
+        ("random:\n  - {log: gone.log}\n", r"random\[0\].log: .*gone.log: no such file"),
+        (
+            "thermal: {disc_cooling: [{log: gone.log, disc_turns_per_s: 1}]}\n",
+            r"disc_cooling\[0\].log: .*no such file",
+        ),
     ],
 )
 def test_unusable_campaigns_end_with_one_clear_line(rig, tmp_path, capsys, text, expected):
@@ -115,6 +136,41 @@ def test_unusable_campaigns_end_with_one_clear_line(rig, tmp_path, capsys, text,
     error = capsys.readouterr().err
     assert re.search(expected, error), error
     assert not (tmp_path / "c.yaml").exists()
+
+
+def test_outputs_that_cannot_be_written_are_refused_before_the_work(rig, tmp_path, capsys):
+    campaign = _campaign(tmp_path, rig, "curves: [{log: RIG/static/curve_6p5mm.log.gz}]\n")
+    (tmp_path / "file").write_text("")
+    for arguments, expected in (
+        (["--output", str(tmp_path)], "is no regular file"),
+        (["--output", str(campaign)], "is the campaign itself"),
+        (["--output", str(tmp_path / "none" / "c.yaml")], "no such folder"),
+        (["--output", str(tmp_path / "c.yaml"), "--report", str(tmp_path / "file")], "expected a folder"),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(read, "read_file", lambda path: pytest.fail(f"{path} read"))
+            assert main(["identify", str(campaign), *arguments]) == 2
+        assert expected in capsys.readouterr().err
+
+
+def test_a_disc_that_turns_otherwise_than_the_campaign_says_is_left_out(rig, tmp_path):
+    campaign = load_campaign(_campaign(tmp_path, rig, ""))
+    log = f"{rig}/thermal/disc_cooling_1tps.log.gz"
+    assert campaign.load_cooling(DiscCooling(log=log, disc_turns_per_s=1.0)) is not None
+    assert campaign.load_cooling(DiscCooling(log=log, disc_turns_per_s=2.0)) is None
+    (fault,) = campaign.faults
+    assert "disc_turns_per_s: expected 2 turns per second" in fault
+
+
+def test_a_wheel_with_other_pulses_than_the_daemon_counts_is_refused(rig, tmp_path):
+    sheet = (rig / "datasheet.yaml").read_text()
+    (tmp_path / "datasheet.yaml").write_text(sheet.replace("pulses_per_revolution: 96", "pulses_per_revolution: 48"))
+    path = tmp_path / "campaign.yaml"
+    path.write_text("rig: A\ndatasheet: datasheet.yaml\n")
+    with pytest.raises(InputError, match="pulses_per_revolution: expected 96"):
+        load_campaign(path)
+    (tmp_path / "datasheet.yaml").write_text(sheet)
+    assert load_campaign(path).pad_thickness_mm == 10.0, "the datasheet's, where the campaign states none"
 
 
 def test_a_rig_with_another_bus_layout_is_refused(rig, tmp_path):

@@ -126,6 +126,16 @@ def test_names_with_dots(tmp_path, name):
     assert len(read_frames(path)) == 1
 
 
+def test_a_gzipped_log_that_is_cut_off_is_read_up_to_the_cut(tmp_path, capsys):
+    rows = "".join(f"(1{row:09d}.000000) can0 123#{row % 251:02X}{row * 7919 % 65521:06X}\n" for row in range(20_000))
+    packed = gzip.compress(rows.encode())
+    (tmp_path / "whole.log.gz").write_bytes(packed)
+    (tmp_path / "cut.log.gz").write_bytes(packed[: len(packed) // 2])
+    whole, cut = read_frames(tmp_path / "whole.log.gz"), read_frames(tmp_path / "cut.log.gz")
+    assert 5_000 < len(cut) < 15_000 and np.array_equal(cut, whole[: len(cut)])
+    assert "cut.log.gz: cut off, read up to there" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
@@ -133,8 +143,8 @@ def test_names_with_dots(tmp_path, name):
         ("empty.log", b"", "holds no frames"),
         ("blank.log", b"\n\n", "holds no frames"),
         ("empty.log.gz", gzip.compress(b""), "holds no frames"),
-        ("damaged.log.gz", gzip.compress(_GOOD.encode() * 1000)[:-20], "damaged gzip"),
-        ("flipped.log.gz", gzip.compress(_GOOD.encode())[:12] + b"\xff\xff\xff", "damaged gzip"),
+        ("damaged.log.gz", gzip.compress(_GOOD.encode() * 1000)[:-8] + b"wrong CRC", "damaged gzip"),
+        ("flipped.log.gz", gzip.compress(_GOOD.encode())[:10] + b"\xff\xff\xff", "damaged gzip"),
         ("notes.txt", b"hello", "unknown log format"),
         ("nothing", b"hello", "unknown log format"),
         ("x.blf", b"not a blf file at all", "BLFReader"),

@@ -1,7 +1,7 @@
 """The calibration as the one parameter space: whatever fits, learns or perturbs moves numbers by their keys.
 
 A key is the dotted path of a number in the calibration file: ``motor.torque_constant_Nm_per_A``,
-``stiffness.curves[0].coefficients[1]``, ``effects.second_relaxation.share``. Records are only ever derived from a
+``stiffness.curves[0].coefficients[1]``, ``effects.NAME.PARAMETER``. Records are only ever derived from a
 calibration (`types.to_parameters`); what adaptation learns is a partial calibration, ``{key: value}``, applied by `moved`.
 """
 

@@ -26,6 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.files import load_calibration, save_calibration
     from emb_daemon.diagnose.diagnosis import diagnose, log_paths
     from emb_daemon.diagnose.page import page
+    from emb_daemon.diagnose.report import report
     from emb_daemon.diagnose.text import table, verdict
     from emb_daemon.errors import InputError
     from emb_daemon.offline import corner_index, load_log
@@ -51,8 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         diagnosis = diagnose(fit_logs, calibration, judges, progress)
     save_calibration(diagnosis.calibration, arguments.output / "calibration.yaml")
-    report = json.dumps(diagnosis.report(), indent=1, ensure_ascii=False)
-    write_atomically(arguments.output / "report.json", report.encode())
+    text = json.dumps(report(diagnosis), indent=1, ensure_ascii=False)
+    write_atomically(arguments.output / "report.json", text.encode())
     write_atomically(arguments.output / "report.html", page(diagnosis).encode())
     console.print(verdict(diagnosis))
     console.print(table(diagnosis))

@@ -19,11 +19,10 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.files import calibration_hash, save_calibration
     from emb_daemon.errors import InputError
     from emb_daemon.identify.campaign import load_campaign
+    from emb_daemon.identify.report import build
     from emb_daemon.identify.run import identify
-    from emb_daemon.identify.table import table
 
-    if not arguments.output.parent.is_dir():
-        raise InputError(f"{arguments.output}: no such folder: {arguments.output.parent}")
+    _check_outputs(arguments)
     campaign = load_campaign(arguments.campaign)
     result = _with_progress(lambda progress: identify(campaign, progress))
     for fault in campaign.faults:
@@ -31,26 +30,38 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         save_calibration(result.calibration, arguments.output)
         if arguments.report:
-            from emb_daemon.identify.report import build
-
             arguments.report.mkdir(parents=True, exist_ok=True)
             build(result).write(arguments.report / "report.html")
     except OSError as error:
         raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
-    _print(table(result))
+    _print(result.judged, result.thermal.figures)
     print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s")
     return 0
 
 
-def _print(lines) -> None:
-    rows = [("RMSE on logs that fitted nothing", "", "thesis reports", "thesis form", "ours", "to reach", "")]
-    for line in lines:
-        verdict = {True: "met", False: "MISSED", None: ""}[line.met]
-        thesis, ours = line.spread(line.thesis), line.spread(line.ours)
-        rows.append((line.judged_on, line.unit, line.thesis_reports, thesis, ours, line.target, verdict))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows if lines else ():
-        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Minutes of work must not end in a file that cannot be written."""
+    from emb_daemon.errors import InputError
+
+    if not arguments.output.parent.is_dir():
+        raise InputError(f"{arguments.output}: no such folder: {arguments.output.parent}")
+    if arguments.output.exists() and not arguments.output.is_file():
+        raise InputError(f"{arguments.output}: is no regular file, which writing would replace")
+    if arguments.output.resolve() == arguments.campaign.resolve():
+        raise InputError(f"{arguments.output}: is the campaign itself")
+    if arguments.report and arguments.report.exists() and not arguments.report.is_dir():
+        raise InputError(f"{arguments.report}: is a file, expected a folder for the report")
+
+
+def _print(judged: list, temperatures: dict[str, float]) -> None:
+    from emb_daemon.identify.judge import COLUMNS, rows
+
+    lines = [["RMSE on logs that fitted nothing", *COLUMNS[1:]], *rows(judged)] if judged else []
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for name, *cells in lines:
+        print("  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in zip(cells, widths[1:], strict=True))]))
+    for name, value in temperatures.items():
+        print(f"{name}: {value:.3g}")
 
 
 def _with_progress(work):

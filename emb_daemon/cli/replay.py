@@ -11,7 +11,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help=".log, .log.gz, .asc, .blf, .trc or .mf4")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's DBC to our signals")
-    parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
+    parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
     parser.add_argument("--pad-thickness", type=float, metavar="MM", help="thickness of the pads mounted, if not the file's")
     parser.add_argument(
         "--measured-torque", action="store_true", help="heat the pads with the rig's brake torque sensor, which no car has"
@@ -36,46 +36,27 @@ def run(arguments: argparse.Namespace) -> int:
     import msgspec
     import numpy as np
 
-    from emb_daemon.calibration.files import calibration_hash, load_calibration
-    from emb_daemon.errors import InputError
+    from emb_daemon.calibration.files import load_calibration
     from emb_daemon.logs.mapping import Mapping
     from emb_daemon.logs.read import read_frames
-    from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of, table_columns, write_frames, write_table
+    from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
     from emb_daemon.resources import resource
 
-    output = arguments.output
-    ending = ending_of(output) if output else None
-    if output and ending not in TABLE_ENDINGS + FRAME_ENDINGS:
-        raise InputError(f"{output}: unknown ending, expected one of {', '.join(TABLE_ENDINGS + FRAME_ENDINGS)}")
-    if output and not output.parent.is_dir():
-        raise InputError(f"{output}: no such folder: {output.parent}")
-    if arguments.report and not arguments.report.absolute().parent.is_dir():
-        raise InputError(f"{arguments.report}: no such folder: {arguments.report.absolute().parent}")
+    _check(arguments)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
     read = Mapping(arguments.mapping).read if arguments.mapping else read_frames
     replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read)
-    if ending in FRAME_ENDINGS:
-        if arguments.report:
-            raise InputError(f"--report: expected together with a table ({', '.join(TABLE_ENDINGS)}) or without --output")
-        if arguments.measured_torque:
-            raise InputError("--measured-torque: the daemon has no such input, so there are no frames it would have sent")
-        write_frames(output, np.concatenate([part for log in arguments.logs for part in replay.frames(log)]))
+    if arguments.output and ending_of(arguments.output) in FRAME_ENDINGS:
+        write_frames(arguments.output, np.concatenate([part for log in arguments.logs for part in replay.frames(log)]))
         return 0
-    results = [replay.run(log) for log in arguments.logs]
-    if output:
-        tables = [table_columns(result.estimates, 1e-9 * result.time_ns) for result in results]
-        write_table(output, {name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
+    results = [result for log in arguments.logs for result in replay.run_corners(log)]
+    if arguments.output:
+        _write_table(arguments.output, results)
     if arguments.report:
-        from emb_daemon.adapt.memory import Memory
-        from emb_daemon.report.replay import replay_page
-
-        described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
-        learned = Memory(arguments.state).read(arguments.corner) if arguments.state else None
-        page = replay_page(results, arguments.corner, described, learned, calibration)
-        page.write(arguments.report)
+        _write_report(arguments, results, replay.corners[0], calibration)
     report = [result.figures() for result in results]
     if arguments.json:
         json.dump({"logs": report}, sys.stdout, indent=1)
@@ -86,8 +67,64 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check(arguments: argparse.Namespace) -> None:
+    """What can be refused before the work."""
+    from emb_daemon.errors import InputError
+    from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
+    from emb_daemon.replay import ALL
+
+    output, report = arguments.output, arguments.report
+    inputs = [path.resolve() for path in (*arguments.logs, arguments.calibration, arguments.mapping) if path]
+    for path in (output, report):
+        if path and not path.absolute().parent.is_dir():
+            raise InputError(f"{path}: no such folder: {path.absolute().parent}")
+        if path and path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no regular file, which writing would replace")
+        if path and path.resolve() in inputs:
+            raise InputError(f"{path}: is one of the inputs, which it would overwrite")
+    if output and ending_of(output) not in TABLE_ENDINGS + FRAME_ENDINGS:
+        raise InputError(f"{output}: unknown ending, expected one of {', '.join(TABLE_ENDINGS + FRAME_ENDINGS)}")
+    if report and arguments.corner == ALL:
+        raise InputError(f"--report: shows one corner, expected --corner FL, FR, RL or RR instead of {ALL}")
+    if output and ending_of(output) in FRAME_ENDINGS:
+        if report:
+            raise InputError(f"--report: expected together with a table ({', '.join(TABLE_ENDINGS)}) or without --output")
+        if arguments.measured_torque:
+            raise InputError("--measured-torque: the daemon has no such input, so there are no frames it would have sent")
+
+
+def _write_table(path: Path, results: list) -> None:
+    """Rows in time order within each log; a column that only some logs have is empty in the others."""
+    import numpy as np
+
+    from emb_daemon.logs.write import reference_columns, table_columns, write_table
+
+    tables = []
+    for result in results:
+        table = table_columns(result.estimates, 1e-9 * result.time_ns)
+        tables.append(table | reference_columns(result.reference, result.estimates["time_ns"], result.force_N))
+    names = dict.fromkeys(name for table in tables for name in table)
+    empty = [np.full(len(table["time_s"]), np.nan) for table in tables]
+    columns = {
+        name: np.concatenate([table.get(name, none) for table, none in zip(tables, empty, strict=True)]) for name in names
+    }
+    # Corners of one log stand one after the other; a drive's clock tells the order of all.
+    order = np.argsort(np.concatenate([result.estimates["time_ns"] for result in results]), kind="stable")
+    write_table(path, {name: values[order] for name, values in columns.items()})
+
+
+def _write_report(arguments: argparse.Namespace, results: list, corner: str, calibration) -> None:
+    from emb_daemon.adapt.memory import Memory
+    from emb_daemon.calibration.files import calibration_hash
+    from emb_daemon.report.replay import replay_page
+
+    described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
+    learned = Memory(arguments.state).read(corner) if arguments.state else None
+    replay_page(results, corner, described, learned, calibration).write(arguments.report)
+
+
 def _print(report: dict) -> None:
-    print(f"{report['log']}: {report['samples']} samples, {report['seconds']:.1f} s")
+    print(f"{report['log']}, {report['corner']}: {report['samples']} samples, {report['seconds']:.1f} s")
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
         print("  no reference signals in this log")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.logs.columns import Decoder
+from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
 from emb_daemon.wire.contract import INVALID
 from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
@@ -40,16 +41,8 @@ class Comparison:
     def figures(self) -> dict[str, float]:
         """Error figures in N over the usable estimates, and the share of them within two sigma."""
         error = (self.force_N - self.true_N)[self.usable]
-        if not len(error):
-            return dict.fromkeys(("rmse", "bias", "p95", "max", "within_2_sigma"), np.nan)
-        size = np.abs(error)
-        return {
-            "rmse": float(np.sqrt(np.mean(error**2))),
-            "bias": float(np.mean(error)),
-            "p95": float(np.percentile(size, 95)),
-            "max": float(np.max(size)),
-            "within_2_sigma": float(np.mean(size <= 2.0 * self.sigma_N[self.usable])),
-        }
+        none = dict.fromkeys(("rmse", "bias", "p95", "max"), np.nan)
+        return none | figures(error) | {"within_2_sigma": share_inside(error, self.sigma_N[self.usable])}
 
 
 class Recorder:

@@ -1,19 +1,24 @@
-"""The last hurdle: the running estimator itself must get better on episodes that took no part in the fit.
+"""The last hurdle: the running estimator itself must get better on data that took no part in the fit.
 
 The search judges residuals of one path with the contact angle held. What an engineer gets is the estimator with everything
-at work, so whatever was accepted has to lower the error of its own path there, and must not raise the error of the fused
-force. What does is taken out again, one by one.
+at work, so whatever was accepted has to lower the error of its own path on episodes left out of the fit, and must not raise
+the error of the fused force. Where validation logs are given, they have a veto. What fails is taken out, one by one, and the
+rest refitted.
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 
-from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.diagnose.attribution import Attribution, Search, is_shape
-from emb_daemon.diagnose.channels import Bench
-from emb_daemon.diagnose.evidence import Moments, fit
-from emb_daemon.diagnose.judged import Errors, errors_of, innovation_errors, joined, judged
-from emb_daemon.diagnose.knobs import Knob, calibrated
-from emb_daemon.offline import estimate
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.comparison import errors, errors_of, whole
+from emb_daemon.diagnose.coordinates import Coordinate
+from emb_daemon.diagnose.evidence import Moments, leave_out
+from emb_daemon.diagnose.model import is_shape
+from emb_daemon.diagnose.residuals import UNITS, Bench
+from emb_daemon.diagnose.selection import Selection
+from emb_daemon.offline.run import estimate
+from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
 _FOLDS = 4
@@ -22,35 +27,38 @@ _FOLDS = 4
 _HARM = 1.05
 
 
-def left_out(bench: Bench, attribution: Attribution, calibration: Calibration, without: str = "") -> Errors:
-    """Errors of each quarter of the episodes with parameters that the other quarters gave.
+def confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
+    """What is left of a search when everything that makes the running estimator worse is taken out again.
 
-    ``without``: effect (or channel with its base parameters) that is taken out, the others refitted.
+    Returns it with the errors on left-out episodes. ``judges``: the validation logs.
     """
+    bench = selection.model.bench
+    before, main = errors(bench, bench.calibration), whole(bench)
+    while True:
+        after = left_out(selection)
+        worse = harm(before, after, {selection.channel_of(suspect) for suspect in selection.suspects})
+        if worse and selection.suspects:
+            rest = {suspect: left_out(selection, suspect).rmse(main) for suspect in selection.suspects}
+            selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
+        elif veto := judges and _veto(selection, judges):
+            selection = selection.without(*veto)
+        else:
+            return selection, after
+
+
+def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
+    """Errors of each quarter of the episodes with parameters that the other quarters gave; ``without`` one suspect."""
+    bench = selection.model.bench
     fold = np.arange(bench.episodes) % _FOLDS
-    parts: list[Errors] = []
-    of = errors_of if bench.has_reference else innovation_errors
+    parts = []
     for number in range(_FOLDS):
-        values: dict[Knob, float] = {}
+        values = selection.applied(without)
         for channel in bench.channels:
-            own = [knob for knob in attribution.knobs if knob.channel == channel]
-            if channel == without or not any(attribution.values[knob] for knob in own):
-                continue
-            linear = [knob for knob in own if not is_shape(knob)]
-            table = np.column_stack([attribution.regressors[knob] for knob in linear])
-            restored = attribution.residual[channel] + table @ np.array([attribution.values[knob] for knob in linear])
-            free = np.array([knob.name.partition(".")[0] != without for knob in linear])
-            moments = Moments.of(table[:, free], restored, bench.episode[channel], bench.episodes)
-            kept = Moments(moments.products[fold != number], moments.counts[fold != number])
-            penalty = attribution.penalties[channel][[own.index(knob) for knob in linear]][free]
-            found = fit(kept, penalty).values
-            for knob, value in zip([k for k, use in zip(linear, free, strict=True) if use], found, strict=True):
-                values[knob] = float(np.clip(value, knob.low, knob.high))
-        # Shapes are not linear: they stand as fitted.
-        shapes = {knob: value for knob, value in attribution.values.items() if is_shape(knob) and knob.channel != without}
-        values.update({knob: value for knob, value in shapes.items() if knob.name.partition(".")[0] != without})
-        parameters = to_parameters(calibrated(calibration, values)) if values else to_parameters(calibration)
-        parts.append(joined([of(trial, estimate(trial.log.samples, parameters)) for trial in bench.trials]))
+            values |= _refitted(selection, channel, without, fold != number)
+        parameters = to_parameters(bench.calibrated(values))
+        parts.append(
+            EpisodeErrors.joined([errors_of(bench, trial, estimate(trial.log.samples, parameters)) for trial in bench.trials])
+        )
     result = parts[0]
     for number in range(1, _FOLDS):
         result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
@@ -58,33 +66,64 @@ def left_out(bench: Bench, attribution: Attribution, calibration: Calibration, w
     return result
 
 
-def harm(before: Errors, after: Errors, paths: set[str]) -> str:
+def _refitted(selection: Selection, channel: str, without: str, kept: np.ndarray) -> dict[Coordinate, float]:
+    """A channel's coordinates from some of the episodes; shapes, which are not linear, stand as fitted."""
+    model = selection.model
+    linear = [c for c in model.own(channel) if not is_shape(c)]
+    if channel == without or not linear or channel not in selection.touched:
+        return {}
+    table = np.column_stack([model.columns[c] for c in linear])
+    centre = np.array([model.centre.get(c, c.start) for c in linear])
+    restored = model.residual[channel] + table @ (np.array([model.values[c] for c in linear]) - centre)
+    free = np.array([c.effect != without or not without for c in linear])
+    moments = Moments.of(table[:, free], restored, model.bench.episode[channel], model.bench.episodes)
+    penalty = model.penalty([c for c, use in zip(linear, free, strict=True) if use], channel)
+    found = leave_out(Moments(moments.products[kept], moments.counts[kept]), penalty).values
+    moved = centre.copy()
+    moved[free] += found
+    return {
+        c: float(np.clip(value, c.low, c.high)) for c, value, use in zip(linear, moved, free, strict=True) if use
+    }  # fmt: skip
+
+
+def harm(before: EpisodeErrors, after: EpisodeErrors, paths: Iterable[str]) -> str:
     """What got worse in words, or nothing. ``paths``: those that were meant to get better."""
-    for path in sorted(paths & set(before.names)):
+    for path in sorted(set(paths) & set(before.paths)):
         first, last = before.rmse(path), after.rmse(path)
         if last >= first:
-            return f"the estimator's {path} error on left-out episodes goes from {first:.4g} to {last:.4g} N"
-    whole = "fused" if "fused" in before.names else before.names[0]
-    first, last = before.rmse(whole), after.rmse(whole)
-    if last > _HARM * first:
-        return f"the {whole} error on left-out episodes goes from {first:.4g} to {last:.4g} N"
-    return ""
+            return f"the estimator's {path} error goes from {first:.4g} to {last:.4g} N"
+    main = "fused" if "fused" in before.paths else before.paths[0]
+    first, last = before.rmse(main), after.rmse(main)
+    return f"the {main} error goes from {first:.4g} to {last:.4g} N" if last > _HARM * first else ""
 
 
-def confirm(search: Search, calibration: Calibration) -> tuple[Attribution, Errors]:
-    """What is left of a search when everything that makes the running estimator worse is taken out again.
+def validation_gains(selection: Selection, judges: Bench) -> dict[str, float]:
+    """By suspect, RMS by which it lowers its channel's residual on the validation logs, in quadrature and the channel's unit;
+    negative where it does harm there."""
+    bench = selection.model.bench
+    with_all = judges.under(bench.calibrated(selection.applied())).residuals({})
+    result = {}
+    for suspect in selection.suspects:
+        channel = selection.channel_of(suspect)
+        if channel not in with_all:
+            continue
+        rest = judges.under(bench.calibrated(selection.applied(suspect))).residuals({})
+        gain = rmse(rest[channel]) ** 2 - rmse(with_all[channel]) ** 2
+        result[suspect] = float(np.sign(gain) * np.sqrt(abs(gain)))
+    return result
 
-    Returns it with the errors on left-out episodes.
-    """
-    bench = search.bench
-    before = judged(bench, to_parameters(calibration))
-    whole = "fused" if bench.has_reference else "innovation"
-    while True:
-        attribution = search.outcome()
-        after = left_out(bench, attribution, calibration)
-        worse = harm(before, after, {search.history[name].channel for name in search.accepted})
-        suspects = [*search.accepted, *search.recalibrated]
-        if not worse or not suspects:
-            return attribution, after
-        errors = {name: left_out(bench, attribution, calibration, name).rmse(whole) for name in suspects}
-        search.drop(min(suspects, key=errors.__getitem__), worse)
+
+def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
+    """The suspect that the validation logs speak against most, and what they say."""
+    gains = validation_gains(selection, judges)
+    worst = min(gains, key=gains.__getitem__, default=None)
+    if worst is not None and gains[worst] < 0.0:
+        channel = selection.channel_of(worst)
+        return worst, f"withdrawn: on the validation logs it adds {-gains[worst]:.3g} {UNITS[channel]} RMS to what it explains"
+    bench, main = selection.model.bench, whole(judges)
+    before = errors(judges, bench.calibration)
+    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), set())
+    if not worse or not gains:
+        return None
+    rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in gains}
+    return min(rest, key=rest.__getitem__), f"withdrawn: {worse} on the validation logs"

@@ -2,223 +2,106 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import combinations
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
-from emb_daemon.diagnose.attribution import Attribution, Finding, searched
-from emb_daemon.diagnose.channels import FORCE_CHANNELS, UNITS, Bench
-from emb_daemon.diagnose.confirmation import confirm
-from emb_daemon.diagnose.judged import Errors, comparison, judged
-from emb_daemon.diagnose.knobs import Knob, calibrated
-from emb_daemon.diagnose.unexplained import Rest, rests
+from emb_daemon.calibration.parameters import parameter, value_of
+from emb_daemon.calibration.types import Calibration, Provenance, Source
+from emb_daemon.diagnose.comparison import comparison, errors, whole
+from emb_daemon.diagnose.confirmation import confirmed, validation_gains
+from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
+from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.selection import Progress, Selection, select
+from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, dependences
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
-from emb_daemon.offline import Log
+from emb_daemon.identify.steps.noise import force_error_levels, integral_time
+from emb_daemon.offline.log import Log
+from emb_daemon.offline.score import EpisodeErrors, rmse
 
+#: Least number of episodes that tell effect from chance.
+_EPISODES = 6
 #: A stated noise this many times what is left is none.
 _OVERSTATED = 3.0
+#: Correlation from which two parameters are known only together.
+_TRADE = 0.9
+#: Standard deviations from which a base parameter counts as moved.
+_MOVED = 2.0
 
-Progress = Callable[[str, float], None]
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """A base parameter that was estimated anew; ``gain`` is the RMS that it takes away on left-out episodes."""
+
+    before: float
+    value: float
+    sigma: float
+    unit: str
+    gain: float
+    channel: str
 
 
-@dataclass
+@dataclass(frozen=True)
 class Diagnosis:
     """Everything that the report shows.
 
     Attributes:
         calibration: the augmented one.
-        before, after: squared errors of the running estimator on ``judged_on``.
-        rests: dependence of what is left, by channel, strongest first.
+        findings: one for each effect of the catalogue, accepted ones first.
+        recalibrated: base parameters, by key.
+        initial, residual: by channel, on the fit logs, before anything and after everything.
+        before, after: errors of the running estimator on what ``judged_on`` says.
+        validated: RMS by which each finding lowers its channel's residual on the validation logs.
+        judged_residual: (before, after) RMS of each channel's residual on the validation logs.
+        left: what is left, by channel; ``left_before``: dependences before anything was accepted.
     """
 
     original: Calibration
     calibration: Calibration
     bench: Bench
-    attribution: Attribution
+    judges: Bench
     judged_on: str
-    judged_bench: Bench
-    before: Errors
-    after: Errors
-    rests: dict[str, list[Rest]]
-    rests_before: dict[str, list[Rest]]
+    findings: tuple[Candidate, ...]
+    recalibrated: Mapping[str, Recalibrated]
+    signals: Mapping[str, np.ndarray]
+    initial: Mapping[str, np.ndarray]
+    residual: Mapping[str, np.ndarray]
+    before: EpisodeErrors
+    after: EpisodeErrors
+    validated: Mapping[str, float]
+    judged_residual: Mapping[str, tuple[float, float]]
+    left: Mapping[str, Left]
+    left_before: Mapping[str, list[Dependence]]
     seconds: float
 
     @property
-    def accepted(self) -> list[Finding]:
+    def accepted(self) -> list[Candidate]:
         """Effects that were found, by share explained."""
-        return sorted((f for f in self.attribution.findings if f.accepted), key=lambda f: -f.share_explained)
+        return [finding for finding in self.findings if finding.accepted]
 
     @property
-    def unexplained(self) -> Rest | None:
-        """The strongest rest that matters."""
-        matter = [channel[0] for channel in self.rests.values() if channel and channel[0].matters]
-        return max(matter, key=lambda rest: rest.rms, default=None)
+    def unexplained(self) -> Left | None:
+        """Where most is left, over what the calibration achieved, if anything is."""
+        present = [left for left in self.left.values() if left.present]
+        return max(present, key=lambda left: (left.beyond, np.nan_to_num(left.rms / left.achieved)), default=None)
+
+    @property
+    def whole(self) -> str:
+        return whole(self.judges)
 
     def figures(self) -> dict:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
-
-    def validated(self) -> dict[str, float]:
-        """By effect accepted, RMS by which it lowers its path's residual on the validation logs (in quadrature; negative if
-        it does harm there). Empty without validation logs. It judges and chooses nothing."""
-        if self.judged_on != "validate":
-            return {}
-        logs = [trial.log for trial in self.judged_bench.trials]
-        with_all = Bench(logs, to_parameters(self.calibration)).residuals({})
-        result = {}
-        for finding in self.accepted:
-            if finding.channel not in with_all:
-                continue
-            bare = to_parameters(self.calibration).copy()
-            bare["effects"][finding.effect.name] = np.zeros((), bare["effects"][finding.effect.name].dtype)
-            without = Bench(logs, bare).residuals({})[finding.channel]
-            gain = float(np.mean(without**2) - np.mean(with_all[finding.channel] ** 2))
-            result[finding.effect.name] = float(np.sign(gain) * np.sqrt(abs(gain)))
-        return result
-
-    def judged_residual(self) -> dict:
-        """RMS of each path's residual on the judging logs, before and after: of the torque path without the limit at zero
-        force that its estimate has. Empty where the fit logs judge themselves."""
-        if self.judged_on != "validate":
-            return {}
-        before = self.judged_bench.residuals({})
-        after = Bench(
-            [trial.log for trial in self.judged_bench.trials], to_parameters(self.calibration)
-        ).residuals({})  # fmt: skip
-        return {
-            channel: {"unit": UNITS[channel], "rms_before": _rms(before[channel]), "rms_after": _rms(after[channel])}
-            for channel in self.judged_bench.channels
-        }
-
-    def report(self) -> dict:
-        """Contents of report.json."""
-        figures = self.figures()
-        rest = self.unexplained
-        validated = self.validated()
-        first = max((channel[0] for channel in self.rests.values() if channel), key=lambda r: r.share, default=None)
-        return {
-            "paths": {
-                path: {
-                    "rmse_before_N": part["total"]["rmse_before_N"],
-                    "rmse_after_N": part["total"]["rmse_after_N"],
-                    "interval_before_N": part["total"]["interval_before_N"],
-                    "interval_after_N": part["total"]["interval_after_N"],
-                    "conditions": {name: value for name, value in part.items() if name != "total"},
-                }
-                for path, part in figures.items()
-            },
-            "judged_on": self.judged_on,
-            "reference": "clamp_force" if self.bench.has_reference else "innovation",
-            "effects": [
-                finding_json(finding)
-                | ({"gain_on_validation": validated[finding.effect.name]} if finding.effect.name in validated else {})
-                for finding in ranked(self.attribution.findings)
-            ],
-            "recalibrated": {
-                knob.name: {"change": value, "sigma": self.attribution.sigmas.get(knob, 0.0), "unit": knob.unit}
-                for knob, value in self.attribution.values.items()
-                if value != 0.0 and not _of_effect(knob)
-            },
-            "noise": {
-                name: {"before": getattr(self.original.noise, name), "after": getattr(self.calibration.noise, name)}
-                for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
-                if getattr(self.original.noise, name) != getattr(self.calibration.noise, name)
-            },
-            "unexplained": {
-                "present": rest is not None,
-                "share": rest.share if rest else (first.share if first else 0.0),
-                "strongest_dependence": rest.signal if rest else None,
-                "path": rest.channel if rest else None,
-                "rms_N": rest.rms if rest else 0.0,
-            },
-            "residual": {
-                channel: {
-                    "unit": UNITS[channel],
-                    "rms_before": _rms(self.attribution.initial[channel]),
-                    "rms_after": _rms(self.attribution.residual[channel]),
-                    "dependences": [
-                        {"signal": r.signal, "share": r.share, "certainty": r.certainty}
-                        for r in self.rests.get(channel, [])[:6]
-                    ],
-                }
-                for channel in self.bench.channels
-            },
-            "judged_residual": self.judged_residual(),
-            "episodes": self.bench.episodes,
-            "seconds": self.seconds,
-        }
-
-
-def ranked(findings: list[Finding]) -> list[Finding]:
-    """Accepted ones first, each group by share explained."""
-    return sorted(findings, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained))
-
-
-def finding_json(finding: Finding) -> dict:
-    """One entry of report.json's ``effects``."""
-    effect = finding.effect
-    parameters = {
-        parameter.name: {
-            "value": finding.values.get(parameter.name, 0.0),
-            "sigma": finding.sigmas.get(parameter.name, 0.0),
-            "unit": parameter.unit,
-        }
-        for parameter in effect.parameters
-        if parameter.name in finding.values
-    }
-    parameters |= amplitudes(finding)
-    entry = {
-        "name": effect.name,
-        "path": effect.path,
-        "accepted": finding.accepted,
-        "share_explained": finding.share_explained,
-        "gain_N": finding.gain if UNITS.get(finding.channel or "") == "N" else 0.0,
-        "q_value": finding.q_value,
-        "parameters": parameters,
-        "equation": effect.equation,
-        "reason": finding.reason,
-        "in_calibration": finding.in_calibration,
-    }
-    if finding.channel and UNITS[finding.channel] != "N":
-        entry["gain"] = {"value": finding.gain, "unit": UNITS[finding.channel]}
-    if finding.placebo is not None:
-        entry["placebo_share"] = finding.placebo
-    if finding.confounded_with:
-        entry["confounded_with"] = finding.confounded_with
-        entry["manoeuvre"] = finding.manoeuvre
-    return entry
-
-
-def amplitudes(finding: Finding) -> dict:
-    """Amplitude of each order out of its cosine and sine."""
-    result = {}
-    for name, cosine in finding.values.items():
-        if "cosine" not in name:
-            continue
-        other = name.replace("cosine", "sine")
-        sine = finding.values.get(other, 0.0)
-        size = float(np.hypot(cosine, sine))
-        if size == 0.0:
-            continue
-        spread = np.hypot(cosine * finding.sigmas.get(name, 0.0), sine * finding.sigmas.get(other, 0.0)) / size
-        parameter = next(p for p in finding.effect.parameters if p.name == name)
-        result[name.replace("cosine", "amplitude")] = {"value": size, "sigma": float(spread), "unit": parameter.unit}
-    return result
-
-
-def _of_effect(knob: Knob) -> bool:
-    return knob.name.partition(".")[0] not in ("contact", "stiffness", "thermal", "motor", "friction")
-
-
-def _rms(residual: np.ndarray) -> float:
-    counted = residual[residual != 0.0]
-    return float(np.sqrt(np.mean(counted**2))) if len(counted) else 0.0
 
 
 def diagnose(
@@ -229,67 +112,202 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the calibration's models lack on ``fit_logs``, add it, and judge on ``validate``.
 
-    Without validation logs the fit logs judge: each quarter of their episodes by parameters from the other three.
+    Validation logs choose nothing, but have a veto. Without them the fit logs judge: each quarter of their episodes by
+    parameters from the other three.
 
     Raises:
-        InputError: the logs cannot tell anything (too short, no motion).
+        InputError: the logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves.
     """
     begin = time.monotonic()
+    _refuse_same(fit_logs, validate)
     progress("cutting the logs into episodes", 0.02)
-    bench = Bench(fit_logs, to_parameters(calibration))
-    if bench.episodes < 6:
-        raise InputError(f"{fit_logs[0].path}: only {bench.episodes} episodes, expected at least 6 to tell effect from chance")
-    search = searched(bench, progress)
+    bench = Bench(fit_logs, calibration)
+    if bench.episodes < _EPISODES:
+        told = f"only {bench.episodes} episodes, expected at least {_EPISODES} to tell effect from chance"
+        raise InputError(f"{fit_logs[0].path}: {told}")
+    judges = Bench(validate, calibration) if validate else None
+    selection = select(bench, progress)
     progress("confirming with the running estimator", 0.8)
-    attribution, left_out_errors = confirm(search, calibration)
-    progress("what is left", 0.87)
-    after_rests = {
-        channel: rests(channel, search.dependence(channel), search.counted(channel), search.floor(channel))
-        for channel in bench.channels
-        if channel in FORCE_CHANNELS
-    }
-    before_rests = {channel: rests(channel, gains, search.counted(channel), 0.0) for channel, gains in search.first.items()}
-    used = {knob: value for knob, value in attribution.values.items() if value != 0.0}
-    augmented = _with_noise(calibrated(calibration, used), bench, attribution) if used else calibration
+    selection, left_out = confirmed(selection, judges)
+    applied = selection.applied()
+    augmented = _with_noise(bench.calibrated(applied), selection) if applied else calibration
     progress("judging", 0.9)
-    if validate:
-        judges = Bench(validate, to_parameters(calibration))
-        before = judged(judges, to_parameters(calibration))
-        after = judged(judges, to_parameters(augmented))
-    else:
-        judges = bench
-        before = judged(bench, to_parameters(calibration))
-        after = left_out_errors
+    judging = judges or bench
+    before = errors(judging, calibration)
+    after = errors(judging, augmented) if judges else left_out
+    final = judging.under(augmented).residuals({}) if judges else selection.model.residual
+    judged_before = judging.residuals({})
     result = Diagnosis(
-        calibration, augmented, bench, attribution, "validate" if validate else "left_out_episodes",
-        judges, before, after, after_rests, before_rests, time.monotonic() - begin,
-    )  # fmt: skip
-    sources = tuple(
-        Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())
-        for log in fit_logs
-        if log.path.is_file()
+        original=calibration,
+        calibration=_with_provenance(augmented, selection, after, judges is not None, fit_logs),
+        bench=bench,
+        judges=judging,
+        judged_on="validate" if judges else "left_out_episodes",
+        findings=findings(selection),
+        recalibrated=_recalibrated(selection),
+        signals=selection.screening.signals,
+        initial=selection.screening.initial,
+        residual=selection.model.residual,
+        before=before,
+        after=after,
+        validated=validation_gains(selection, judges) if judges else {},
+        judged_residual={c: (_rms(judged_before[c]), _rms(final[c])) for c in judging.channels} if judges else {},
+        left=_left(selection, judged_before, final, judging, calibration),
+        left_before=selection.at_first,
+        seconds=time.monotonic() - begin,
     )
-    result.calibration = _with_provenance(result, sources)
     progress("done", 1.0)
     return result
 
 
-def _with_noise(calibration: Calibration, bench: Bench, attribution: Attribution) -> Calibration:
+def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:
+    for judge in validate:
+        for log in fit_logs:
+            if len(judge.samples) == len(log.samples) and judge.samples.tobytes() == log.samples.tobytes():
+                raise InputError(f"{judge.path}: is {log.path}, which chooses; expected another log to judge")
+
+
+# -- findings ---------------------------------------------------------------------------------------------------------
+
+
+def findings(selection: Selection) -> tuple[Candidate, ...]:
+    """What became of every effect, with values as they are applied; accepted ones first, each group by share explained."""
+    described = [_described(selection, selection.candidates[effect.name]) for effect in REGISTRY]
+    return tuple(sorted(described, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained)))
+
+
+def _described(selection: Selection, candidate: Candidate) -> Candidate:
+    model, effect = selection.model, candidate.effect
+    own = model.of_effect(effect.name)
+    if not own or not (candidate.accepted or candidate.in_calibration):
+        return candidate
+    on = model.bench.calibration.effects.get(effect.name, {})
+    applied = by_key({c: model.values[c] for c in own}, model.bench.middle)
+    values = {p.name: applied.get(f"effects.{effect.name}.{p.name}", on.get(p.name, 0.0)) for p in effect.parameters}
+    if not candidate.accepted and own[0].channel not in selection.touched:
+        values = dict(on)
+    sigmas = dict.fromkeys(values, 0.0) | _sigmas(model, effect, own)
+    described = replace(candidate, values=values, sigmas=sigmas, before=dict(on))
+    if not candidate.accepted:
+        return described
+    start = about_middle({c: c.start for c in own}, model.bench.middle)
+    without = model.entered(start) if candidate.in_calibration else model.without(own)
+    first, last, bare = (
+        float(r[candidate.channel] @ r[candidate.channel])
+        for r in (selection.screening.initial, model.residual, without.residual)
+    )
+    share = float(np.clip((bare - last) / first, 0.0, 1.0)) if first > 0.0 else 0.0
+    return replace(described, share_explained=share, reason=_why(candidate) + _tradeoffs(model, effect, own))
+
+
+def _why(candidate: Candidate) -> str:
+    text = f"q = {candidate.q_value:.1g} over episodes, gains {candidate.gain:.3g} {UNITS[candidate.channel]} on left-out ones"
+    if candidate.in_calibration:
+        text = f"not as calibrated: {text}"
+    for disturbed, share in candidate.placebos.items():
+        text += f"; {disturbed}: {100 * share:.0f} % of it"
+    if candidate.channel == "innovation":
+        text += "; from the difference of both paths: no reference was recorded"
+    return text
+
+
+def _sigmas(model: Model, effect: Effect, own: Sequence[Coordinate]) -> dict[str, float]:
+    """Standard deviations by parameter. A harmonic's cosine and sine are as sure as its amplitude; a shift of its order only
+    turns them."""
+    found = {c.parameter: float(model.fits[c.channel].sigmas.get(c, 0.0)) for c in own}
+    if effect.harmonic:
+        pair = [name for name in (effect.harmonic.cosine, effect.harmonic.sine) if name in found]
+        found |= dict.fromkeys(pair, rmse(np.array([found[name] for name in pair])))
+    return found
+
+
+def _tradeoffs(model: Model, effect: Effect, own: Sequence[Coordinate]) -> str:
+    """Which parameters of an effect these logs know only together."""
+    text, fitted = "", model.fits[own[0].channel]
+    known = [c for c in own if c in fitted.keys and not effect.parameter(c.parameter).group]
+    for one, other in combinations(known, 2):
+        covariance = fitted.block([one, other])
+        if abs(covariance[0, 1]) > _TRADE * np.sqrt(covariance[0, 0] * covariance[1, 1]):
+            names = f"{one.parameter} and {other.parameter}"
+            text += f"; {names} trade off on these logs: what they do together is known better than either"
+    return text
+
+
+def _recalibrated(selection: Selection) -> dict[str, Recalibrated]:
+    """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together."""
+    model, calibration = selection.model, selection.model.bench.calibration
+    base = [c for c in selection.applied() if not c.effect]
+    groups: dict[str, list[Coordinate]] = {}
+    for c in base:
+        groups.setdefault(c.name.partition("[")[0].removesuffix(".over_force").removesuffix(".over_speed"), []).append(c)
+    result = {}
+    for group in groups.values():
+        evidence = model.evidence_against({c: c.start for c in group})
+        gain = model.rms(evidence.gain, group[0].channel)
+        for c in group:
+            size = next((move.weight for move in c.moves if move.key == c.name), 1.0)
+            value, sigma = model.values[c] * size, model.fits[c.channel].sigmas.get(c, 0.0) * abs(size)
+            known = any(move.key == c.name for move in c.moves)
+            before = value_of(calibration, c.name) if known else c.start
+            unit = parameter(calibration, c.name).unit if known else "1"
+            if abs(value - before) < _MOVED * sigma and gain < selection.screening.floor(model, c.channel):
+                continue
+            key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
+            result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel)
+    return result
+
+
+# -- what is left -----------------------------------------------------------------------------------------------------
+
+
+def _left(
+    selection: Selection,
+    before: Mapping[str, np.ndarray],
+    after: Mapping[str, np.ndarray],
+    judging: Bench,
+    calibration: Calibration,
+) -> dict[str, Left]:
+    """What is left in each channel: its size where the error is judged, its dependences where effects were looked for."""
+    model, screening, result = selection.model, selection.screening, {}
+    force = np.concatenate([np.nan_to_num(trial.force_N) for trial in judging.trials])
+    if not judging.has_reference:
+        force = screening.signals["clamp_force"]
+    rise = np.concatenate([(t.temperature_C - t.temperature_C[:1]).ravel() for t in judging.trials])
+    for channel in model.bench.channels:
+        if channel not in after:
+            continue
+        found: list[Dependence] = []
+        if channel in FORCE_CHANNELS:
+            gains = screening.dependence(model, channel)
+            found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
+        first, last = _rms(before[channel]), _rms(after[channel])
+        share = (last / first) ** 2 if first > 0.0 else 0.0
+        result[channel] = Left(channel, last, achieved(calibration, channel, force, rise), share, tuple(found))
+    return result
+
+
+def _rms(residual: np.ndarray) -> float:
+    counted = residual[residual != 0.0]
+    return rmse(counted) if len(counted) else 0.0
+
+
+# -- the calibration --------------------------------------------------------------------------------------------------
+
+
+def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
     """The calibration with the stiffness path's noise as it now is, if what it states contains what has been explained.
 
     The filter would go on trusting the worse path. It is only ever lowered: a rest that nothing explains is no noise."""
-    from emb_daemon.identify.noise import force_error_levels, integral_time
-
-    noise = calibration.noise
-    if not any(v != 0.0 and knob.channel == "stiffness" for knob, v in attribution.values.items()):
+    noise, model = calibration.noise, selection.model
+    if "stiffness" not in selection.touched:
         return calibration
-    residual, force = attribution.residual["stiffness"], attribution.signals["clamp_force"]
+    residual, force = model.residual["stiffness"], selection.screening.signals["clamp_force"]
     known = residual != 0.0
-    stated = np.sqrt(np.mean(noise.stiffness_N**2 + (noise.stiffness_relative * force[known]) ** 2))
-    if stated < _OVERSTATED * np.sqrt(np.mean(residual[known] ** 2)):
+    stated = rmse(np.hypot(noise.stiffness_N, noise.stiffness_relative * force[known]))
+    if stated < _OVERSTATED * rmse(residual[known]):
         return calibration
     floor, relative = force_error_levels(residual[known], force[known])
-    lengths = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]
+    lengths = np.cumsum([len(trial.log.samples) for trial in model.bench.trials])[:-1]
     levels = msgspec.structs.replace(
         noise,
         stiffness_N=floor,
@@ -299,15 +317,23 @@ def _with_noise(calibration: Calibration, bench: Bench, attribution: Attribution
     return msgspec.structs.replace(calibration, noise=levels)
 
 
-def _with_provenance(diagnosis: Diagnosis, sources: tuple[Source, ...]) -> Calibration:
-    old = diagnosis.calibration.provenance
-    sigmas = dict(old.sigmas) if old else {}
-    for knob, sigma in diagnosis.attribution.sigmas.items():
-        if diagnosis.attribution.values.get(knob, 0.0) != 0.0 and np.isfinite(sigma):
-            sigmas[f"effects.{knob.name}" if _of_effect(knob) else knob.name] = float(sigma)
-    figures = dict(old.figures) if old else {}
-    for path in diagnosis.after.names:
-        figures[f"diagnose.{diagnosis.judged_on}.{path}_rmse_N"] = diagnosis.after.rmse(path)
+def _with_provenance(
+    calibration: Calibration, selection: Selection, after: EpisodeErrors, validated: bool, logs: Sequence[Log]
+) -> Calibration:
+    old = calibration.provenance
+    sigmas, figures = (dict(old.sigmas), dict(old.figures)) if old else ({}, {})
+    for c in selection.applied():
+        sigma = selection.model.fits[c.channel].sigmas.get(c, np.inf)
+        weight = next((abs(move.weight) for move in c.moves if move.key == c.name), 0.0)
+        if weight and np.isfinite(sigma):
+            sigmas[c.name] = float(sigma * weight)
+    judged_on = "validate" if validated else "left_out_episodes"
+    figures |= {f"diagnose.{judged_on}.{path}_rmse_N": after.rmse(path) for path in after.paths}
+    sources = tuple(
+        Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())
+        for log in logs
+        if log.path.is_file()
+    )
     provenance = Provenance(
         date=datetime.now(UTC).date().isoformat(),
         tool=f"emb-daemon diagnose {__version__}",
@@ -316,7 +342,7 @@ def _with_provenance(diagnosis: Diagnosis, sources: tuple[Source, ...]) -> Calib
         figures={name: value for name, value in figures.items() if np.isfinite(value)},
         sigmas=sigmas,
     )
-    return msgspec.structs.replace(diagnosis.calibration, provenance=provenance)
+    return msgspec.structs.replace(calibration, provenance=provenance)
 
 
 def log_paths(paths: Sequence[Path]) -> list[Path]:

@@ -2,7 +2,8 @@
 
 Residuals at 250 Hz are autocorrelated over seconds, so neighbouring samples say nothing new; what happens in one stop says
 little about the next. A log is therefore cut into brake applications, each with the pause before it, and what goes on for
-long (a drag, a burst, a park brake stroke) into pieces of a few seconds.
+long (a drag, a burst, a park brake stroke) into pieces of a few seconds, but only while the motor turns: however long a
+hold, what is aliased in it is the same throughout.
 """
 
 from itertools import pairwise
@@ -16,18 +17,41 @@ _PAUSE_S = 0.3
 _LONGEST_S = 8.0
 _PIECES = 40
 _SHORTEST_S = 0.5
+#: The motor holds where it turns less than this over this time: a tenth of the angle over which gears slide.
+_HOLDING_RAD, _HOLDING_S = 0.03, 0.25
 
 
-def episodes(time_s: np.ndarray, force_N: np.ndarray) -> np.ndarray:
+def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     """Number of the episode that each sample belongs to, ascending from 0.
 
     Args:
         time_s: sample times, shape (N,).
         force_N: clamp force, measured or estimated, shape (N,).
+        angle_rad: motor angle, shape (N,).
     """
     if not len(time_s):
         return np.zeros(0, np.int64)
     longest = float(np.clip((time_s[-1] - time_s[0]) / _PIECES, _SHORTEST_S, _LONGEST_S))
+    moving = np.flatnonzero(~_holding(time_s, angle_rad))
+    cuts = [0]
+    for start, stop in pairwise([*_applications(time_s, force_N), len(time_s)]):
+        duration = time_s[stop - 1] - time_s[start]
+        pieces = max(1, round(duration / longest))
+        wanted = np.searchsorted(time_s, time_s[start] + duration * np.arange(1, pieces) / pieces)
+        inside = moving[(moving > start) & (moving < stop)]
+        if len(inside):
+            # A hold is never cut: its halves would vouch for each other.
+            cuts += np.unique(inside[np.minimum(np.searchsorted(inside, wanted), len(inside) - 1)]).tolist()
+        cuts.append(stop)
+    apart = [0]
+    for cut in cuts[1:-1]:
+        if time_s[cut] - time_s[apart[-1]] >= _SHORTEST_S:
+            apart.append(cut)
+    return np.searchsorted(apart, np.arange(len(time_s)), side="right") - 1
+
+
+def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:
+    """First samples of brake applications, each with the pause before it."""
     applied = force_N > _APPLIED_N
     ends = np.flatnonzero(applied[:-1] & ~applied[1:]) + 1
     starts = np.flatnonzero(~applied[:-1] & applied[1:]) + 1
@@ -38,13 +62,12 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray) -> np.ndarray:
             continue
         if time_s[end] - time_s[cuts[-1]] >= _SHORTEST_S:
             cuts.append(int(end))
-    cuts.append(len(time_s))
-    number = np.zeros(len(time_s), np.int64)
-    count = 0
-    for start, stop in pairwise(cuts):
-        duration = time_s[stop - 1] - time_s[start]
-        pieces = max(1, round(duration / longest))
-        share = (time_s[start:stop] - time_s[start]) / max(duration, 1e-9)
-        number[start:stop] = count + np.minimum((share * pieces).astype(np.int64), pieces - 1)
-        count += pieces
-    return number
+    return cuts
+
+
+def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Where the motor stands."""
+    before = np.searchsorted(time_s, time_s - _HOLDING_S)
+    after = np.minimum(np.searchsorted(time_s, time_s + _HOLDING_S), len(time_s) - 1)
+    back, on = np.abs(angle_rad - angle_rad[before]), np.abs(angle_rad[after] - angle_rad)
+    return np.minimum(back, on) < _HOLDING_RAD

@@ -42,7 +42,7 @@ class Moments:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LeftOut:
     """Least squares with everything that leaving episodes out says of it.
 
     Attributes:
@@ -58,7 +58,7 @@ class Fit:
     without: np.ndarray
 
 
-def fit(moments: Moments, penalty: np.ndarray) -> Fit:
+def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     """Penalised least squares; ``penalty`` is added to the diagonal of the normal equations, shape (columns,)."""
     products = moments.products
     columns = products.shape[1] - 1
@@ -71,7 +71,7 @@ def fit(moments: Moments, penalty: np.ndarray) -> Fit:
         return np.linalg.solve(normal / outer + ridge, right / scale) / scale
 
     if not columns:
-        return Fit(np.zeros(0), np.zeros((0, 0)), products[:, -1, -1].copy(), np.zeros((len(products), 0)))
+        return LeftOut(np.zeros(0), np.zeros((0, 0)), products[:, -1, -1].copy(), np.zeros((len(products), 0)))
     values = solve(total[:-1, :-1], total[:-1, -1])
     without = np.empty((len(products), columns))
     for index, part in enumerate(products):
@@ -85,11 +85,11 @@ def fit(moments: Moments, penalty: np.ndarray) -> Fit:
     count = max(int(informative.sum()), 2)
     deviation = without[informative] - values
     covariance = (count - 1) / count * deviation.T @ deviation
-    return Fit(values, covariance, left_out, without)
+    return LeftOut(values, covariance, left_out, without)
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Evidence:
     """What the episodes say of a candidate.
 
     Attributes:
@@ -110,11 +110,11 @@ class Verdict:
     alignment: float
 
 
-NOT_EXCITED = Verdict(1.0, 0.0, np.zeros(0), 0.0, np.zeros(0), np.zeros(0), 1.0)
+NOT_EXCITED = Evidence(1.0, 0.0, np.zeros(0), 0.0, np.zeros(0), np.zeros(0), 1.0)
 
 
-def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray) -> Verdict:
-    """Test ``candidate`` columns with ``nuisances`` columns free; ``penalty`` as in `fit`, for all columns."""
+def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray) -> Evidence:
+    """Test ``candidate`` columns with ``nuisances`` columns free; ``penalty`` as in `leave_out`, for all columns."""
     from scipy.stats import f
 
     base = moments.select(nuisances)
@@ -124,8 +124,8 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     own = np.diag(total)[first : first + count]
     if np.any(own <= 0.0) or not np.isfinite(total).all():
         return NOT_EXCITED
-    fitted = fit(both, penalty[nuisances + candidate])
-    plain = fit(base, penalty[nuisances])
+    fitted = leave_out(both, penalty[nuisances + candidate])
+    plain = leave_out(base, penalty[nuisances])
     gains = plain.left_out - fitted.left_out
     # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
     normal = total[:first, :first] + np.diag(penalty[nuisances])
@@ -146,10 +146,10 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     values, covariance = fitted.values[first:], fitted.covariance[first:, first:]
     freedom = clusters - count
     if freedom < 2.0:
-        return Verdict(1.0, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+        return Evidence(1.0, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
     statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
     p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
-    return Verdict(p_value, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+    return Evidence(p_value, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
 
 
 def false_discovery(p_values: np.ndarray) -> np.ndarray:

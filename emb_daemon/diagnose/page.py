@@ -3,26 +3,21 @@
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.diagnose.attribution import Finding
-from emb_daemon.diagnose.channels import UNITS
-from emb_daemon.diagnose.diagnosis import Diagnosis, ranked
-from emb_daemon.diagnose.text import number, size, title, verdict
+from emb_daemon.diagnose.diagnosis import Diagnosis
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
+from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
 from emb_daemon.report import ACCENT, MARKS, MODEL, PALE, Page, Panel, Trace, xy_figure
 
 _BINS = 40
-_PATHS = {
-    "stiffness": "stiffness path",
-    "torque": "torque path",
-    "maximum_likelihood": "maximum likelihood",
-    "fused": "fused force",
-    "innovation": "difference of both paths",
-}
+#: Fewest residuals that are worth a picture, and dependences listed.
+_FEWEST, _LISTED = 100, 6
 
 
 def page(diagnosis: Diagnosis) -> str:
     """The whole report as one HTML file."""
     logs = ", ".join(trial.log.path.name for trial in diagnosis.bench.trials)
-    judges = ", ".join(trial.log.path.name for trial in diagnosis.judged_bench.trials)
+    judges = ", ".join(trial.log.path.name for trial in diagnosis.judges.trials)
     report = Page(
         "Diagnosis of a clamp force estimate",
         f"{diagnosis.original.actuator} · found in {logs} · judged on "
@@ -34,7 +29,7 @@ def page(diagnosis: Diagnosis) -> str:
     _errors(report, diagnosis)
     for finding in diagnosis.accepted:
         _evidence(report, diagnosis, finding)
-    _rest(report, diagnosis)
+    _left(report, diagnosis)
     _candidates(report, diagnosis)
     _recalibration(report, diagnosis)
     return report.render()
@@ -54,10 +49,10 @@ def _errors(report: Page, diagnosis: Diagnosis) -> None:
             before = f"{f['rmse_before_N']:.1f}"
             after = f"{f['rmse_after_N']:.1f}"
             interval = f"{f['interval_after_N'][0]:.1f} to {f['interval_after_N'][1]:.1f}"
-            rows.append([_PATHS.get(path, path), condition, before, after, interval, f"{low:.2f} to {high:.2f}"])
-    main = "fused" if "fused" in figures else "innovation"
+            rows.append([NAMES[path], condition, before, after, interval, f"{low:.2f} to {high:.2f}"])
+    main = diagnosis.whole
     names = list(figures[main])
-    section.figure(_bars(names, figures[main]), f"{_PATHS[main].capitalize()}, by condition.")
+    section.figure(_bars(names, figures[main]), f"{NAMES[main].capitalize()}, by condition.")
     section.table(["path", "condition", "before / N", "after / N", "after, 95 %", "ratio, 95 %"], rows)
 
 
@@ -84,91 +79,86 @@ def _bars(names: list[str], figures: dict):
     return figure
 
 
-def _binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean of ``y`` and its spread in bins of ``x``; bins with too few samples are left out."""
+def _binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of bins of ``x`` and mean of ``y`` in them; bins with too few samples are left out."""
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, _BINS + 1)))
     if len(edges) < 3:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0)
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(place, minlength=len(edges) - 1)
     kept = count >= 5
     mean = np.bincount(place, y, minlength=len(edges) - 1) / np.maximum(count, 1)
-    square = np.bincount(place, y**2, minlength=len(edges) - 1) / np.maximum(count, 1)
     centre = np.bincount(place, x, minlength=len(edges) - 1) / np.maximum(count, 1)
-    return centre[kept], mean[kept], np.sqrt(np.maximum(square - mean**2, 0.0))[kept]
+    return centre[kept], mean[kept]
 
 
-def _evidence(report: Page, diagnosis: Diagnosis, finding: Finding) -> None:
+def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
     section = report.section(
         title(finding).capitalize(), f"{finding.effect.equation}, with {size(finding)}. {finding.reason}."
     )
     channel = finding.channel
-    signal = diagnosis.attribution.signals.get(finding.effect.signal)
-    if channel not in ("stiffness", "torque", "innovation") or signal is None:
+    signal = diagnosis.signals.get(finding.effect.signal)
+    if channel not in FORCE_CHANNELS or signal is None:
         return
-    applied = diagnosis.attribution.signals["clamp_force"] > 150.0
+    applied = diagnosis.signals["clamp_force"] > 150.0
     if channel != "stiffness" or not applied.any():
         applied = np.ones(len(signal), bool)
     unit = UNITS[channel]
     traces = []
     for residual, name, style in (
-        (diagnosis.attribution.initial[channel], "before", PALE),
-        (diagnosis.attribution.residual[channel], "after", MODEL),
+        (diagnosis.initial[channel], "before", PALE),
+        (diagnosis.residual[channel], "after", MODEL),
     ):
-        x, mean, _ = _binned(signal[applied], residual[applied])
-        traces.append(Trace(name, x, mean, style))
-    panels = [Panel(f"mean residual of the {_PATHS[channel]}", unit, traces)]
+        traces.append(Trace(name, *_binned(signal[applied], residual[applied]), style))
+    panels = [Panel(f"mean residual of the {NAMES[channel]}", unit, traces)]
     section.figure(xy_figure(panels, finding.effect.signal.replace("_", " ")), "Mean residual in bins of equal counts.")
-    if finding.placebo is not None:
-        section.text(f"Placebo: with {finding.effect.placebo.replace('_', ' ')} disturbed, the same term reaches "
-                     f"{100 * finding.placebo:.0f} % of this gain.")  # fmt: skip
+    for text, share in finding.placebos.items():
+        section.text(f"Placebo: with {text} the same term reaches {100 * share:.0f} % of this gain.")
     section.table(
         ["parameter", "value", "unit"],
         [[n, number(v, finding.sigmas.get(n, 0.0)), _unit(finding, n)] for n, v in finding.values.items()],
     )
 
 
-def _unit(finding: Finding, name: str) -> str:
+def _unit(finding: Candidate, name: str) -> str:
     return next((p.unit for p in finding.effect.parameters if p.name == name), "")
 
 
-def _rest(report: Page, diagnosis: Diagnosis) -> None:
-    rest = diagnosis.unexplained
+def _left(report: Page, diagnosis: Diagnosis) -> None:
     section = report.section("What is left")
-    if rest is None:
-        section.text("No smooth function of any measured or estimated signal explains what is left on left-out episodes.")
-    else:
+    if diagnosis.unexplained is None:
         section.text(
-            f"{rest.rms:.0f} N RMS ({100 * rest.share:.0f} % of the mean square) of the {_PATHS[rest.channel]} follow "
-            f"{rest.signal.replace('_', ' ')} on left-out episodes. No effect of the catalogue explains it; none was invented."
+            "Nothing clearly above what the calibration achieved on its own data, and no smooth function of any signal."
         )
-    for channel, listed in diagnosis.rests.items():
-        if not listed:
+    section.table(
+        ["", "left, RMS", "achieved by the calibration", "unit", "share of before", ""],
+        [
+            [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}", UNITS[c], f"{p.share:.2f}", "not explained" if p.present else ""]
+            for c, p in diagnosis.left.items()
+        ],
+        "Residual with the contact angle held. No effect of the catalogue explains what is marked; none was invented.",
+    )
+    for channel, left in diagnosis.left.items():
+        keep = diagnosis.residual[channel] != 0.0
+        if not left.dependences or keep.sum() < _FEWEST:
             continue
-        signal = diagnosis.attribution.signals[listed[0].signal]
-        keep = diagnosis.attribution.residual[channel] != 0.0
-        if keep.sum() < 100:
-            continue
-        before = _binned(signal[keep], diagnosis.attribution.initial[channel][keep])
-        after = _binned(signal[keep], diagnosis.attribution.residual[channel][keep])
-        traces = [Trace("before", before[0], before[1], PALE), Trace("after", after[0], after[1], MARKS)]
+        strongest = left.dependences[0].signal
+        signal = diagnosis.signals[strongest]
+        before = _binned(signal[keep], diagnosis.initial[channel][keep])
+        after = _binned(signal[keep], diagnosis.residual[channel][keep])
+        traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
         section.figure(
-            xy_figure([Panel(f"{_PATHS[channel]}, mean residual", "N", traces)], listed[0].signal.replace("_", " ")),
-            f"Strongest dependence of the {_PATHS[channel]} residual after the diagnosis.",
+            xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),
+            f"Strongest dependence of the {NAMES[channel]} residual after the diagnosis.",
         )
-        earlier = {r.signal: r for r in diagnosis.rests_before.get(channel, [])}
+        earlier = {d.signal: f"{d.share:.3f}" for d in diagnosis.left_before.get(channel, [])}
         section.table(
             ["signal", "share before", "share after", "mean gain / its error"],
             [
-                [
-                    r.signal.replace("_", " "),
-                    f"{earlier[r.signal].share:.3f}" if r.signal in earlier else "–",
-                    f"{r.share:.3f}",
-                    f"{r.certainty:.1f}",
-                ]
-                for r in listed[:6]
+                [d.signal.replace("_", " "), earlier.get(d.signal, "–"), f"{d.share:.3f}", f"{d.certainty:.1f}"]
+                for d in left.dependences[:_LISTED]
             ],
-            f"{_PATHS[channel]}: share of the residual's mean square that a smooth function explains on left-out episodes.",
+            f"{NAMES[channel]}: share of the residual's mean square that a smooth function explains on left-out episodes.",
         )
 
 
@@ -177,7 +167,7 @@ def _candidates(report: Page, diagnosis: Diagnosis) -> None:
         "All candidates", "Every effect of the catalogue, with what it would have gained and why it was not taken."
     )
     rows = []
-    for f in ranked(diagnosis.attribution.findings):
+    for f in diagnosis.findings:
         state = "accepted" if f.accepted else "in calibration" if f.in_calibration else ""
         unit = UNITS.get(f.channel or "", "")
         gain = f"{f.gain:.3g} {unit}" if f.channel and not f.in_calibration else "–"
@@ -186,14 +176,13 @@ def _candidates(report: Page, diagnosis: Diagnosis) -> None:
 
 
 def _recalibration(report: Page, diagnosis: Diagnosis) -> None:
-    attribution = diagnosis.attribution
     rows = [
-        [knob.name, number(value, attribution.sigmas.get(knob, 0.0)), "relative" if knob.unit == "1" else knob.unit]
-        for knob, value in attribution.values.items()
-        if value != 0.0 and knob.name.partition(".")[0] in ("contact", "stiffness", "thermal", "motor", "friction")
+        [key, f"{r.before:.4g}", number(r.value, r.sigma), r.unit, f"{r.gain:.3g} {UNITS[r.channel]}"]
+        for key, r in diagnosis.recalibrated.items()
     ]
     if rows:
         report.section(
             "Recalibrated",
-            "Base parameters that were re-estimated together with the effects: a calibration that is off is no effect.",
-        ).table(["parameter", "change", "unit"], rows)
+            "Base parameters that were estimated anew together with the effects: a calibration that is off is no effect. The "
+            "curve's coefficients stand for those of all pad thicknesses, which follow in proportion, and gain together.",
+        ).table(["parameter", "before", "after", "unit", "gain"], rows)

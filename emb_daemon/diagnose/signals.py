@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from emb_daemon.diagnose.channels import Bench, wheel_angle
-from emb_daemon.offline import estimate
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.models.wheel import wheel_angle
+from emb_daemon.offline.run import estimate, held
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
@@ -11,9 +13,10 @@ _KNOTS = 7
 _APPLIED_N = 150.0
 
 
-def signals(bench: Bench, parameters: np.void) -> dict[str, np.ndarray]:
+def signals(bench: Bench) -> dict[str, np.ndarray]:
     """Measured and estimated signals at every sample of all logs, under the names of the report."""
     columns: dict[str, list[np.ndarray]] = {}
+    parameters = held(to_parameters(bench.calibration))
     for trial in bench.trials:
         samples = trial.log.samples
         estimates = estimate(samples, parameters)

@@ -1,14 +1,24 @@
 """The verdict in words, for terminal and page."""
 
-from emb_daemon.diagnose.attribution import Finding
-from emb_daemon.diagnose.diagnosis import Diagnosis, amplitudes
+from emb_daemon.diagnose.diagnosis import Diagnosis
+from emb_daemon.diagnose.report import amplitudes
+from emb_daemon.diagnose.residuals import UNITS
+from emb_daemon.diagnose.screening import Candidate
 
 #: Units at the end of parameters' keys, longest first.
 _UNIT_ENDINGS = (
     "_um_per_MJ", "_um_per_K", "_Nms_per_rad", "_rad_per_s", "_per_turn", "_per_K", "_rad", "_um", "_Nm", "_m2", "_A", "_C",
     "_s",
 )  # fmt: skip
-_NAMES = {"stiffness": "stiffness path", "torque": "torque path", "fused": "fused", "maximum_likelihood": "maximum likelihood"}
+NAMES = {
+    "stiffness": "stiffness path",
+    "torque": "torque path",
+    "maximum_likelihood": "maximum likelihood",
+    "fused": "fused force",
+    "innovation": "difference of both paths",
+    "temperature": "temperatures",
+    "brake_torque": "brake torque",
+}
 
 
 def number(value: float, sigma: float = 0.0) -> str:
@@ -16,11 +26,11 @@ def number(value: float, sigma: float = 0.0) -> str:
     return f"{value:.3g} ± {sigma:.2g}" if sigma > 0.0 else f"{value:.3g}"
 
 
-def title(finding: Finding) -> str:
+def title(finding: Candidate) -> str:
     return finding.effect.name.replace("_", " ")
 
 
-def size(finding: Finding) -> str:
+def size(finding: Candidate) -> str:
     """The parameters that say how large an effect is, with units."""
     found = amplitudes(finding)
     parts = [f"{_spoken(name)} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
@@ -29,7 +39,8 @@ def size(finding: Finding) -> str:
         if "cosine" in name or "sine" in name or name not in finding.values:
             continue
         value = number(finding.values[name], finding.sigmas.get(name, 0.0))
-        parts.append(f"{_spoken(name)} {value} {_unit(parameter.unit)}")
+        before = f"{finding.before[name]:.3g} → " if name in finding.before else ""
+        parts.append(f"{_spoken(name)} {before}{value} {_unit(parameter.unit)}")
     return ", ".join(part.strip() for part in parts)
 
 
@@ -46,37 +57,48 @@ def _spoken(name: str) -> str:
 
 
 def verdict(diagnosis: Diagnosis) -> str:
-    """What was found and what it changed, in one or two sentences."""
-    accepted = diagnosis.accepted
-    path = "fused" if diagnosis.bench.has_reference else "innovation"
-    before, after = diagnosis.before.rmse(path), diagnosis.after.rmse(path)
+    """What was found and what it changed, in a few sentences."""
+    before, after = diagnosis.before.rmse(diagnosis.whole), diagnosis.after.rmse(diagnosis.whole)
     where = "on the validation logs" if diagnosis.judged_on == "validate" else "on left-out episodes"
     if not diagnosis.bench.has_reference:
         where += ", judged by the difference of both paths because no reference force was recorded"
     change = f"error {before:.1f} N → {after:.1f} N {where}"
-    if accepted:
-        names = " and ".join(f"{title(f)} ({size(f)})" for f in accepted)
-        text = f"Found: {names}; {change}."
-    elif diagnosis.attribution.recalibrated:
-        text = f"No effect beyond the calibration's models is proven; the calibration itself was off: {change}."
-    else:
-        text = f"No effect beyond the calibration's models is proven: {change}."
-    rest = diagnosis.unexplained
-    if rest:
-        text += (
-            f" Not explained by any known effect: {rest.rms:.0f} N RMS of the {_NAMES.get(rest.channel, rest.channel)},"
-            f" which depend most on {rest.signal.replace('_', ' ')}."
+    if not diagnosis.bench.has_current:
+        change += "; no motor current was recorded, so the stiffness path alone was diagnosed"
+    found = [f"{title(f)} ({size(f)})" for f in diagnosis.accepted if not f.in_calibration]
+    changed = [f"{title(f)} ({size(f)})" for f in diagnosis.accepted if f.in_calibration]
+    sentences = [f"Found: {' and '.join(found)}"] if found else []
+    if changed:
+        sentences.append(f"{'n' if found else 'N'}ot as calibrated: {' and '.join(changed)}")
+    if not sentences:
+        off = "; the calibration itself was off" if diagnosis.recalibrated else ""
+        sentences = [f"No effect beyond the calibration's models is proven{off}"]
+    text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
+    return " ".join([text, *_unexplained(diagnosis)])
+
+
+def _unexplained(diagnosis: Diagnosis) -> list[str]:
+    left = diagnosis.unexplained
+    if left is None:
+        return []
+    unit, strongest = UNITS[left.channel], left.strongest
+    if left.beyond:
+        text = (
+            f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, "
+            f"where the calibration achieved {left.achieved:.3g} {unit} on its own data"
         )
-    return text
+    else:
+        text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
+    return [f"{text}, which depend most on {strongest.signal.replace('_', ' ')}." if strongest else f"{text}."]
 
 
 def table(diagnosis: Diagnosis) -> str:
     """RMSE before and after, one line for each path."""
-    figures = diagnosis.figures()
-    lines = [f"{'RMSE / N':<22}{'before':>10}{'after':>10}   95 % interval of after/before"]
-    for path, part in figures.items():
+    lines = [f"{'RMSE / N':<26}{'before':>10}{'after':>10}   95 % interval of after/before"]
+    for path, part in diagnosis.figures().items():
         total = part["total"]
         low, high = total["ratio_interval"]
-        name = _NAMES.get(path, path)
-        lines.append(f"{name:<22}{total['rmse_before_N']:>10.1f}{total['rmse_after_N']:>10.1f}   {low:.2f} to {high:.2f}")
+        lines.append(
+            f"{NAMES[path]:<26}{total['rmse_before_N']:>10.1f}{total['rmse_after_N']:>10.1f}   {low:.2f} to {high:.2f}"
+        )
     return "\n".join(lines)

@@ -4,20 +4,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.offline.score import rmse
+from emb_daemon.wire.contract import CYCLE_S
+
 #: Evidence needed to say that something is left: mean relative gain over its standard error, over episodes.
 _SURE = 2.5
-#: Share of the residual's mean square from which a rest is worth a word.
+#: Share of the residual's mean square from which a dependence is worth a word.
 _LEAST_SHARE = 0.05
+#: Residual over what the calibration achieved on its own data from which something is left: its figures scatter by a quarter
+#: from log to log and pad to pad, units by less.
+_CLEARLY = 1.5
+#: Heat without a brake torque sensor is as uncertain as pads' friction, which no table knows better from one day to the next.
+_FRICTION_SHARE = 0.08
 
 
 @dataclass(frozen=True)
-class Rest:
+class Dependence:
     """Dependence of one channel's residual on one signal.
 
     Attributes:
         share: of the left-out squared error that smooth functions of the signal take away.
         rms: the same as RMS in N.
         certainty: mean relative gain over its standard error; relative, so that one violent stop has one vote.
+        matters: sure, and large enough for a word.
     """
 
     channel: str
@@ -28,13 +38,13 @@ class Rest:
     matters: bool
 
 
-def rests(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], samples: int, floor: float) -> list[Rest]:
-    """One `Rest` for each signal, strongest first.
+def dependences(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], samples: int, floor: float) -> list[Dependence]:
+    """One for each signal, strongest first.
 
     Args:
         gains: by signal, squared error of each left-out episode without and with a smooth function of the signal.
         samples: that the squared errors are summed over.
-        floor: RMS (N) from which a rest matters.
+        floor: RMS (N) from which a dependence matters.
     """
     result = []
     for signal, (without, with_) in gains.items():
@@ -45,5 +55,67 @@ def rests(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], samples
         share = max(float(gain.sum() / max(without.sum(), 1e-300)), 0.0)
         rms = float(np.sqrt(max(gain.sum(), 0.0) / max(samples, 1)))
         matters = share >= _LEAST_SHARE and rms >= floor and certainty >= _SURE
-        result.append(Rest(channel, signal, share, rms, certainty, matters))
-    return sorted(result, key=lambda rest: -rest.share)
+        result.append(Dependence(channel, signal, share, rms, certainty, matters))
+    return sorted(result, key=lambda dependence: -dependence.share)
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is left of one channel's residual.
+
+    Attributes:
+        rms: of the residual after everything, on the judging logs, in the channel's unit.
+        achieved: what the calibration achieved on its own data, by its figures and its noise; NaN where it does not say.
+        share: of the mean square there was before, that is left.
+        dependences: on signals, strongest first.
+    """
+
+    channel: str
+    rms: float
+    achieved: float
+    share: float
+    dependences: tuple[Dependence, ...]
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the residual is clearly above what the calibration achieved."""
+        return self.rms > _CLEARLY * self.achieved
+
+    @property
+    def present(self) -> bool:
+        return self.beyond or any(d.matters for d in self.dependences)
+
+    @property
+    def strongest(self) -> Dependence | None:
+        return next(iter([*(d for d in self.dependences if d.matters), *self.dependences]), None)
+
+
+def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
+    """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
+    nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.
+
+    Args:
+        force_N: clamp forces of the judging logs.
+        rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
+    """
+    figures = calibration.provenance.figures if calibration.provenance else {}
+    noise, motor = calibration.noise, calibration.motor
+    # Without a reference the current is held against the stiffness path: its error comes on top.
+    paths = {"stiffness": ("stiffness",), "torque": ("torque",), "innovation": ("stiffness", "torque")}.get(channel, ())
+    own = {
+        "stiffness": np.hypot(noise.stiffness_N, noise.stiffness_relative * force_N),
+        "torque": np.sqrt(
+            (motor.torque_constant_Nm_per_A * noise.current_A / motor.gear_gain_m_per_rad) ** 2
+            + 2.0 * (motor.inertia_kg_m2 * noise.speed_rad_per_s / CYCLE_S / motor.gear_gain_m_per_rad) ** 2
+            + (noise.torque_relative * force_N) ** 2
+        ),
+    }
+    total = 0.0
+    for path in paths:
+        stated = [value for name, value in figures.items() if name.endswith(f"{path} rmse_N")]
+        total += max([*stated, float(np.sqrt(np.mean(own[path] ** 2)))]) ** 2
+    if channel == "temperature":
+        stated = [value for name, value in figures.items() if name.endswith(" K") and "thesis" not in name]
+        heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0
+        total = max([*stated, calibration.thermal.sigma_K]) ** 2 + heated**2
+    return float(np.sqrt(total)) if total else float("nan")

@@ -1,52 +1,45 @@
 """Effects that the thesis's models lack, one file each, and their registry.
 
 An effect's file holds its parameters (a numpy record, exactly neutral at zero), its state, the compiled term that the
-running estimator calls (grouped by path in `paths`), and an `Effect` that says on which path it acts and what physics
-allows.
+running estimator calls (composed by hook in `paths`), and an `Effect` that says where it enters and what physics allows.
 """
+
+from importlib import import_module
 
 import numpy as np
 
-from emb_daemon.effects import (
-    backlash,
-    cogging_torque,
-    current_offset,
-    disc_radiation,
-    disc_thermal_expansion,
-    disc_thickness_variation,
-    friction_asymmetry,
-    friction_coefficient_fade,
-    gear_mesh_ripple,
-    pad_wear,
-    second_relaxation,
-    signal_delay,
-    stiffness_hysteresis,
-    stribeck_friction,
-    thermocouple_lag,
-    torque_constant_fade,
-    viscous_friction,
-)
 from emb_daemon.effects.base import Effect
 
-REGISTRY: tuple[Effect, ...] = (
-    disc_thickness_variation.EFFECT,
-    disc_thermal_expansion.EFFECT,
-    pad_wear.EFFECT,
-    torque_constant_fade.EFFECT,
-    current_offset.EFFECT,
-    viscous_friction.EFFECT,
-    stribeck_friction.EFFECT,
-    friction_asymmetry.EFFECT,
-    gear_mesh_ripple.EFFECT,
-    cogging_torque.EFFECT,
-    stiffness_hysteresis.EFFECT,
-    second_relaxation.EFFECT,
-    signal_delay.EFFECT,
-    backlash.EFFECT,
-    friction_coefficient_fade.EFFECT,
-    disc_radiation.EFFECT,
-    thermocouple_lag.EFFECT,
+#: Simpler causes first: of two that a log cannot tell apart, diagnose takes the one that stands first. Also the order in
+#: which the terms of one hook are added.
+_NAMES = (
+    "disc_thickness_variation",
+    "disc_thermal_expansion",
+    "pad_wear",
+    "torque_constant_fade",
+    "current_offset",
+    "viscous_friction",
+    "stribeck_friction",
+    "friction_asymmetry",
+    "gear_mesh_ripple",
+    "cogging_torque",
+    "stiffness_hysteresis",
+    "second_relaxation",
+    "signal_delay",
+    "backlash",
+    "friction_coefficient_fade",
+    "disc_radiation",
+    "thermocouple_lag",
 )
 
-EFFECT_PARAMETERS = np.dtype([(effect.name, effect.parameter_record) for effect in REGISTRY], align=True)
-EFFECT_STATES = np.dtype([(effect.name, effect.state) for effect in REGISTRY if effect.state is not None], align=True)
+REGISTRY: tuple[Effect, ...] = tuple(import_module(f"{__name__}.{name}").EFFECT for name in _NAMES)
+
+
+def parameter_record(effects: tuple[Effect, ...]) -> np.dtype:
+    """Parameters of all effects, by name."""
+    return np.dtype([(effect.name, effect.parameter_record) for effect in effects], align=True)
+
+
+def state_record(effects: tuple[Effect, ...]) -> np.dtype:
+    """States of all effects that have one, by name."""
+    return np.dtype([(effect.name, effect.state) for effect in effects if effect.state is not None], align=True)

@@ -1,8 +1,68 @@
-"""The shape that every effect has."""
+"""The shape that every effect has, and the places in the physics where one can enter."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
+
+@dataclass(frozen=True)
+class Hook:
+    """A quantity of the estimator's physics to which terms of effects add.
+
+    Attributes:
+        unit: of the quantity, hence of what a term returns.
+        start: what the quantity is without any effect; None where the caller brings it (see ``value``).
+        arguments: what a term may ask for by name, beside its parameters ``p``, its state ``s`` and ``value``, which is the
+            quantity with the terms of all effects before it in the registry. ``m`` is the SAMPLE; the others are in SI units.
+        path: ``stiffness``, ``torque`` or ``thermal``.
+        channel: residual in which a change of it shows.
+        like: base parameter (key of the calibration) that changes the same quantity, or None: its regressor times a signal is
+            what any function of that signal would do here. ``like_per_unit`` of it make one unit of the quantity.
+    """
+
+    unit: str
+    start: float | None
+    arguments: tuple[str, ...]
+    path: str
+    channel: str
+    like: str | None = None
+
+
+_GEAR = ("m", "travel", "mean_speed", "friction_mean", "past_contact", "force", "dt")
+
+#: By name, in the order in which a sample passes through them.
+HOOKS = {
+    # What disc and pads have gained since power-on in the pads' way.
+    "thickness": Hook(
+        "m", 0.0, ("m", "disc", "disc_known", "power", "dt"), "stiffness", "stiffness", "contact.clearance_rad"
+    ),
+    # What the spindle is ahead of the measured motor angle.
+    "motor_angle": Hook("rad", 0.0, ("m", "dt"), "stiffness", "stiffness", "contact.clearance_rad"),
+    # Factor on the static clamp force, after ``travel`` rad in contact.
+    "stiffness": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
+    # Static clamp force.
+    "force": Hook("N", None, ("travel", "dt"), "stiffness", "stiffness"),
+    # Factor on the torque constant. Its terms are also asked with dt 0, and must then leave their state as it is.
+    "torque_constant": Hook(
+        "1", 1.0, ("m", "disc", "disc_known", "dt"), "torque", "torque", "motor.torque_constant_Nm_per_A"
+    ),
+    # Current of the motor.
+    "current": Hook("A", None, ("m", "dt"), "torque", "torque"),
+    # Motor torque that reaches the gear.
+    "torque": Hook("N·m", None, ("m", "travel", "mean_speed", "dt"), "torque", "torque"),
+    # Factors on the gear gain and on gear friction; ``friction_mean`` in [-1, 1] is the friction state, positive while
+    # clamping, ``past_contact`` the motor angle past contact, rad.
+    "gear_gain": Hook("1", 1.0, _GEAR, "torque", "torque"),
+    "gear_friction": Hook("1", 1.0, _GEAR, "torque", "torque"),
+    # Temperature of a backing plate, degC; ``side`` 0 is the inner one.
+    "backplate": Hook("K", None, ("side", "dt"), "thermal", "temperature"),
+    # Factor on the pads' coefficient of friction at their ``surface`` temperature, degC.
+    "pad_friction": Hook("1", 1.0, ("surface",), "thermal", "brake_torque"),
+    # Change of the disc temperature over ``dt`` by what the disc model lacks.
+    "disc": Hook("K", 0.0, ("heat_capacity", "disc", "ambient", "dt"), "thermal", "temperature"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -11,6 +71,10 @@ class Parameter:
 
     The term is linear, or nearly so, in its amplitudes and vanishes with them. A parameter with ``starts`` shapes the
     term instead (a time constant, an order) and says nothing while the amplitudes are zero; the starts cover its range.
+
+    Attributes:
+        drawn: range from which blind trials draw it; None: not drawn. An effect takes part if all its parameters do.
+        group: amplitudes of one group stand or fall together (cosine and sine of one order).
     """
 
     name: str
@@ -20,6 +84,47 @@ class Parameter:
     prior: float
     meaning: str
     starts: tuple[float, ...] = ()
+    drawn: tuple[float, float] | None = None
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class Placebo:
+    """What must destroy the finding: with it, the effect may not explain half of what it explains.
+
+    Attributes:
+        text: what is disturbed, as the report says it.
+        samples: (SAMPLE rows, episode of each row, random generator) → disturbed rows, over which the term then runs.
+        signal: (the effect's ``signal`` at each sample, episode, random generator) → disturbed signal, which the term then
+            follows; for effects that enter where a base parameter does (`Hook.like`) in proportion to their signal.
+        order: order of a harmonic → orders that it cannot be.
+    """
+
+    text: str
+    samples: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray] | None = None
+    signal: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray] | None = None
+    order: Callable[[float], tuple[float, ...]] | None = None
+
+    def __post_init__(self):
+        if sum(way is not None for way in (self.samples, self.signal, self.order)) != 1:
+            raise ValueError(f"placebo {self.text}: expected one of samples, signal and order")
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A shape that is looked for over all of its range: the order of a cosine and sine over the motor angle.
+
+    Attributes:
+        order, cosine, sine: names of the parameters.
+        whole: the order is a whole number, chosen and not fitted.
+        grows_with: signal that the harmonic's amplitude is proportional to, or None.
+    """
+
+    order: str
+    cosine: str
+    sine: str
+    whole: bool = False
+    grows_with: str | None = None
 
 
 @dataclass(frozen=True)
@@ -27,26 +132,49 @@ class Effect:
     """What the estimator, the calibration and diagnose need to know of an effect.
 
     Attributes:
-        path: ``stiffness``, ``torque`` or ``thermal``.
+        hook: where it enters, one of `HOOKS`.
+        term: what it adds there, compiled (`emb_daemon.jit.njit`), exactly zero at zero amplitudes. Its arguments are asked
+            for by name: ``p`` its parameters, ``s`` its state, ``value``, and what the hook offers.
         equation: the term as an engineer writes it.
         source: paper, standard or textbook.
         state: numpy dtype of what the running term remembers, or None.
         signal: what the effect is a function of; evidence is plotted over it.
         manoeuvre: what a driver of the rig does to make it visible and tell it from others.
-        placebo: signal that, disturbed, must destroy the finding: ``wheel_pulse`` or ``disc``; None where there is none.
-        forbidden: condition under which physics forbids the term to vary: ``standing`` wheel; None where there is none.
+        placebos: what must destroy the finding.
+        harmonic: how its shape is looked for, if it is a harmonic of the motor angle.
     """
 
     name: str
-    path: str
+    hook: str
+    term: Callable
     parameters: tuple[Parameter, ...]
     equation: str
     source: str
     state: np.dtype | None = None
     signal: str = "clamp_force"
     manoeuvre: str = ""
-    placebo: str | None = None
-    forbidden: str | None = None
+    placebos: tuple[Placebo, ...] = ()
+    harmonic: Harmonic | None = None
+
+    def __post_init__(self):
+        if self.hook not in HOOKS:
+            raise ValueError(f"effect {self.name}: there is no hook {self.hook}; there are {', '.join(HOOKS)}")
+        offered = {"p", "value", *HOOKS[self.hook].arguments} | ({"s"} if self.state is not None else set())
+        if unknown := set(self.arguments) - offered:
+            raise ValueError(f"effect {self.name}: {self.hook} does not offer {', '.join(sorted(unknown))}")
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the term's arguments."""
+        return tuple(inspect.signature(plain(self.term)).parameters)
+
+    @property
+    def path(self) -> str:
+        return HOOKS[self.hook].path
+
+    @property
+    def channel(self) -> str:
+        return HOOKS[self.hook].channel
 
     @property
     def parameter_record(self) -> np.dtype:
@@ -61,3 +189,30 @@ class Effect:
     def shapes(self) -> tuple[Parameter, ...]:
         """Parameters that only shape it."""
         return tuple(parameter for parameter in self.parameters if parameter.starts)
+
+    def parameter(self, name: str) -> Parameter:
+        return next(parameter for parameter in self.parameters if parameter.name == name)
+
+
+def plain(function: Callable) -> Callable:
+    """The Python function under a compiled one."""
+    return inspect.unwrap(getattr(function, "py_func", function))
+
+
+def of_another_episode(signal: np.ndarray, episode: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Each episode gets another one's mean: temperatures mostly rise in a log, so one shifted in time is much the same."""
+    count = np.maximum(np.bincount(episode), 1)
+    return random.permutation(np.bincount(episode, signal) / count)[episode]
+
+
+def at_another_time(*fields: str) -> Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]:
+    """Some fields of the samples as they were a quarter to three quarters of the log earlier, as if it were a circle."""
+
+    def disturb(samples: np.ndarray, _episode: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        shift = int(len(samples) * random.uniform(0.25, 0.75))
+        disturbed = samples.copy()
+        for field in fields:
+            disturbed[field] = np.roll(samples[field], shift)
+        return disturbed
+
+    return disturb

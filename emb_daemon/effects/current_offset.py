@@ -12,8 +12,9 @@ def term(p):
 
 EFFECT = Effect(
     name="current_offset",
-    path="torque",
-    parameters=(Parameter("offset_A", "A", -20.0, 20.0, 0.3, "current that flows but is not measured"),),
+    hook="current",
+    term=term,
+    parameters=(Parameter("offset_A", "A", -20.0, 20.0, 0.3, "current that flows but is not measured", drawn=(-20.0, 20.0)),),
     equation="I → I + I₀",
     source="Hall sensors: offset 0.5 to 1 % of range",
     signal="current",

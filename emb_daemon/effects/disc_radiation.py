@@ -1,6 +1,6 @@
 """Radiation of the disc beyond what the calibration's disc radiates: it rules when a hot disc stands."""
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import KELVIN, STEFAN_BOLTZMANN
 
@@ -16,11 +16,12 @@ def term(p, heat_capacity, disc, ambient, dt):
 
 EFFECT = Effect(
     name="disc_radiation",
-    path="thermal",
+    hook="disc",
+    term=term,
     parameters=(Parameter("area_m2", "m²", -0.3, 1.0, 0.1, "emissivity times radiating area"),),
     equation="C dT_disc/dt → … − ε A σ (T⁴ − T_ambient⁴)",
     source="thesis 8.2 lumps it into convection; Limpert, Brake Design and Safety, 3rd ed., ch. 3",
     signal="disc_temperature",
     manoeuvre="let a disc of more than 300 °C cool while it stands",
-    placebo="disc",
+    placebos=(Placebo("wheel turning at another time", samples=at_another_time("wheel_speed", "has_wheel_speed")),),
 )

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
 from emb_daemon.jit import njit
 
 STATE = np.dtype([("known", "?"), ("start_C", "f8")], align=True)
 
 
 @njit
-def term(p, s, disc, known):
+def term(p, s, disc, disc_known):
     """Growth of the disc in m since power-on, where the contact angle was set."""
-    if p.growth_um_per_K == 0.0 or not known:
+    if p.growth_um_per_K == 0.0 or not disc_known:
         return 0.0
     if not s.known:
         s.known = True
@@ -21,12 +21,17 @@ def term(p, s, disc, known):
 
 EFFECT = Effect(
     name="disc_thermal_expansion",
-    path="stiffness",
-    parameters=(Parameter("growth_um_per_K", "µm/K", -1.0, 2.0, 0.25, "growth of disc and pads between the pistons"),),
+    hook="thickness",
+    term=term,
+    parameters=(
+        Parameter(
+            "growth_um_per_K", "µm/K", -1.0, 2.0, 0.25, "growth of disc and pads between the pistons", drawn=(-1.0, 2.0)
+        ),
+    ),
     equation="θ → θ + g (T_disc − T_start) / γ",
     source="thesis 10.2; grey iron, 26 mm, 1.0e-5 1/K: 0.26 µm/K",
     state=STATE,
     signal="disc_temperature",
     manoeuvre="heat the disc, then clamp repeatedly while it cools: wear stays, growth goes back",
-    placebo="disc",
+    placebos=(Placebo("disc temperature of another episode", signal=of_another_episode),),
 )

@@ -4,43 +4,21 @@ The wheel angle comes from the wheel's pulse counter, carried on by the wheel sp
 the counter was at power-on, which is arbitrary, so each order has a cosine and a sine.
 """
 
-from math import cos, pi, sin
+from math import cos, sin
 
 import numpy as np
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo
 from emb_daemon.jit import njit
+from emb_daemon.models.wheel import PULSE_MODULO, PULSES_PER_TURN, WHEEL, track
 
 ORDERS = 4
-PULSES_PER_TURN = 96
-PULSE_MODULO = 4096
-#: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
-_CORRECTION = 0.2
-
-STATE = np.dtype([("known", "?"), ("count", "f8"), ("turned", "f8")], align=True)
+#: Those that discs commonly have.
+_COMMON_ORDERS = 2
 
 
 @njit
-def track(s, pulse, wheel_speed, dt):
-    """Wheel angle in rad: carried on by ``wheel_speed`` rad/s, corrected when the pulse counter has moved."""
-    width = 2.0 * pi / PULSES_PER_TURN
-    if not s.known:
-        s.known = True
-        s.count = pulse
-        s.turned = (pulse + 0.5) * width
-        return s.turned
-    s.turned += wheel_speed * dt
-    moved = (pulse - s.count % PULSE_MODULO + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
-    if moved != 0.0:
-        s.count += moved
-        error = (s.count + 0.5) * width - s.turned
-        # More than two pulses off is no interpolation error: frames were missing.
-        s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
-    return s.turned
-
-
-@njit
-def term(p, s, pulse, has_pulse, wheel_speed, dt):
+def term(p, s, m):
     """Disc thickness in m above its mean, where the pads stand."""
     if (
         p.order_1_cosine_um == 0.0
@@ -53,10 +31,10 @@ def term(p, s, pulse, has_pulse, wheel_speed, dt):
         and p.order_4_sine_um == 0.0
     ):
         return 0.0
-    if not has_pulse:
+    if not m.has_wheel_pulse:
         s.known = False
         return 0.0
-    angle = track(s, pulse, wheel_speed, dt)
+    angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
     return 1e-6 * (
         p.order_1_cosine_um * cos(angle)
         + p.order_1_sine_um * sin(angle)
@@ -69,19 +47,50 @@ def term(p, s, pulse, has_pulse, wheel_speed, dt):
     )
 
 
+def _from_anywhere(samples, episode, random):
+    """Each episode begins at another place of the disc."""
+    disturbed = samples.copy()
+    offset = random.integers(0, PULSES_PER_TURN, episode[-1] + 1)[episode]
+    disturbed["wheel_pulse"] = np.mod(samples["wheel_pulse"] + offset, PULSE_MODULO)
+    return disturbed
+
+
+def _of_another_size(samples, _episode, random):
+    """A wheel that turns at another ratio: orders that no disc has."""
+    ratio = random.choice((0.63, 1.41, 2.57, 3.37))
+    disturbed = samples.copy()
+    known = samples["has_wheel_pulse"]
+    count = np.unwrap(samples["wheel_pulse"][known], period=PULSE_MODULO)
+    disturbed["wheel_pulse"][known] = np.mod(np.floor(ratio * count), PULSE_MODULO)
+    disturbed["wheel_speed"] *= ratio
+    return disturbed
+
+
 EFFECT = Effect(
     name="disc_thickness_variation",
-    path="stiffness",
+    hook="thickness",
+    term=term,
     parameters=tuple(
-        Parameter(f"order_{order}_{part}_um", "µm", -60.0, 60.0, 10.0, f"{part} of {order} per turn")
+        Parameter(
+            f"order_{order}_{part}_um",
+            "µm",
+            -60.0,
+            60.0,
+            10.0,
+            f"{part} of {order} per turn",
+            drawn=(-60.0, 60.0) if order <= _COMMON_ORDERS else (0.0, 0.0),
+            group=f"order {order}",
+        )
         for order in range(1, ORDERS + 1)
         for part in ("cosine", "sine")
     ),
     equation="θ → θ + Σ (aₙ cos nφ + bₙ sin nφ) / γ",
     source="Jacobsson, Aspects of disc brake judder, Proc. IMechE D 217, 2003: 10 to 20 µm, orders 1 to 4 when cold",
-    state=STATE,
+    state=WHEEL,
     signal="disc_angle",
     manoeuvre="hold the clamp force on a turning wheel for several turns",
-    placebo="wheel_pulse",
-    forbidden="standing",
+    placebos=(
+        Placebo("wheel angle beginning anew with each episode", samples=_from_anywhere),
+        Placebo("orders that no disc has", samples=_of_another_size),
+    ),
 )

@@ -12,8 +12,13 @@ def term(p, friction_mean):
 
 EFFECT = Effect(
     name="friction_asymmetry",
-    path="torque",
-    parameters=(Parameter("asymmetry", "1", -0.6, 0.6, 0.1, "half the difference of both directions over their mean"),),
+    hook="gear_friction",
+    term=term,
+    parameters=(
+        Parameter(
+            "asymmetry", "1", -0.6, 0.6, 0.1, "half the difference of both directions over their mean", drawn=(-0.6, 0.6)
+        ),
+    ),
     equation="T_f → T_f (1 + a s)",
     source="forward and backward efficiency of screws: Olaru et al., Mech. Mach. Theory 2005",
     signal="motor_speed",

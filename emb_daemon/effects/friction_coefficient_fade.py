@@ -1,23 +1,24 @@
 """Pad fade: hot pads rub less, so braking heats less than the friction table says."""
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
 from emb_daemon.jit import njit
 
-#: Least that is left of the coefficient of friction.
-_FLOOR = 0.2
+#: Most of the coefficient of friction that can be lost.
+_MOST = 0.8
 
 
 @njit
 def term(p, surface):
-    """Factor on the coefficient of friction at the pads' ``surface`` temperature, degC."""
+    """Coefficient of friction at the pads' ``surface`` temperature (degC) over that without fade, minus one."""
     if p.fade_per_K == 0.0:
-        return 1.0
-    return max(1.0 - p.fade_per_K * max(surface - p.onset_C, 0.0), _FLOOR)
+        return 0.0
+    return -min(p.fade_per_K * max(surface - p.onset_C, 0.0), _MOST)
 
 
 EFFECT = Effect(
     name="friction_coefficient_fade",
-    path="thermal",
+    hook="pad_friction",
+    term=term,
     parameters=(
         Parameter("fade_per_K", "1/K", -0.003, 0.008, 0.0015, "relative loss of friction above the onset"),
         Parameter("onset_C", "°C", 0.0, 500.0, 150.0, "surface temperature from which friction falls", (20.0, 100.0, 200.0)),
@@ -26,5 +27,5 @@ EFFECT = Effect(
     source="Limpert, Brake Design and Safety, 3rd ed., ch. 2: 0.4 at 150 °C to 0.2 at 350 °C",
     signal="pad_temperature",
     manoeuvre="equal drags from a cold and from a hot start",
-    placebo="disc",
+    placebos=(Placebo("wheel turning at another time", samples=at_another_time("wheel_speed", "has_wheel_speed")),),
 )

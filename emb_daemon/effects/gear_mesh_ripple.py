@@ -2,7 +2,7 @@
 
 from math import cos, sin
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Harmonic, Parameter, Placebo
 from emb_daemon.jit import njit
 
 
@@ -16,24 +16,31 @@ def cycle_mean(cosine, sine, order, angle, travel):
 
 
 @njit
-def term(p, angle, travel):
+def term(p, m, travel):
     """Gear gain over its mean, minus one, mean over the cycle."""
     if p.cosine == 0.0 and p.sine == 0.0:
         return 0.0
-    return cycle_mean(p.cosine, p.sine, p.order_per_turn, angle, travel)
+    return cycle_mean(p.cosine, p.sine, p.order_per_turn, m.angle, travel)
+
+
+def _off(order: float) -> tuple[float, ...]:
+    """Orders of no simple ratio to the one found: what is no ripple is there as well."""
+    return 0.73 * order, 1.37 * order
 
 
 EFFECT = Effect(
     name="gear_mesh_ripple",
-    path="torque",
+    hook="gear_gain",
+    term=term,
     parameters=(
-        Parameter("cosine", "1", -0.5, 0.5, 0.05, "cosine of the relative ripple over motor angle"),
-        Parameter("sine", "1", -0.5, 0.5, 0.05, "its sine"),
-        Parameter("order_per_turn", "1", 0.05, 100.0, 10.0, "ripples per motor turn", (0.05, 100.0)),
+        Parameter("cosine", "1", -0.5, 0.5, 0.05, "cosine of the relative ripple over motor angle", drawn=(-0.5, 0.5)),
+        Parameter("sine", "1", -0.5, 0.5, 0.05, "its sine", drawn=(-0.5, 0.5)),
+        Parameter("order_per_turn", "1", 0.05, 100.0, 10.0, "ripples per motor turn", (0.05, 100.0), drawn=(1.3, 12.0)),
     ),
     equation="γ → γ [1 + c cos nθ + d sin nθ]",
     source="transmission error: Smith, Gear Noise and Vibration, 2nd ed., ch. 1",
     signal="motor_angle",
     manoeuvre="slow strokes under load: ripple grows with force, cogging does not",
-    placebo="order",
+    placebos=(Placebo("another order", order=_off),),
+    harmonic=Harmonic("order_per_turn", "cosine", "sine", grows_with="clamp_force"),
 )

@@ -1,85 +1,63 @@
-"""The effects of one path together, as `estimator.step` calls them."""
+"""The effects at work: where each hook stands in the physics, as `estimator.step` calls it.
 
-from emb_daemon.effects import (
-    backlash,
-    cogging_torque,
-    current_offset,
-    disc_radiation,
-    disc_thermal_expansion,
-    disc_thickness_variation,
-    friction_asymmetry,
-    friction_coefficient_fade,
-    gear_mesh_ripple,
-    pad_wear,
-    second_relaxation,
-    signal_delay,
-    stiffness_hysteresis,
-    stribeck_friction,
-    thermocouple_lag,
-    torque_constant_fade,
-    viscous_friction,
-)
+A hook's function is written from the registry when this module is imported: one line for each effect that enters there, in the
+order of the registry, which compiled code then calls directly. numba keeps it on disk under the digest of all sources
+(`emb_daemon.jit`), so the same registry finds the same compiled code again.
+"""
+
+from emb_daemon import effects
+from emb_daemon.effects.base import HOOKS, Hook
 from emb_daemon.jit import njit
 
 
-@njit
-def thickness(e, s, m, disc, disc_known, power):
-    """What disc and pads have gained since power-on in the pads' way, m."""
-    wheel_speed = m.wheel_speed if m.has_wheel_speed else 0.0
-    return (
-        disc_thickness_variation.term(
-            e.disc_thickness_variation, s.disc_thickness_variation, m.wheel_pulse, m.has_wheel_pulse, wheel_speed, m.dt
-        )
-        + disc_thermal_expansion.term(e.disc_thermal_expansion, s.disc_thermal_expansion, disc, disc_known)
-        - pad_wear.term(e.pad_wear, s.pad_wear, power, m.dt)
-    )
+def _source(name: str, hook: Hook) -> str:
+    """The hook as Python: the quantity it starts from, plus the term of each effect."""
+    value = "value, " if hook.start is None else ""
+    lines = [f"def {name}({value}e, s, {', '.join(hook.arguments)}):"]
+    if hook.start is not None:
+        lines.append(f"    value = {hook.start!r}")
+    for effect in effects.REGISTRY:
+        if effect.hook == name:
+            own = {"p": f"e.{effect.name}", "s": f"s.{effect.name}"}
+            lines.append(f"    value += {effect.name}({', '.join(own.get(a, a) for a in effect.arguments)})")
+    return "\n".join([*lines, "    return value"])
 
 
-@njit
-def motor_angle(e, s, m):
-    """What the spindle is ahead of the measured motor angle, rad."""
-    return signal_delay.term(e.signal_delay, m.speed) + backlash.term(e.backlash, s.backlash, m.angle)
+def _compose(name: str):
+    scope = {effect.name: effect.term for effect in effects.REGISTRY} | {"__name__": __name__}
+    # numba's cache on disk wants a file that exists; this one's content decides together with the registry's.
+    exec(compile(_source(name, HOOKS[name]), __file__, "exec"), scope)
+    return njit(scope[name])
+
+
+thickness = _compose("thickness")
+motor_angle = _compose("motor_angle")
+stiffness = _compose("stiffness")
+force = _compose("force")
+torque_constant = _compose("torque_constant")
+current = _compose("current")
+torque = _compose("torque")
+gear_gain = _compose("gear_gain")
+gear_friction = _compose("gear_friction")
+backplate = _compose("backplate")
+pad_friction = _compose("pad_friction")
+disc_cooling = _compose("disc")
 
 
 @njit
 def static_force(e, s, static, travel, dt):
-    """Static clamp force (N) with hysteresis and slow relaxation after ``travel`` rad in contact."""
-    drive = static * (1.0 + stiffness_hysteresis.term(e.stiffness_hysteresis, s.stiffness_hysteresis, travel))
-    return drive + second_relaxation.term(e.second_relaxation, s.second_relaxation, drive, dt)
+    """Static clamp force (N) with what effects add to it after ``travel`` rad in contact."""
+    return force(static * stiffness(e, s, travel, dt), e, s, travel, dt)
 
 
 @njit
-def motor_torque(e, m, torque_constant, travel, mean_speed, disc, disc_known):
-    """Motor torque (N m) that reaches the gear."""
-    fade = torque_constant_fade.term(e.torque_constant_fade, m.caliper, m.has_thermocouple, disc, disc_known)
-    torque = torque_constant * (1.0 + fade) * (m.current_q + current_offset.term(e.current_offset))
-    return (
-        torque - viscous_friction.term(e.viscous_friction, mean_speed) - cogging_torque.term(e.cogging_torque, m.angle, travel)
-    )
-
-
-@njit
-def gear(e, angle, travel, mean_speed, friction_mean):
-    """Factors on the gear gain and on gear friction."""
-    friction = 1.0 + stribeck_friction.term(e.stribeck_friction, mean_speed)
-    friction += friction_asymmetry.term(e.friction_asymmetry, friction_mean)
-    return 1.0 + gear_mesh_ripple.term(e.gear_mesh_ripple, angle, travel), friction
+def motor_torque(e, s, m, nominal, travel, mean_speed, disc, disc_known):
+    """Motor torque (N m) that reaches the gear; ``nominal`` is the torque constant at 25 degC."""
+    constant = nominal * torque_constant(e, s, m, disc, disc_known, m.dt)
+    return torque(constant * current(m.current_q, e, s, m, m.dt), e, s, m, travel, mean_speed, m.dt)
 
 
 @njit
 def backplates(e, s, inner, outer, dt):
     """Temperatures (degC) of the backing plates from what their thermocouples show."""
-    more_inner, more_outer = thermocouple_lag.term(e.thermocouple_lag, s.thermocouple_lag, inner, outer, dt)
-    return inner + more_inner, outer + more_outer
-
-
-@njit
-def friction_factor(e, surface):
-    """Factor on the coefficient of friction of the pads."""
-    return friction_coefficient_fade.term(e.friction_coefficient_fade, surface)
-
-
-@njit
-def disc_cooling(e, heat_capacity, disc, ambient, dt):
-    """Change of the disc temperature (K) by what the disc model lacks."""
-    return disc_radiation.term(e.disc_radiation, heat_capacity, disc, ambient, dt)
+    return backplate(inner, e, s, 0, dt), backplate(outer, e, s, 1, dt)

@@ -10,21 +10,22 @@ STATE = np.dtype([("force", "f8"), ("before", "f8")], align=True)
 
 
 @njit
-def term(p, s, static_force, dt):
-    """Force in N that is still to come: share of the static force that lags with the second time constant."""
+def term(p, s, value, dt):
+    """Force in N that is still to come: share of the static force ``value`` that lags with the second time constant."""
     if p.share == 0.0:
         return 0.0
-    s.force = first_order_lag(s.force, s.before, static_force, dt, p.time_constant_s)
-    s.before = static_force
-    return p.share * (s.force - static_force)
+    s.force = first_order_lag(s.force, s.before, value, dt, p.time_constant_s)
+    s.before = value
+    return p.share * (s.force - value)
 
 
 EFFECT = Effect(
     name="second_relaxation",
-    path="stiffness",
+    hook="force",
+    term=term,
     parameters=(
-        Parameter("share", "1", -0.5, 0.5, 0.1, "share of the static force that follows slowly"),
-        Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant", (0.3, 1.5, 8.0)),
+        Parameter("share", "1", -0.5, 0.5, 0.1, "share of the static force that follows slowly", drawn=(0.0, 0.5)),
+        Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant", (0.3, 1.5, 8.0), drawn=(0.2, 5.0)),
     ),
     equation="F_r = w (v − F_s),  τ₂ dv/dt + v = F_s",
     source="standard linear solid; Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 1",

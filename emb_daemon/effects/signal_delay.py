@@ -5,15 +5,17 @@ from emb_daemon.jit import njit
 
 
 @njit
-def term(p, speed):
+def term(p, m):
     """Angle in rad by which the motor has gone on."""
-    return p.delay_s * speed
+    return p.delay_s * m.speed
 
 
 EFFECT = Effect(
     name="signal_delay",
-    path="stiffness",
-    parameters=(Parameter("delay_s", "s", -0.01, 0.01, 0.001, "age of the angle"),),
+    hook="motor_angle",
+    term=term,
+    # A delay is undone to first order, which one longer than a cycle and a half outgrows.
+    parameters=(Parameter("delay_s", "s", -0.01, 0.01, 0.001, "age of the angle", drawn=(0.0, 0.006)),),
     equation="θ → θ + d ω",
     source="first-order hold of a delayed sample",
     signal="motor_speed",

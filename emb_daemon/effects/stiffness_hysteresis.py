@@ -19,9 +19,10 @@ def term(p, s, travel):
 
 EFFECT = Effect(
     name="stiffness_hysteresis",
-    path="stiffness",
+    hook="stiffness",
+    term=term,
     parameters=(
-        Parameter("share", "1", 0.0, 0.2, 0.03, "half width of the loop over the clamp force"),
+        Parameter("share", "1", 0.0, 0.2, 0.03, "half width of the loop over the clamp force", drawn=(0.0, 0.2)),
         Parameter(
             "slip_angle_rad",
             "rad",
@@ -30,6 +31,7 @@ EFFECT = Effect(
             1.0,
             "motor angle over which the element stretches before it slips",
             (0.3, 1.0, 3.0),
+            drawn=(0.4, 2.0),
         ),
     ),
     equation="F_s → F_s (1 + h z),  dz = dθ/θ_slip held to ±1",

@@ -16,10 +16,20 @@ def term(p, mean_speed):
 
 EFFECT = Effect(
     name="stribeck_friction",
-    path="torque",
+    hook="gear_friction",
+    term=term,
     parameters=(
-        Parameter("rise", "1", 0.0, 3.0, 0.5, "breakaway over Coulomb friction, minus one"),
-        Parameter("speed_rad_per_s", "rad/s", 0.2, 60.0, 5.0, "speed at which the rise has fallen to 1/e", (2.0, 6.0, 20.0)),
+        Parameter("rise", "1", 0.0, 3.0, 0.5, "breakaway over Coulomb friction, minus one", drawn=(0.0, 3.0)),
+        Parameter(
+            "speed_rad_per_s",
+            "rad/s",
+            0.2,
+            60.0,
+            5.0,
+            "speed at which the rise has fallen to 1/e",
+            (2.0, 6.0, 20.0),
+            drawn=(2.0, 20.0),
+        ),
     ),
     equation="T_f → T_f [1 + r exp(−|ω|/ω_s)]",
     source="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994: T_s/T_c 1.3 to 2",

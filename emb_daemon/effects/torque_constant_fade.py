@@ -4,7 +4,7 @@ The magnets' temperature is not measured. It lies between the caliper's, which i
 from the other side: a share says where.
 """
 
-from emb_daemon.effects.base import Effect, Parameter
+from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
 from emb_daemon.jit import njit
 
 #: Temperature at which torque constants are stated.
@@ -12,26 +12,34 @@ RATED_C = 25.0
 
 
 @njit
-def term(p, caliper, has_caliper, disc, has_disc):
+def term(p, m, disc, disc_known):
     """Relative change of the torque constant."""
-    if p.fade_per_K == 0.0 or not has_caliper:
+    if p.fade_per_K == 0.0 or not m.has_thermocouple:
         return 0.0
-    temperature = caliper + (p.disc_share * (disc - caliper) if has_disc else 0.0)
+    temperature = m.caliper + (p.disc_share * (disc - m.caliper) if disc_known else 0.0)
     return -p.fade_per_K * (temperature - RATED_C)
 
 
 EFFECT = Effect(
     name="torque_constant_fade",
-    path="torque",
+    hook="torque_constant",
+    term=term,
     parameters=(
-        Parameter("fade_per_K", "1/K", -0.005, 0.02, 0.001, "relative loss of torque constant"),
+        Parameter("fade_per_K", "1/K", -0.005, 0.02, 0.001, "relative loss of torque constant", drawn=(-0.005, 0.02)),
         Parameter(
-            "disc_share", "1", 0.0, 1.0, 0.0, "where the magnets' temperature lies between caliper and disc", (0.0, 1.0)
+            "disc_share",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "where the magnets' temperature lies between caliper and disc",
+            (0.0, 1.0),
+            drawn=(0.3, 1.0),
         ),
     ),
     equation="K_m → K_m [1 − κ (T_caliper + w (T_disc − T_caliper) − 25 °C)]",
     source="NdFeB −0.09 to −0.12 %/K: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2",
     signal="caliper_temperature",
     manoeuvre="the same strokes with a cold and with a hot caliper",
-    placebo="caliper",
+    placebos=(Placebo("temperature of another episode", signal=of_another_episode),),
 )

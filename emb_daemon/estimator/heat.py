@@ -110,7 +110,7 @@ def _flow(s, t, e, m):
     _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
     s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
-    s.disc += effects.disc_cooling(e, t.disc_heat_capacity, s.disc, ambient, dt)
+    s.disc += effects.disc_cooling(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     forgotten = exp(-dt / t.history_time)
@@ -147,7 +147,8 @@ def heat(s, p, m):
     if touching and wheel_speed > TURNING_RAD_PER_S:
         if np.isnan(m.brake_torque):
             surface = 0.5 * (s.pads[0, 0] + s.pads[1, 0])
-            s.power = friction_power(t, s.fused, wheel_speed, surface) * effects.friction_factor(p.effects, surface)
+            fade = effects.pad_friction(p.effects, s.effects, surface)
+            s.power = friction_power(t, s.fused, wheel_speed, surface) * fade
         else:
             s.power = max(m.brake_torque, 0.0) * wheel_speed
         s.heat_energy += s.power * m.dt

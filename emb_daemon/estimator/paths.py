@@ -28,9 +28,9 @@ _DOUBTFUL_RAD = 0.05
 def position(s, p, m):
     """Motor angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
-    gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power)
+    gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
-    return m.angle + effects.motor_angle(e, state, m) + gained / p.gear_gain + grown - s.contact_angle
+    return m.angle + effects.motor_angle(e, state, m, m.dt) + gained / p.gear_gain + grown - s.contact_angle
 
 
 @njit
@@ -82,12 +82,13 @@ def torque_path(s, p, m):
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
     s.friction_mean = mean
-    e, mean_speed = p.effects, 0.5 * (m.speed + s.speed)
-    gear, friction = effects.gear(e, m.angle, travel, mean_speed, mean)
+    e, state, mean_speed = p.effects, s.effects, 0.5 * (m.speed + s.speed)
+    gear = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     leverage = p.gear_gain * gear + p.load_friction * friction * mean
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain:
         return np.nan, leverage, 1.0
-    motor_torque = effects.motor_torque(e, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
+    motor_torque = effects.motor_torque(e, state, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
     offset_friction = p.offset_friction * friction
     torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.effects import EFFECT_PARAMETERS, EFFECT_STATES
+from emb_daemon.effects import REGISTRY, parameter_record, state_record
 from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
@@ -95,7 +95,7 @@ PARAMETERS = np.dtype(
         ("torque_relative_sigma", "f8"),
         ("contact_walk", "f8"),
         ("thermal", THERMAL),
-        ("effects", EFFECT_PARAMETERS),
+        ("effects", parameter_record(REGISTRY)),
     ],
     align=True,
 )
@@ -217,7 +217,7 @@ STATE = np.dtype(
         ("unanswered", "f8", (2,)),
         ("plate_stuck", "?"),
         ("work", "f8", (4, CHAIN)),
-        ("effects", EFFECT_STATES),
+        ("effects", state_record(REGISTRY)),
         # Last answer, which predictions start from.
         ("fused", "f8"),
         ("fused_sigma", "f8"),

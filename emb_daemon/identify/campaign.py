@@ -3,7 +3,6 @@
 Logs are read once, checked for what their part needs, and left out with a word when they cannot serve.
 """
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +14,16 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
+from emb_daemon.logs.read import read_with_digest
+from emb_daemon.models.wheel import PULSES_PER_TURN
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
+
+#: Relative tolerance of a datasheet's values where it states none: two standard deviations.
+_TOLERANCE = 0.15
+#: Relative difference of a disc's speed from the campaign's at which a log is another one.
+_SPEED_TOLERANCE = 0.2
 
 
 class Trial(Struct, kw_only=True):
@@ -36,7 +42,7 @@ class Sine(Struct, kw_only=True):
 
 
 class Adaptation(Struct, kw_only=True):
-    """Park brake training without the reference force, judged on another log."""
+    """Park brake training without the reference force, for the study of adaptation; identification judges on ``judge``."""
 
     training: str
     judge: str
@@ -52,7 +58,7 @@ class Gear(Struct, kw_only=True):
 
 
 class DiscCooling(Struct, kw_only=True):
-    """Heated, then released at constant disc speed."""
+    """Heated, then released at constant disc speed, against which the log is checked."""
 
     log: str
     disc_turns_per_s: Annotated[float, Meta(ge=0.0)]
@@ -83,8 +89,8 @@ class CampaignFile(Struct, kw_only=True):
     #: The rig's own description of its bus; it must agree with the layout that the daemon reads.
     dbc: str | None = None
     datasheet: str
-    #: Of every log that states none, and of the pads that the calibration is for.
-    pad_thickness_mm: Positive
+    #: Of every log that states none, and of the pads that the calibration is for; the datasheet's if it is left out.
+    pad_thickness_mm: Positive | None = None
     curves: tuple[Trial, ...] = ()
     random: tuple[Trial, ...] = ()
     adaptation: tuple[Adaptation, ...] = ()
@@ -96,8 +102,11 @@ class CampaignFile(Struct, kw_only=True):
 
 class Actuator(Struct, kw_only=True):
     gear_gain_m_per_rad: Positive
+    #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
+    motor_torque_constant_tolerance: Positive = _TOLERANCE
     lumped_inertia_kg_m2: Positive
+    lumped_inertia_tolerance: Positive = _TOLERANCE
     max_motor_speed_rad_per_s: Positive
     rated_clamp_force_N: Positive
     pad_clearance_rad: Positive
@@ -105,7 +114,13 @@ class Actuator(Struct, kw_only=True):
 
 class Resolver(Struct, kw_only=True):
     counts_per_revolution: Positive
+    #: In words, for people.
     angle_is: str = ""
+
+    @property
+    def count_rad(self) -> float:
+        """Smallest step of the motor angle."""
+        return 2.0 * np.pi / self.counts_per_revolution
 
 
 class PadNominal(Struct, kw_only=True):
@@ -127,6 +142,10 @@ class DiscNominal(Struct, kw_only=True):
 class Wheel(Struct, kw_only=True):
     pulses_per_revolution: Positive
 
+    def __post_init__(self):
+        if self.pulses_per_revolution != PULSES_PER_TURN:
+            raise ValueError(f"pulses_per_revolution: expected {PULSES_PER_TURN}, by which the daemon turns pulses into angle")
+
 
 class Datasheet(Struct, kw_only=True):
     """Nominal values of actuator, pads and disc, as the supplier states them."""
@@ -137,6 +156,17 @@ class Datasheet(Struct, kw_only=True):
     disc: DiscNominal
     wheel: Wheel | None = None
     friction_coefficient: Positive
+
+    def stated(self, key: str) -> tuple[float, float]:
+        """Value that the supplier states for a key of the calibration, and its relative tolerance."""
+        actuator = self.actuator
+        return {
+            "motor.torque_constant_Nm_per_A": (
+                actuator.motor_torque_constant_Nm_per_A,
+                actuator.motor_torque_constant_tolerance,
+            ),
+            "motor.inertia_kg_m2": (actuator.lumped_inertia_kg_m2, actuator.lumped_inertia_tolerance),
+        }[key]
 
 
 @dataclass(frozen=True)
@@ -191,33 +221,81 @@ def excitation(log: Log, clearance_rad: float) -> Excitation:
 
 @dataclass
 class Campaign:
-    """A campaign with its logs; ``faults`` grows by one line for each log or step that could not serve."""
+    """A campaign with its logs; ``faults`` grows by one line for whatever could not serve or contradicts the datasheet."""
 
     path: Path
     file: CampaignFile
     datasheet: Datasheet
     faults: list[str] = field(default_factory=list)
+    #: Logs used, by name in the campaign: SHA-256 of the file.
     sources: dict[str, str] = field(default_factory=dict)
+    _logs: dict[str, Log | InputError] = field(default_factory=dict, repr=False)
+
+    @property
+    def pad_thickness_mm(self) -> float:
+        """Of the pads that the calibration is for."""
+        return self.file.pad_thickness_mm or self.datasheet.pad.thickness_mm
 
     def thickness(self, entry) -> float:
         """Pad thickness of an entry in mm; the campaign's where it states none."""
-        return entry.pad_thickness_mm or self.file.pad_thickness_mm
+        return entry.pad_thickness_mm or self.pad_thickness_mm
 
     def fault(self, text: str) -> None:
         if text not in self.faults:
             self.faults.append(text)
 
-    def load(self, name: str, part: str, need: str) -> Log | None:
-        """A log, or None after a word about why it cannot serve as ``part`` and what was needed."""
-        path = self.path.parent / name
+    def compare_with_datasheet(self, key: str, value: float) -> None:
+        """A value beyond the datasheet's tolerance is more often a wrong unit or sensor gain than an odd motor."""
+        stated, tolerance = self.datasheet.stated(key)
+        if abs(value / stated - 1.0) > tolerance:
+            self.fault(
+                f"{key}: identified {value:.4g}, datasheet {stated:.4g} within {100.0 * tolerance:g} %: "
+                "check scale and sign of current, force and angle"
+            )
+
+    def _read(self, name: str) -> Log:
+        def read(path):
+            frames, self.sources[name] = read_with_digest(path)
+            return frames
+
+        if name not in self._logs:
+            try:
+                self._logs[name] = load_log(self.path.parent / name, self.file.corner, read)
+            except InputError as error:
+                self._logs[name] = error
+        if isinstance(found := self._logs[name], InputError):
+            self.sources.pop(name, None)
+            raise found
+        return found
+
+    def load(self, name: str | None, part: str, need: str) -> Log | None:
+        """A log, or None after a word about why it cannot serve as ``part`` and what was needed; None if it has no name."""
+        if name is None:
+            return None
         try:
-            log = load_log(path, self.file.corner)
+            log = self._read(name)
         except InputError as error:
             self.fault(f"{part}: {error}; needed: {need}; left out")
             return None
-        self.sources[name] = hashlib.sha256(path.read_bytes()).hexdigest()
         if not np.isfinite(log.force_N).any():
-            self.fault(f"{part}: {path}: holds no reference clamp force (RIG_{log.corner}_Force); needed: {need}; left out")
+            self.fault(
+                f"{part}: {log.path}: holds no reference clamp force (RIG_{log.corner}_Force); needed: {need}; left out"
+            )
+            return None
+        return log
+
+    def load_cooling(self, entry: DiscCooling) -> Log | None:
+        """A log of disc cooling, if its disc turns as fast as the campaign says."""
+        part, need = "thermal.disc_cooling", "a hot disc released at constant speed, with its thermocouple"
+        log = self.load(entry.log, part, need)
+        if log is None:
+            return None
+        speed = log.slow.wheel_speed[f"WheelSpeed{log.corner}"]
+        # The second half is surely released.
+        turns = float(np.median(speed[len(speed) // 2 :])) / (2.0 * np.pi) if len(speed) else np.nan
+        if not abs(turns - entry.disc_turns_per_s) <= max(_SPEED_TOLERANCE * entry.disc_turns_per_s, 0.1):
+            expected = f"{entry.disc_turns_per_s:g} turns per second in its second half, found {turns:.2g}"
+            self.fault(f"{part}: {log.path}: disc_turns_per_s: expected {expected}; needed: {need}; left out")
             return None
         return log
 
@@ -271,17 +349,30 @@ def _check_dbc(path: Path, corner: str) -> None:
         raise InputErrors(faults)
 
 
+def _missing(value, folder: Path, key: str = "") -> list[str]:
+    """A line for each log that is named and not there."""
+    if isinstance(value, tuple):
+        return [line for number, entry in enumerate(value) for line in _missing(entry, folder, f"{key}[{number}]")]
+    if isinstance(value, Struct):
+        fields = value.__struct_fields__
+        return [line for name in fields for line in _missing(getattr(value, name), folder, f"{key}.{name}".strip("."))]
+    is_log = isinstance(value, str) and key.rpartition(".")[2] not in ("rig", "corner", "dbc", "datasheet")
+    return [f"{key}: {folder / value}: no such file"] if is_log and not (folder / value).is_file() else []
+
+
 def load_campaign(path: str | Path) -> Campaign:
     """Read a campaign and its datasheet; no log is read yet.
 
     Raises:
-        InputErrors: every fault of either file with line and key.
+        InputErrors: every fault of either file with line and key; every log that is not there.
         InputError: a file that the campaign needs is missing, or the corner is none.
     """
     path = Path(path)
     file = load_yaml(path, CampaignFile)
     corner_index(file.corner)
     datasheet = load_yaml(path.parent / file.datasheet, Datasheet)
+    if missing := _missing(file, path.parent):
+        raise InputErrors([f"{path}: {line}" for line in missing])
     if file.dbc is not None:
         _check_dbc(path.parent / file.dbc, file.corner)
     return Campaign(path, file, datasheet)

@@ -1,48 +1,157 @@
-"""A calibration judged on a log that fitted nothing, by the estimator as it runs."""
+"""Calibrations judged on logs that fitted nothing, by the estimator as it runs."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec.structs import replace
 
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.judging import PATHS
+from emb_daemon.errors import InputError
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.steps.thickness import ThicknessStep
+from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.offline import Log, estimate
+from emb_daemon.offline.score import force_figures
+from emb_daemon.report import BAND, MODEL, PALE, REFERENCE, Page, Panel, Trace, time_figure
+
+#: Turning points per second of motion that tell random motion from a slow clamp.
+RANDOM = (1.0, 100.0)
+_NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
+_NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
+_NEED_INTEGRATED = "training and braking heat at full frame rate"
+_PATHS = ("stiffness", "torque", "maximum_likelihood", "fused")
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Errors against the reference force in N, over every sample that has one.
+class Judged:
+    """One log that fitted nothing.
 
     Attributes:
-        rmse, bias: by force path: stiffness, torque, maximum_likelihood, fused.
-        inside_two_sigma: share of fused errors within two of the stated standard deviations.
+        kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it.
+        calibration: that was judged.
+        estimates: ESTIMATE rows.
+        figures: `offline.score.force_figures`.
         innovation_ratio: mean squared normalised innovation; one where the filter's noise levels fit.
-        estimates: what plots need: force and sigma by path, ``sigma`` of the fused one.
     """
 
-    rmse: dict[str, float]
-    bias: dict[str, float]
-    inside_two_sigma: float
+    name: str
+    kind: str
+    log: Log = field(repr=False)
+    calibration: Calibration = field(repr=False)
+    estimates: np.ndarray = field(repr=False)
+    figures: dict
     innovation_ratio: float
-    estimates: dict[str, np.ndarray] = field(repr=False)
 
-    @property
-    def fused_over_better_input(self) -> float:
-        """RMSE of the filter over that of the better of its two inputs."""
-        return self.rmse["fused"] / min(self.rmse["stiffness"], self.rmse["torque"])
+    def rmse_N(self, path: str = "fused") -> float:
+        return self.figures[path]["rmse"]
 
 
-def judge(log: Log, calibration: Calibration) -> Figures:
+def judge(name: str, kind: str, log: Log, calibration: Calibration) -> Judged:
     """Run the estimator over a log, as the daemon would, and compare."""
-    estimates = estimate(log.samples, to_parameters(calibration))
-    known = np.isfinite(log.force_N)
-    errors = {path: (estimates[column] - log.force_N)[known] for path, column in PATHS.items()}
-    inside = np.abs(errors["fused"]) <= 2.0 * estimates["sigma"][known]
-    ratio = (estimates["innovation"] / estimates["innovation_sigma"]) ** 2
-    return Figures(
-        rmse={path: float(np.sqrt(np.nanmean(error**2))) for path, error in errors.items()},
-        bias={path: float(np.nanmean(error)) for path, error in errors.items()},
-        inside_two_sigma=float(np.mean(inside)),
-        innovation_ratio=float(np.nanmean(ratio)) if np.isfinite(ratio).any() else np.nan,
-        estimates={path: estimates[column].copy() for path, column in PATHS.items()} | {"sigma": estimates["sigma"].copy()},
+    found = estimate(log.samples, to_parameters(calibration))
+    ratio = (found["innovation"] / found["innovation_sigma"]) ** 2
+    mean = float(np.nanmean(ratio)) if np.isfinite(ratio).any() else np.nan
+    return Judged(name, kind, log, calibration, found, force_figures(log.samples, found, log.force_N), mean)
+
+
+def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_mm: float) -> Calibration:
+    """For pads of another thickness, with what interpolation of the curve then adds to the noise."""
+    there = thickness.interpolation_error(thickness_mm)
+    here = thickness.interpolation_error(calibration.pad_thickness_mm)
+    relative = float(np.sqrt(max(calibration.noise.stiffness_relative**2 - here**2, 0.0) + there**2))
+    noise = replace(calibration.noise, stiffness_relative=relative)
+    return replace(calibration, pad_thickness_mm=thickness_mm, noise=noise)
+
+
+def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep, torque: TorqueStep) -> list[Judged]:
+    """Logs of the campaign that no step fitted, each with the curve that its thickness asks for."""
+    found = []
+
+    def add(entry, kind, name, log, calibration=ours):
+        if log is None:
+            return
+        try:
+            found.append(judge(name, kind, log, at_thickness(calibration, thickness, campaign.thickness(entry))))
+        except InputError as error:
+            campaign.fault(f"{kind}: {log.path}: {error}; not judged")
+
+    for entry in campaign.file.adaptation:
+        log = campaign.load_motion(entry.judge, "adaptation.judge", _NEED_RANDOM, reversals=RANDOM)
+        add(entry, "predicted", f"random, {campaign.thickness(entry):g} mm, curve predicted", log)
+    gears = dict(torque.gears)
+    for entry in campaign.file.gear_wear:
+        if entry.judge is not None and entry.training in gears:
+            log = campaign.load_motion(entry.judge, "gear_wear.judge", _NEED_RANDOM, reversals=RANDOM)
+            # Wear changes friction; motor and inertia stay.
+            worn = replace(ours, friction=gears[entry.training].friction())
+            add(entry, "gear", f"{_stem(entry.judge)}, curve predicted", log, worn)
+    for entry in campaign.file.frequency_response:
+        bounds = (0.0, 4.0 * entry.frequency_Hz)
+        log = campaign.load_motion(entry.log, "frequency_response", _NEED_SINE, reversals=bounds)
+        add(entry, "frequency", f"sine, {entry.frequency_Hz:g} Hz", log)
+    for pair in campaign.file.integrated:
+        log = campaign.load(pair.judge, "integrated.judge", _NEED_INTEGRATED)
+        if log is not None:
+            found.append(judge(f"integrated, {_stem(pair.judge)}", "integrated", log, ours))
+    return found
+
+
+def _stem(name: str) -> str:
+    return name.rsplit("/", 1)[-1].split(".log")[0]
+
+
+#: Columns of `rows`.
+COLUMNS = ("judged on", "stiffness / N", "torque / N", "max. likelihood / N", "fused / N", "fused bias / N", "inside 2 σ / %")
+
+
+def rows(judged: list[Judged]) -> list[list[str]]:
+    """RMSE of each path, bias of the fused force and share inside two sigma, one row per log."""
+    return [
+        [
+            one.name,
+            *(f"{one.rmse_N(path):.0f}" for path in _PATHS),
+            f"{one.figures['fused']['bias']:+.0f}",
+            f"{100 * one.figures['inside_two_sigma']:.1f}",
+        ]
+        for one in judged
+    ]
+
+
+def section(page: Page, judged: list[Judged]) -> None:
+    """Figures of every judged log, and pictures of those that the estimator meets last."""
+    part = page.section(
+        "On logs that fitted nothing",
+        "RMSE over every sample. A random log's dynamics and torque path come from the other pads, its curve from its own "
+        "slow log; gears have the friction of their own training; everything else is as calibrated. Innovation ratio: mean "
+        "squared normalised innovation, one where the noise levels fit.",
+    )
+    ratios = [f"{one.innovation_ratio:.2f}" for one in judged]
+    part.table([*COLUMNS, "innovation ratio"], [[*row, ratio] for row, ratio in zip(rows(judged), ratios, strict=True)])
+    random = [one for one in judged if one.kind == "random"]
+    shown = random[len(random) // 2 :][:1] + [one for one in judged if one.kind in ("predicted", "integrated")]
+    for one in shown:
+        part.heading(one.name)
+        part.figure(_figure(one))
+
+
+def _figure(judged: Judged):
+    log, found = judged.log, judged.estimates
+    time = log.time_s
+    forces = [
+        Trace("reference", time, 1e-3 * log.force_N, REFERENCE),
+        Trace("torque balance", time, 1e-3 * found["torque_force"], PALE),
+        Trace("fused", time, 1e-3 * found["force"], MODEL),
+    ]
+    errors = [
+        Trace("", time, -2.0 * found["sigma"], BAND),
+        Trace("two sigma", time, 2.0 * found["sigma"], BAND),
+        Trace("fused", time, found["force"] - log.force_N, MODEL),
+    ]
+    stiffness = [Trace("stiffness path", time, found["stiffness_force"] - log.force_N, MODEL)]
+    return time_figure(
+        [
+            Panel("Clamp force", "kN", forces, 300),
+            Panel("Error of the fused force, with two sigma", "N", errors, 200),
+            Panel("Error of the stiffness path", "N", stiffness, 200),
+        ]
     )

@@ -33,6 +33,9 @@ class Decoder:
     def __init__(self, dbc: str = "dbc/emb.dbc"):
         self._database = load_database(resource(dbc))
 
+    def can_id(self, message: str) -> int:
+        return self._database.get_message_by_name(message).frame_id
+
     def columns(self, frames: np.ndarray, message: str) -> dict[str, np.ndarray]:
         """``time_ns`` and every signal of ``message``, one entry per frame; empty arrays where the log has none."""
         found = self._database.get_message_by_name(message)
@@ -40,11 +43,20 @@ class Decoder:
         rows = _select(frames, found.frame_id, found.length)
         values = np.zeros((len(names), len(rows)))
         _decode(frames, rows, signal_columns(self._database, message, names), values)
+        if message.startswith("RIG_"):
+            for column, signal in zip(values, found.signals, strict=True):
+                column[column <= signal.scale * (absent_raw(signal.length) + 0.5) + signal.offset] = np.nan
         return {"time_ns": frames["time_ns"][rows]} | dict(zip(names, values, strict=True))
 
 
+def absent_raw(length: int) -> int:
+    """Raw value of a signed reference signal that says that the rig has no such instrument: the least there is."""
+    return -(1 << (length - 1))
+
+
 class References:
-    """What a rig's instruments measured at one corner; empty arrays where it has none. Identifies and judges only."""
+    """What a rig's instruments measured at one corner; empty arrays where it has none, NaN where one of a message's
+    instruments is missing. Identifies and judges only."""
 
     def __init__(self, frames: np.ndarray, corner: str):
         decoder = Decoder("dbc/rig.dbc")

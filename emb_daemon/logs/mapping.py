@@ -14,6 +14,7 @@ from msgspec import Meta
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Struct
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.read import read_frames
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
@@ -136,7 +137,8 @@ class Mapping:
             for message in database.messages
         }
         self._faults: list[str] = []
-        self._messages: dict[str, dict[str, _Source | float]] = {}
+        #: Signals by message: where they come from, a constant, or None for an instrument that the rig has not.
+        self._messages: dict[str, dict[str, _Source | float | None]] = {}
         for name, mapped in file.signals.items():
             self._add(name, mapped, theirs)
         self._complete()
@@ -189,7 +191,7 @@ class Mapping:
                 other = name in ("VEH_WheelSpeed", "VEH_WheelPulse") and signal.name[-2:] not in corners
                 if signal.name not in signals:
                     if optional or other:
-                        signals[signal.name] = 0.0
+                        signals[signal.name] = None if name.startswith("RIG_") else 0.0
                     else:
                         self._fault(f"{name}.{signal.name}", "missing: map it too, or give it a constant `value`")
             if not any(isinstance(source, _Source) for source in signals.values()):
@@ -243,10 +245,14 @@ class Mapping:
         names = tuple(key for key in signals if key not in ("CRC", "Counter", "Status"))
         payload, usable = np.zeros(len(times), np.uint64), np.ones(len(times), bool)
         for signal, key in zip(signal_columns(database, name, names), names, strict=True):
+            start, length = np.uint64(signal["start"]), int(signal["length"])
+            if values[key] is None:
+                payload |= np.uint64(absent_raw(length) & ((1 << length) - 1)) << start
+                continue
             column = np.broadcast_to(np.asarray(values[key], float), times.shape)
             usable &= np.isfinite(column) & (column >= signal["low"]) & (column <= signal["high"])
             raw = np.rint((np.where(np.isfinite(column), column, 0.0) - signal["offset"]) / signal["factor"]).astype(np.int64)
-            payload |= (raw.astype(np.uint64) & np.uint64((1 << int(signal["length"])) - 1)) << np.uint64(signal["start"])
+            payload |= (raw.astype(np.uint64) & np.uint64((1 << length) - 1)) << start
         frames = np.zeros(int(usable.sum()), FRAME)
         frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
         frames["data"] = payload[usable]

@@ -1,6 +1,7 @@
 """Any log file as an array of frames."""
 
 import gzip
+import hashlib
 import io
 import sys
 import zlib
@@ -15,24 +16,35 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITT
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
 
 
-def _content(path: Path) -> bytes:
-    """A file's bytes, unpacked if they are gzip's, whatever the file is called."""
+def read_file(path: Path) -> bytes:
+    """The one place where a log file is read."""
     try:
-        raw = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
+
+
+def _unpacked(path: Path, raw: bytes) -> bytes:
+    """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
     if raw[:2] != b"\x1f\x8b":
         return raw
+    parts = []
     try:
-        return gzip.decompress(raw)
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        with gzip.GzipFile(fileobj=io.BytesIO(raw)) as file:
+            while part := file.read1(1 << 20):
+                parts.append(part)
+    except (zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{path}: damaged gzip file ({error})") from None
+    except EOFError:
+        content = b"".join(parts)
+        print(f"{path}: cut off, read up to there ({len(content)} bytes)", file=sys.stderr)
+        return content
+    return b"".join(parts)
 
 
-def _candump(path: Path) -> np.ndarray:
-    text = _content(path)
+def _candump(path: Path, text: bytes) -> np.ndarray:
     frames, bad_line, unfinished = parse_candump(text)
     if bad_line and unfinished and bad_line > 1:
         print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
@@ -41,14 +53,14 @@ def _candump(path: Path) -> np.ndarray:
     return frames
 
 
-def _python_can(path: Path, reader_name: str) -> np.ndarray:
+def _python_can(path: Path, content: bytes, reader_name: str) -> np.ndarray:
     import can
     from can.io.generic import TextIOMessageReader
 
-    content = io.BytesIO(_content(path))
+    file = io.BytesIO(content)
     try:
         kind = getattr(can, reader_name)
-        reader = kind(io.TextIOWrapper(content) if issubclass(kind, TextIOMessageReader) else content)
+        reader = kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file)
         rows = [
             (
                 round(message.timestamp * 1e9),
@@ -78,14 +90,18 @@ def read_frames(path: str | Path) -> np.ndarray:
     Raises:
         InputError: missing, damaged, empty or unknown file; names the file and the line where there are lines.
     """
+    return read_with_digest(path)[0]
+
+
+def read_with_digest(path: str | Path) -> tuple[np.ndarray, str]:
+    """`read_frames`, and the SHA-256 of the file as it was read."""
     path = Path(path)
     ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
-    if ending == ".log":
-        frames = _candump(path)
-    elif ending in _PYTHON_CAN:
-        frames = _python_can(path, _PYTHON_CAN[ending])
-    else:
+    if ending != ".log" and ending not in _PYTHON_CAN:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
+    raw = read_file(path)
+    content = _unpacked(path, raw)
+    frames = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     if not len(frames):
         raise InputError(f"{path}: holds no frames")
-    return frames
+    return frames, hashlib.sha256(raw).hexdigest()

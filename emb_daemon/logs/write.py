@@ -9,7 +9,8 @@ import numpy as np
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.wire.contract import MODES, SOURCES
+from emb_daemon.logs.columns import References
+from emb_daemon.wire.contract import MODES, SOURCES, reason_words
 from emb_daemon.wire.layout import CORNERS
 
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
@@ -30,9 +31,13 @@ _COMMENTS = {
     "disc": "brake disc, lumped",
     "mode": "mode of the estimator",
     "source": "what clamp_force rests on",
+    "reasons": "why not to trust the row, joined by '; '",
+    "clamp_force_ref": "reference instrument of the rig",
+    "brake_torque_ref": "reference instrument of the rig",
+    "disc_ref": "reference instrument of the rig",
     "corner": "wheel",
 }
-_UNITS = {"N": "N", "rad": "rad", "C": "degC"}
+_UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
 
 
 def ending_of(path: Path) -> str:
@@ -67,7 +72,25 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
     for code, name in SOURCES.items():
         names[code] = name
     columns["source"] = names[e["source"]].astype(str)
+    raised, codes = np.unique(e["reasons"], return_inverse=True)
+    columns["reasons"] = np.array(["; ".join(reason_words(value)) for value in raised])[codes]
     return columns
+
+
+def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.ndarray) -> dict[str, np.ndarray]:
+    """What a rig's instruments measured at the samples, as far as it has them: force and torque of the nearest frame (NaN
+    where none is near), temperatures as last heard."""
+    columns = {
+        "clamp_force_ref_N": force_N,
+        "brake_torque_ref_Nm": reference.at(time_ns, reference.brake_torque_Nm),
+        "disc_ref_C": reference.latest(time_ns, reference.disc_C),
+    }
+    for side, (stamps, depths) in reference.pads.items():
+        row = np.searchsorted(stamps, time_ns, side="right") - 1
+        for depth, values in zip((2, 4, 6, 8), depths, strict=True):
+            known = values[np.maximum(row, 0)] if len(values) else np.nan
+            columns[f"{side}_{depth}mm_ref_C"] = np.where(row >= 0, known, np.nan)
+    return {name: values for name, values in columns.items() if np.isfinite(values).any()}
 
 
 def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
@@ -91,9 +114,10 @@ def _unit_and_comment(name: str) -> tuple[str, str]:
     stem, _, last = name.rpartition("_")
     unit = _UNITS.get(last, "")
     quantity = stem if unit else name
-    if quantity.endswith("mm"):
-        side, depth = quantity.split("_")
-        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface"
+    if quantity.removesuffix("_ref").endswith("mm"):
+        side, depth = quantity.removesuffix("_ref").split("_")
+        by = ", reference instrument of the rig" if quantity.endswith("_ref") else ""
+        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface{by}"
     pad = f"{quantity.split('_')[0]} pad, " if quantity.startswith(("inner_", "outer_")) else ""
     return unit, pad + _COMMENTS.get(quantity, _COMMENTS.get(quantity.rpartition("_")[2], ""))
 

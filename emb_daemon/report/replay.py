@@ -1,5 +1,6 @@
 """The page of a replay: estimates, errors and events of a drive on one time axis."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.judging import PATHS
+from emb_daemon.offline.score import PATHS, figures, share_inside
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
@@ -60,10 +61,10 @@ def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]
 
 
 def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> list[Panel]:
-    force, sigma = 1e-3 * estimates["force"], 1e-3 * estimates["sigma"]
+    force, sigma_kN = 1e-3 * estimates["force"], 1e-3 * estimates["sigma"]
     traces = [
-        Trace("", time_s, force - 2.0 * sigma, BAND),
-        Trace("± 2 sigma", time_s, force + 2.0 * sigma, BAND),
+        Trace("", time_s, force - 2.0 * sigma_kN, BAND),
+        Trace("± 2 sigma", time_s, force + 2.0 * sigma_kN, BAND),
         Trace("stiffness path", time_s, 1e-3 * estimates["stiffness_force"], Style("#7fa7d1", 1.0)),
         Trace("torque path", time_s, 1e-3 * estimates["torque_force"], THESIS),
         Trace("estimate", time_s, force, MODEL),
@@ -72,12 +73,12 @@ def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> l
     known = np.isfinite(force_N)
     if known.any():
         traces.append(Trace("reference", time_s[known], 1e-3 * force_N[known], REFERENCE))
-        at, error, doubt = time_s[known], (estimates["force"] - force_N)[known], estimates["sigma"][known]
+        at, error, sigma = time_s[known], (estimates["force"] - force_N)[known], estimates["sigma"][known]
         panels.append(
             Panel(
                 "Estimate minus reference, and two sigma about zero",
                 "N",
-                [Trace("", at, -2.0 * doubt, BAND), Trace("", at, 2.0 * doubt, BAND), Trace("", at, error, MODEL)],
+                [Trace("", at, -2.0 * sigma, BAND), Trace("", at, 2.0 * sigma, BAND), Trace("", at, error, MODEL)],
                 height=200,
             )
         )
@@ -104,9 +105,9 @@ def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return 100.0 * counts / max(len(error), 1)
 
 
-def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, figures: list[dict]) -> None:
+def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, by_log: list[dict]) -> None:
     section = page.section("Errors", "Estimate minus reference. Conditions overlap; figures without a sample are left out.")
-    for log in figures:
+    for log in by_log:
         rows, name = [], Path(log["log"]).name
         for path, label in _LABELS.items():
             part = log["force_N"].get(path, {"samples": 0})
@@ -202,7 +203,7 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
     time_s = 1e-9 * (estimates["time_ns"] - estimates["time_ns"][0])
-    figures = [result.figures() for result in results]
+    by_log = [result.figures() for result in results]
     page = Page(f"Replay, corner {corner}", f"{', '.join(result.path.name for result in results)} · emb-daemon {__version__}")
     doubtful = float(np.mean(estimates["reasons"] != 0))
     details = [
@@ -211,12 +212,10 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
     ]
     known = np.isfinite(force_N)
     if known.any():
-        error = (estimates["force"] - force_N)[known]
-        inside = 100.0 * float(np.mean(np.abs(error) <= 2.0 * estimates["sigma"][known]))
-        headline = (
-            f"Clamp force: RMSE {np.sqrt(np.mean(error**2)):.0f} N, 95 % within {np.percentile(np.abs(error), 95):.0f} N, "
-            f"largest {np.abs(error).max():.0f} N"
-        )
+        error = estimates["force"] - force_N
+        of = figures(error)
+        inside = 100.0 * share_inside(error, estimates["sigma"])
+        headline = f"Clamp force: RMSE {of['rmse']:.0f} N, 95 % within {of['p95']:.0f} N, largest {of['max']:.0f} N"
         details.insert(0, f"{inside:.1f} % of the errors lie inside two sigma; 95.4 % would if they were normal.")
     else:
         headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; no reference in the log to judge it by"
@@ -234,7 +233,7 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
         figure, "Curves are reduced for the screen; the smallest and largest value of every stretch are kept."
     )
     if known.any():
-        _errors(page, estimates, force_N, figures)
+        _errors(page, estimates, force_N, by_log)
     if learned is not None and learned.history:
         _adaptation(page, learned, calibration)
     return page

@@ -688,8 +688,8 @@ static double stribeck_friction(const struct parameters_effects_stribeck_frictio
 static double friction_coefficient_fade(const struct parameters_effects_friction_coefficient_fade *p, double surface)
 {
     if (p->fade_per_K == 0.0)
-        return 1.0;
-    return max(1.0 - p->fade_per_K * max(surface - p->onset_C, 0.0), 0.2);
+        return 0.0;
+    return -min(p->fade_per_K * max(surface - p->onset_C, 0.0), 0.8);
 }
 
 static double disc_radiation(
@@ -701,23 +701,18 @@ static double disc_radiation(
     return -p->area_m2 * STEFAN_BOLTZMANN * (hot * hot * hot * hot - cold * cold * cold * cold) * dt / heat_capacity;
 }
 
-static void thermocouple_lag(
-    const struct parameters_effects_thermocouple_lag *p, struct state_effects_thermocouple_lag *s, double *inner,
-    double *outer, double dt)
+static double thermocouple_lag(
+    const struct parameters_effects_thermocouple_lag *p, struct state_effects_thermocouple_lag *s, int side, double value,
+    double dt)
 {
     if (p->lag_s == 0.0)
-        return;
-    if (!s->known) {
-        s->known = true;
-        s->inner = *inner;
-        s->outer = *outer;
+        return 0.0;
+    if (s->known[side] == 0) {
+        s->known[side] = 1;
+        s->smoothed[side] = value;
     }
-    double share = 1.0 - exp(-dt / 2.0);
-    s->inner += share * (*inner - s->inner);
-    s->outer += share * (*outer - s->outer);
-    double rate = p->lag_s / 2.0;
-    *inner += rate * (*inner - s->inner);
-    *outer += rate * (*outer - s->outer);
+    s->smoothed[side] += (1.0 - exp(-dt / 2.0)) * (value - s->smoothed[side]);
+    return p->lag_s / 2.0 * (value - s->smoothed[side]);
 }
 
 /* effects/paths.py */
@@ -890,7 +885,8 @@ static void flow(State *s, const Thermal *t, const Effects *e, const Sample *m)
     double inner = m->has_thermocouple ? m->inner_backplate : s->pads[0][NODES - 1];
     double outer = m->has_thermocouple ? m->outer_backplate : s->pads[1][NODES - 1];
     watch_plates(s, t, m, dt);
-    thermocouple_lag(&e->thermocouple_lag, &s->effects.thermocouple_lag, &inner, &outer, dt);
+    inner += thermocouple_lag(&e->thermocouple_lag, &s->effects.thermocouple_lag, 0, inner, dt);
+    outer += thermocouple_lag(&e->thermocouple_lag, &s->effects.thermocouple_lag, 1, outer, dt);
     s->disc = heat_step(
         t, s->pads, s->disc, inner, outer, ambient, s->heat_energy / dt, s->touching, wheel_speed, dt, s->work);
     s->disc += disc_radiation(&e->disc_radiation, t->disc_heat_capacity, s->disc, ambient, dt);
@@ -925,7 +921,7 @@ static void heat(State *s, const Parameters *p, const Sample *m)
         if (isnan(m->brake_torque)) {
             double surface = 0.5 * (s->pads[0][0] + s->pads[1][0]);
             s->power = friction_power(t, s->fused, wheel_speed, surface)
-                * friction_coefficient_fade(&p->effects.friction_coefficient_fade, surface);
+                * (1.0 + friction_coefficient_fade(&p->effects.friction_coefficient_fade, surface));
         } else {
             s->power = max(m->brake_torque, 0.0) * wheel_speed;
         }

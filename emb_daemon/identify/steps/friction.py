@@ -7,7 +7,10 @@ import numpy as np
 from emb_daemon.calibration.types import FrictionTable
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID
-from emb_daemon.identify.heat import Recording, simulate
+from emb_daemon.identify.recording import Recording, simulate
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import Panel, Section, Trace, xy_figure
+from emb_daemon.report.figures import Style
 
 #: Rows with less force or speed say more of the sensors' noise than of friction.
 _LEAST_FORCE_N = 500.0
@@ -29,6 +32,8 @@ _PIECES = 8
 _WORTH_IT = 0.98
 #: The table goes on this far beyond the largest force, speed and temperature that were measured.
 _BEYOND = 1.25
+_CLOUD = Style("#aab4c0", mode="markers", size=3.0)
+_DOTS = Style("rgba(11,92,173,0.35)", mode="markers", size=3.5)
 
 
 @dataclass(frozen=True)
@@ -75,12 +80,66 @@ def _rows(r: Recording, parameters: np.ndarray) -> np.ndarray:
     return np.array([force, speed, averaged(surface), averaged(r.power) / (2.0 * radius * averaged(r.force * r.speed))])
 
 
-def _solve(design, coefficient, weight, expected):
-    """Weighted least squares; each term but the first pulled to zero by what is expected of it."""
-    pull = np.diag(1.0 / expected)
-    left = np.concatenate([design * (weight / _ROW_SIGMA)[:, None], pull])
-    right = np.concatenate([coefficient * weight / _ROW_SIGMA, np.zeros(len(expected))])
-    return np.linalg.lstsq(left, right, rcond=None)[0]
+class _Surface:
+    """Coefficient as a polynomial of force, speed and temperature, each measured from its mean in its own spread."""
+
+    def __init__(self, force, speed, temperature, coefficient):
+        self.columns, self.coefficient = np.array([force, speed, temperature]), coefficient
+        self.centre = self.columns.mean(axis=1)
+        self.width = np.maximum(self.columns.std(axis=1), [1.0, 1e-3, 1e-3])
+        self.weight = force / force.max()
+        self.piece = np.arange(len(force)) * _PIECES // len(force)
+        left_out = {bent: self._left_out(bent) for bent in (False, True)}
+        error = {bent: self._left_out_error(terms, bent) for bent, terms in left_out.items()}
+        self.bent = error[True] < _WORTH_IT * error[False]
+        self.terms = self._solve(np.ones(len(force), bool), self.bent)
+        self.model = self._design(self.columns, self.bent) @ self.terms
+        deviation = self._design(self.columns, self.bent) @ (left_out[self.bent] - self.terms).T
+        self.sigma = float(np.sqrt((_PIECES - 1) * np.mean(deviation**2)))
+
+    def _design(self, columns, bent):
+        u = [(column - c) / w for column, c, w in zip(columns, self.centre, self.width, strict=True)]
+        return np.stack([np.ones_like(u[0]), *u] + ([u[2] ** 2 - 1.0] if bent else []), axis=-1)
+
+    def _solve(self, use, bent):
+        """Weighted least squares; each term but the first pulled to zero by what is expected of it."""
+        bend = [_EXPECTED_BEND * self.width[2] ** 2] if bent else []
+        expected = np.array([1e3, *(_EXPECTED_SLOPES * self.width), *bend])
+        weight = self.weight[use] / _ROW_SIGMA
+        left = np.concatenate([self._design(self.columns[:, use], bent) * weight[:, None], np.diag(1.0 / expected)])
+        return np.linalg.lstsq(left, np.concatenate([self.coefficient[use] * weight, 0.0 * expected]), rcond=None)[0]
+
+    def _left_out(self, bent):
+        return np.array([self._solve(self.piece != k, bent) for k in range(_PIECES)])
+
+    def _left_out_error(self, terms, bent):
+        predicted = np.sum(self._design(self.columns, bent) * terms[self.piece], axis=1)
+        return rmse(predicted - self.coefficient, self.weight**2)
+
+    def table(self) -> FrictionTable:
+        most, coldest = _BEYOND * self.columns.max(axis=1), float(self.columns[2].min())
+        force, speed = np.linspace(0.0, most[0], FORCE_GRID), np.linspace(0.0, most[1], SPEED_GRID)
+        hottest = coldest + _BEYOND * np.ptp(self.columns[2]) + 1.0
+        temperature = np.linspace(coldest, hottest, TEMPERATURE_GRID)
+        mesh = np.meshgrid(force, speed, temperature, indexing="ij")
+        values = np.clip(self._design(mesh, self.bent) @ self.terms, self.terms[0] / 3.0, 1.0)
+        return FrictionTable(
+            force_N=tuple(_short(force)),
+            disc_speed_rad_per_s=tuple(_short(speed)),
+            surface_temperature_C=tuple(_short(temperature)),
+            coefficient=tuple(tuple(tuple(_short(line)) for line in plane) for plane in values),
+        )
+
+    def equation(self) -> str:
+        slopes, centre = self.terms[1:4] / self.width, self.centre
+        text = (
+            f"μ = {self.terms[0]:.4f} {1e3 * slopes[0]:+.2e} (F − {1e-3 * centre[0]:.2f} kN)/kN"
+            f" {slopes[1]:+.2e} (ω − {centre[1]:.1f} rad/s) s {slopes[2]:+.2e} (T − {centre[2]:.0f} °C)/K"
+        )
+        if self.bent:
+            square = self.width[2] ** 2
+            text += f" {self.terms[4] / square:+.1e} ((T − {centre[2]:.0f})² − {square:.0f})/K²"
+        return text
 
 
 def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> FrictionFit:
@@ -103,64 +162,17 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
     if len(force) < _LEAST_ROWS:
         names = ", ".join(r.name for r in recordings)
         raise InputError(f"{names}: {len(force)} moments of steady braking; at least {_LEAST_ROWS} are needed for friction")
-    centre = np.array([force.mean(), speed.mean(), temperature.mean()])
-    width = np.maximum([force.std(), speed.std(), temperature.std()], [1.0, 1e-3, 1e-3])
-
-    def design(f, w, t, bent):
-        u = [(f - centre[0]) / width[0], (w - centre[1]) / width[1], (t - centre[2]) / width[2]]
-        return np.stack([np.ones_like(u[0]), *u] + ([u[2] ** 2 - 1.0] if bent else []), axis=-1)
-
-    weight = force / force.max()
-
-    def expected(bent):
-        bend = [_EXPECTED_BEND * width[2] ** 2] if bent else []
-        return np.array([1e3, *(_EXPECTED_SLOPES * width), *bend])
-
-    piece = np.arange(len(force)) * _PIECES // len(force)
-    errors, leave_out = {}, {}
-    for bent in (False, True):
-        columns = design(force, speed, temperature, bent)
-        left = [
-            _solve(columns[piece != k], coefficient[piece != k], weight[piece != k], expected(bent)) for k in range(_PIECES)
-        ]
-        predicted = np.array([columns[row] @ left[k] for row, k in enumerate(piece)])
-        errors[bent], leave_out[bent] = np.average((predicted - coefficient) ** 2, weights=force**2), left
-    bent = errors[True] < _WORTH_IT**2 * errors[False]
-    columns = design(force, speed, temperature, bent)
-    terms = _solve(columns, coefficient, weight, expected(bent))
-    deviation = columns @ (np.array(leave_out[bent]) - terms).T
-    sigma = np.sqrt((_PIECES - 1) / _PIECES * np.mean(np.sum(deviation**2, axis=1)))
-
-    grid_force = np.linspace(0.0, _BEYOND * force.max(), FORCE_GRID)
-    grid_speed = np.linspace(0.0, _BEYOND * speed.max(), SPEED_GRID)
-    coldest = float(temperature.min())
-    grid_temperature = np.linspace(coldest, coldest + _BEYOND * np.ptp(temperature) + 1.0, TEMPERATURE_GRID)
-    mesh = np.meshgrid(grid_force, grid_speed, grid_temperature, indexing="ij")
-    values = np.clip(design(*mesh, bent) @ terms, terms[0] / 3.0, 1.0)
-
-    slopes = terms[1:4] / width
-    equation = (
-        f"μ = {terms[0]:.4f} {1e3 * slopes[0]:+.2e} (F − {1e-3 * centre[0]:.2f} kN)/kN"
-        f" {slopes[1]:+.2e} (ω − {centre[1]:.1f} rad/s) s {slopes[2]:+.2e} (T − {centre[2]:.0f} °C)/K"
-    )
-    if bent:
-        equation += f" {terms[4] / width[2] ** 2:+.1e} ((T − {centre[2]:.0f})² − {width[2] ** 2:.0f})/K²"
-    model = columns @ terms
+    surface = _Surface(force, speed, temperature, coefficient)
     return FrictionFit(
-        table=FrictionTable(
-            force_N=tuple(_short(grid_force)),
-            disc_speed_rad_per_s=tuple(_short(grid_speed)),
-            surface_temperature_C=tuple(_short(grid_temperature)),
-            coefficient=tuple(tuple(tuple(_short(line)) for line in plane) for plane in values),
-        ),
-        equation=equation,
-        sigma=float(sigma),
+        table=surface.table(),
+        equation=surface.equation(),
+        sigma=surface.sigma,
         force_N=force,
         speed_rad_per_s=speed,
         temperature_C=temperature,
         measured=coefficient,
-        model=model,
-        rms=float(np.sqrt(np.average((model - coefficient) ** 2, weights=force**2))),
+        model=surface.model,
+        rms=rmse(surface.model - coefficient, force**2),
     )
 
 
@@ -176,3 +188,14 @@ def constant_friction(coefficient: float) -> FrictionTable:
         surface_temperature_C=tuple(_short(np.linspace(0.0, 400.0, TEMPERATURE_GRID))),
         coefficient=(((coefficient,) * TEMPERATURE_GRID,) * SPEED_GRID,) * FORCE_GRID,
     )
+
+
+def figure(section: Section, found: FrictionFit) -> None:
+    """Friction in the report, drawn over the last of its three variables."""
+    section.heading("Friction of pad on disc, for service without a brake torque sensor")
+    thin = slice(None, None, max(len(found.measured) // 1500, 1))
+    temperature, measured, model = found.temperature_C[thin], found.measured[thin], found.model[thin]
+    coefficient = [Trace("measured", temperature, measured, _CLOUD), Trace("map", temperature, model, _DOTS)]
+    residual = [Trace("map", temperature, model - measured, _DOTS)]
+    panels = [Panel("Friction coefficient", "1", coefficient, 260), Panel("Residual", "1", residual, 160)]
+    section.figure(xy_figure(panels, "surface temperature / °C"), "Over clamp force, disc speed and surface temperature.")

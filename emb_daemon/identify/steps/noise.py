@@ -4,16 +4,54 @@ The daemon's standard deviation is judged against a reference instrument, so tha
 what is held out contains it too.
 """
 
+import msgspec
 import numpy as np
 
-from emb_daemon.calibration.types import Noise
-from emb_daemon.identify.torque import TorqueFit, unexplained_current
+from emb_daemon.calibration.types import Contact, Noise
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.steps import Step
+from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
+from emb_daemon.identify.steps.stiffness import StiffnessStep
+from emb_daemon.identify.steps.torque import TorqueStep, Unexplained, unexplained_current
+from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
+
+
+def identify(
+    campaign: Campaign, stiffness: StiffnessStep, torque: TorqueStep, folds: list[Fold], interpolation: float
+) -> Step:
+    """Noise levels from the folds, or from the second halves of the random logs where there are none.
+
+    Args:
+        interpolation: relative force error that a curve between two measured pad thicknesses adds.
+    """
+    logs = [log for pads in stiffness.pads for log in pads.logs]
+    gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
+    notes = []
+    speed = speed_noise(logs)
+    if speed is None:
+        speed = campaign.datasheet.resolver.count_rad / CYCLE_S
+        notes.append("The motor never stands for 0.2 s: speed noise is one resolver count per sample, not measured.")
+    if folds:
+        errors = [pair for fold in folds for pair in fold.errors]
+        held_out = [left for fold in folds for left in fold.unexplained]
+    else:
+        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, gear_gain) for log in logs]
+        notes.append(
+            "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
+            "levels come from the second halves of the random logs."
+        )
+    levels = noise_levels(errors, held_out, gear_gain, speed, interpolation)
+    # The daemon is not told how worn its gear is.
+    relative = float(np.hypot(levels.torque_relative, torque.gear_wear()))
+    return Step(values={"noise": msgspec.structs.replace(levels, torque_relative=relative)}, notes=tuple(notes))
 
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
@@ -104,37 +142,38 @@ def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, flo
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
 
 
-def torque_levels(held_out: list[tuple[Log, TorqueFit]], gear_gain: float, speed_sigma: float) -> dict[str, float]:
-    """Fields of `Noise` that belong to the torque path, from logs each with a fit that did not see it."""
+def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
+    """Fields of `Noise` that belong to the torque path, from what fits leave on logs that they did not see."""
     series, turning, excess, gains = [], [], [], []
-    fit = held_out[0][1]
-    white = np.sqrt(2.0) * fit.inertia * speed_sigma / CYCLE_S / fit.torque_constant
-    for log, fit in held_out:
-        rows, current, mean, force = unexplained_current(log, fit, gear_gain)
-        torque = fit.torque_constant * current
+    first = held_out[0].found
+    constant = first.values["torque_constant_Nm_per_A"]
+    white = np.sqrt(2.0) * first.values["inertia_kg_m2"] * speed_sigma / CYCLE_S / constant
+    for left in held_out:
+        values = left.found.values
+        rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
+        torque = values["torque_constant_Nm_per_A"] * current
         series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
         sliding = 1.0 - mean**2
-        turning.append((sliding * (fit.offset_friction + fit.load_friction * np.maximum(force, 0.0))) ** 2)
+        turning.append((sliding * (values["offset_Nm"] + values["load_m_per_rad"] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < 0.1] ** 2))
-        load = (gear_gain + fit.load_friction * mean) * force
+        load = (gear_gain + values["load_m_per_rad"] * mean) * force
         # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
     sigma, time = current_noise(series, white)
-    own = np.sqrt(held_out[0][1].covariance[0, 0]) / held_out[0][1].torque_constant
     return {
         "current_A": sigma,
         "current_correlation_s": time,
         "speed_rad_per_s": speed_sigma,
         "presliding": float(np.sqrt(np.clip(share, 0.0, 1.0))),
-        "torque_relative": float(np.hypot(np.sqrt(np.mean(np.square(gains))), own)),
+        "torque_relative": float(np.hypot(rmse(gains), first.sigmas["torque_constant_Nm_per_A"] / constant)),
     }
 
 
 def noise_levels(
-    stiffness: list[tuple[np.ndarray, np.ndarray]],
-    torque: list[tuple[Log, TorqueFit]],
+    stiffness: list[Errors],
+    torque: list[Unexplained],
     gear_gain: float,
     speed_sigma: float,
     interpolation_relative: float = 0.0,
@@ -143,7 +182,7 @@ def noise_levels(
 
     Args:
         stiffness: for each held-out log (error of the stiffness path in N, reference force in N).
-        torque: for each held-out log, a torque fit that did not see it.
+        torque: for each held-out log, what a torque fit that did not see it leaves.
         interpolation_relative: relative force error that a curve between two measured pad thicknesses adds.
     """
     errors = [e for e, _ in stiffness]
@@ -153,4 +192,27 @@ def noise_levels(
         stiffness_relative=float(np.hypot(relative, interpolation_relative)),
         stiffness_correlation_s=integral_time(errors),
         **torque_levels(torque, gear_gain, speed_sigma),
+    )
+
+
+def section(page: Page, noise: Noise, contact: Contact) -> None:
+    """Noise levels in the report."""
+    part = page.section(
+        "Noise levels",
+        "Noise levels come from residuals of data that did not fit the models; they contain the reference instrument's own "
+        "noise, because the stated sigma is compared with that instrument.",
+    )
+    part.table(
+        ["noise level", "value"],
+        [
+            ["stiffness path, floor / N", f"{noise.stiffness_N:.1f}"],
+            ["stiffness path, relative / %", f"{100 * noise.stiffness_relative:.2f}"],
+            ["stiffness path, correlation / ms", f"{1e3 * noise.stiffness_correlation_s:.0f}"],
+            ["current / A", f"{noise.current_A:.3f}"],
+            ["current, correlation / ms", f"{1e3 * noise.current_correlation_s:.1f}"],
+            ["motor speed / rad/s", f"{noise.speed_rad_per_s:.3f}"],
+            ["friction while it turns over / %", f"{100 * noise.presliding:.0f}"],
+            ["torque path, relative / %", f"{100 * noise.torque_relative:.2f}"],
+            ["clearance / rad", with_sigma(contact.clearance_rad, contact.clearance_sigma_rad)],
+        ],
     )

@@ -1,6 +1,6 @@
 """Blind test of diagnose on simulated brakes whose effects a seed has drawn.
 
-    python -m emb_daemon.diagnose.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
+    python -m studies.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
 
 Trials are appended to the file one by one; started again with the same file, the command goes on where it was stopped, and
 prints the table of all.
@@ -22,41 +22,25 @@ import msgspec
 import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.diagnose.channels import Bench
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.effects import REGISTRY
-from emb_daemon.offline import log_of
+from emb_daemon.offline.log import log_of
+from emb_daemon.offline.score import rmse
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
 
-#: Effects with a force on a path, drawn in blind trials, and how: amplitudes in proportions that one factor scales, and
-#: shape parameters from a range.
-_SHAPES: dict[str, dict[str, tuple[float, float]]] = {
-    "disc_thickness_variation": {},
-    "disc_thermal_expansion": {},
-    "torque_constant_fade": {"disc_share": (0.3, 1.0)},
-    "current_offset": {},
-    "viscous_friction": {},
-    "stribeck_friction": {"speed_rad_per_s": (2.0, 20.0)},
-    "friction_asymmetry": {},
-    "gear_mesh_ripple": {"order_per_turn": (1.3, 12.0)},
-    "cogging_torque": {"order_per_turn": (4.0, 24.0)},
-    "signal_delay": {},
-    "backlash": {},
-    "stiffness_hysteresis": {"slip_angle_rad": (0.4, 2.0)},
-    "second_relaxation": {"time_constant_s": (0.2, 5.0)},
-}
+#: Effects that say from which ranges they are to be drawn.
+DRAWN = {effect.name: effect for effect in REGISTRY if all(parameter.drawn for parameter in effect.parameters)}
 #: Effects outside the catalogue, with a size at which they matter.
 _FOREIGN = {
     "clamp_creep": {"share": 0.06, "time_constant_s": 30.0},
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
 }
-_POSITIVE = ("signal_delay", "second_relaxation")
-#: Largest delay drawn, s: a delay is undone to first order, which a longer one than a cycle and a half outgrows.
-_LONGEST_DELAY_S = 0.006
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
 
@@ -68,7 +52,7 @@ class Trial:
     Attributes:
         hidden: effects of the plant with their parameters, beside those of the calibration.
         size: RMS that each makes on its own path, N.
-        found: effects accepted, with their parameters.
+        found: effects accepted, with their parameters; what changed of those in the calibration is recalibration.
         before, after: RMSE of the fused force on the validation log, N.
         unexplained: signal that a rest depends on, or None.
         contribution_error: of what the found effects do on their paths against what the hidden ones do, RMS over RMS; None
@@ -111,46 +95,31 @@ def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:
 
 def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
     """Parameters of an effect at the size that physics leads one to expect."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    values = {}
+    effect, values = DRAWN[name], {}
     for parameter in effect.parameters:
+        low, high = parameter.drawn
         if parameter.starts:
-            low, high = _SHAPES[name][parameter.name]
             value = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-            values[parameter.name] = float(round(value)) if name == "cogging_torque" else value
-        elif "order_3" in parameter.name or "order_4" in parameter.name:
-            values[parameter.name] = 0.0
+            values[parameter.name] = float(round(value)) if effect.harmonic and effect.harmonic.whole else value
+        elif low == high:
+            values[parameter.name] = low
         else:
-            # Only the future would make a delay negative, and only pads that pull a relaxation.
-            sign = 1.0 if parameter.low >= 0.0 or name in _POSITIVE else rng.choice([-1.0, 1.0])
+            sign = 1.0 if low >= 0.0 else rng.choice([-1.0, 1.0])
             values[parameter.name] = float(parameter.prior * sign * rng.uniform(0.5, 1.5))
     return values
 
 
 def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, float]:
-    """The same effect, ``factor`` times as strong, inside its bounds."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    result = dict(values)
-    for parameter in effect.amplitudes:
-        high = _LONGEST_DELAY_S if name == "signal_delay" else parameter.high
-        result[parameter.name] = float(np.clip(values[parameter.name] * factor, max(parameter.low, -high), high))
-    return result
+    """The same effect, ``factor`` times as strong, inside its ranges."""
+    amplitudes = {p.name: float(np.clip(values[p.name] * factor, *p.drawn)) for p in DRAWN[name].amplitudes}
+    return values | amplitudes
 
 
 def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarray:
     """What an effect does on its own path, N, by the estimator's own term."""
-    effect = next(e for e in REGISTRY if e.name == name)
-    channel = bench.channel_of(effect.path, name)
-    other = Bench.__new__(Bench)
-    other.__dict__.update(bench.__dict__)
-    other.parameters = bench.parameters.copy()
-    for key, value in values.items():
-        other.parameters["effects"][name][key] = value
-    return other.residuals({})[channel] - bench.residuals({})[channel]
-
-
-def _rms(signal: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(signal**2)))
+    channel = bench.channel_of(DRAWN[name].channel)
+    with_it = moved(bench.calibration, {f"effects.{name}.{key}": value for key, value in values.items()})
+    return bench.under(with_it).residuals({})[channel] - bench.residuals({})[channel]
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
@@ -171,12 +140,12 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         hidden[names[0]] = dict(_FOREIGN[names[0]])
     elif names:
         frames, _ = simulate_log(base, schedule, seed=seed)
-        bench = Bench([log_of(frames)], to_parameters(start))
+        bench = Bench([log_of(frames)], start)
         for name in names:
             values = draw(name, rng)
             # Twice, because large sizes are not quite linear.
             for _ in range(2):
-                values = scaled(name, values, size / max(_rms(contribution(bench, name, values)), 1e-9))
+                values = scaled(name, values, size / max(rmse(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
     plant = base.copy()
     for name, values in hidden.items():
@@ -188,13 +157,14 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     begin = time.process_time()
     result = diagnose([fit_log], start, [val_log])
     seconds = time.process_time() - begin
-    rest_ = result.unexplained
-    found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in result.accepted}
+    left = result.unexplained
+    new = [f for f in result.accepted if not f.in_calibration]
+    found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in new}
     error = None
     if kind in ("single", "pair") and set(found) == set(hidden):
-        bench = Bench([val_log], to_parameters(start))
+        bench = Bench([val_log], start)
         true = {name: contribution(bench, name, values) for name, values in hidden.items()}
-        error = max(_rms(contribution(bench, name, found[name]) - true[name]) / _rms(true[name]) for name in hidden)
+        error = max(rmse(contribution(bench, name, found[name]) - true[name]) / rmse(true[name]) for name in hidden)
     return Trial(
         seed,
         kind,
@@ -203,7 +173,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         found,
         result.before.rmse("fused"),
         result.after.rmse("fused"),
-        rest_.signal if rest_ else None,
+        left.strongest.signal if left and left.strongest else None,
         error,
         seconds,
     )
@@ -217,8 +187,7 @@ def parameter_error(trial: Trial) -> float:
     for name, values in trial.hidden.items():
         if name not in trial.found:
             return float("nan")
-        effect = next(e for e in REGISTRY if e.name == name)
-        keys = [p.name for p in effect.amplitudes]
+        keys = [p.name for p in DRAWN[name].amplitudes]
         true, found = (_amplitudes({key: v.get(key, 0.0) for key in keys}) for v in (values, trial.found[name]))
         error = max(abs(found[key] - true[key]) for key in true) / max(abs(value) for value in true.values())
         worst = float(np.nanmax([worst, error]))
@@ -235,7 +204,7 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
 def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, str, tuple[str, ...], float]]:
     """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
-    names = list(_SHAPES)
+    names = list(DRAWN)
     trials: list[tuple[int, str, tuple[str, ...], float]] = [(1000 + k, "null", (), 0.0) for k in range(null)]
     cells = [((name,), size) for name in names for size in SIZES_N]
     trials += [(20000 + 10 * k, "single", *cell) for k, cell in enumerate(cells * single)]
@@ -256,7 +225,7 @@ def summary(trials: list[Trial]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for label, group in groups.items():
-        before, after = (_rms(np.array([getattr(trial, when) for trial in group])) for when in ("before", "after"))
+        before, after = (rmse(np.array([getattr(trial, when) for trial in group])) for when in ("before", "after"))
         worse = sum(trial.after > _WORSE * trial.before for trial in group)
         false = sum(bool(trial.false_findings) for trial in group)
         lines.append(f"| {label} | {len(group)} | {_share(group)} | {false} | {before:.0f} → {after:.0f} | {worse} |")

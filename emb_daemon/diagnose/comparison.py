@@ -1,0 +1,66 @@
+"""Error before and after, on logs (or episodes) that chose neither effect nor value, with intervals over episodes."""
+
+import numpy as np
+
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.diagnose.residuals import Bench, Trial
+from emb_daemon.offline.run import estimate
+from emb_daemon.offline.score import PATHS, EpisodeErrors, conditions, is_turning
+
+_RESAMPLES = 1000
+
+
+def errors_of(bench: Bench, trial: Trial, estimates: np.ndarray) -> EpisodeErrors:
+    """Errors in N of one log's estimates: against its reference force, as `replay` counts them, or without one the difference
+    of both paths."""
+    log = trial.log
+    if bench.has_reference:
+        errors = {path: estimates[column] - log.force_N for path, column in PATHS.items()}
+        return EpisodeErrors.of(errors, conditions(log.samples, estimates, log.force_N), trial.episode)
+    turning = is_turning(log.samples)
+    errors = {"innovation": estimates["torque_force"] - estimates["stiffness_force"]}
+    return EpisodeErrors.of(errors, {"rotating": turning, "standing": ~turning}, trial.episode)
+
+
+def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
+    """Errors of the running estimator over all logs of a bench, each from a fresh start."""
+    parameters = to_parameters(calibration)
+    return EpisodeErrors.joined([errors_of(bench, trial, estimate(trial.log.samples, parameters)) for trial in bench.trials])
+
+
+def whole(bench: Bench) -> str:
+    """The path that all others serve."""
+    return "fused" if bench.has_reference else "innovation"
+
+
+def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict:
+    """RMSE before and after by path and condition, each with a 95 % interval, and one of the ratio, over episodes.
+
+    A path that says nothing on these logs is left out."""
+    random = np.random.default_rng(0)
+    count = before.sums.shape[2]
+    weights = random.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES)
+    result: dict = {}
+    for path in before.paths:
+        part = {c: _compared(before, after, path, c, weights) for c in before.conditions if _known(before, after, path, c)}
+        if "total" in part:
+            result[path] = part
+    return result
+
+
+def _known(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str) -> bool:
+    return bool(np.isfinite(before.rmse(path, condition)) and np.isfinite(after.rmse(path, condition)))
+
+
+def _compared(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str, weights: np.ndarray) -> dict:
+    sampled = np.array([[before.rmse(path, condition, w), after.rmse(path, condition, w)] for w in weights])
+    sampled = sampled[np.isfinite(sampled).all(axis=1)]
+    low, high = np.percentile(sampled, (2.5, 97.5), axis=0)
+    ratio = np.percentile(sampled[:, 1] / np.maximum(sampled[:, 0], 1e-12), (2.5, 97.5))
+    return {
+        "rmse_before_N": before.rmse(path, condition),
+        "rmse_after_N": after.rmse(path, condition),
+        "interval_before_N": [float(low[0]), float(high[0])],
+        "interval_after_N": [float(low[1]), float(high[1])],
+        "ratio_interval": [float(ratio[0]), float(ratio[1])],
+    }

@@ -1,0 +1,231 @@
+"""What a fit may move: directions in the calibration's parameter space, with what is known of each beforehand.
+
+A coordinate of the base calibration is a nuisance: a curve or a friction that is a little off must not be called an effect,
+nor hide one, so every candidate is tested with all of its channel's base coordinates free.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.calibration.parameters import parameter, value_of
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect
+
+
+@dataclass(frozen=True)
+class Move:
+    """How a key of the calibration follows a coordinate: ``weight`` times its value, inside the key's bounds."""
+
+    key: str
+    weight: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinate:
+    """One number that a fit moves.
+
+    Attributes:
+        name: key of the calibration that it stands for.
+        channel: residual that it is read from.
+        start: its value as calibrated; zero for an effect that is off.
+        step: of the numerical derivative.
+        prior: standard deviation of what is known beforehand, about the start; infinite for a new effect's amplitude.
+        moves: keys that follow it. Several coordinates of one key add up.
+        effect, parameter: what it belongs to; empty for a base parameter.
+        log: index of the only log that it acts on, or None for all.
+    """
+
+    name: str
+    channel: str
+    start: float
+    step: float
+    prior: float
+    moves: tuple[Move, ...]
+    low: float = -np.inf
+    high: float = np.inf
+    unit: str = "1"
+    effect: str = ""
+    parameter: str = ""
+    log: int | None = None
+
+
+Values = Mapping[Coordinate, float]
+
+#: Base parameters, the channel that shows them, and how well they are known: standard deviation over their size.
+_BASE = (
+    ("stiffness.relaxation_time_s", "stiffness", 0.5),
+    ("motor.torque_constant_Nm_per_A", "torque", 0.03),
+    ("motor.inertia_kg_m2", "torque", 0.5),
+    ("friction.load_m_per_rad", "torque", 0.5),
+    ("friction.offset_Nm", "torque", 1.0),
+    ("friction.presliding_angle_rad", "torque", 1.0),
+    ("thermal.pad.conductivity_W_per_mK", "temperature", 0.15),
+    ("thermal.pad.contact_conductance_W_per_m2K", "temperature", 0.5),
+    ("thermal.pad.gap_conductance_W_per_m2K", "temperature", 0.5),
+    ("thermal.pad.backplate_conductance_W_per_m2K", "temperature", 0.5),
+    ("thermal.pad.inner_heat_share", "temperature", 0.5),
+    ("thermal.pad.outer_heat_share", "temperature", 0.5),
+    ("thermal.disc.heat_capacity_J_per_K", "temperature", 0.1),
+    ("thermal.disc.cooling_W_per_K", "temperature", 0.5),
+    ("thermal.disc.cooling_per_speed_J_per_rad_K", "temperature", 0.5),
+)
+#: The same over the usual size of a parameter that is zero or below this share of it: of its size nothing else is known.
+_OF_USUAL, _NEXT_TO_NOTHING = 3.0, 0.3
+#: A parameter that cannot be zero does not fall below this share of itself.
+_LEAST = 0.1
+#: Curve coefficients and the pads' friction, as above; slopes of the latter over force and disc speed turn about these.
+_CURVE, _FRICTION, _SLOPE = 0.1, 0.3, 0.1
+_FRICTION_FORCE_N, _FRICTION_SPEED = 5000.0, 20.0
+#: Each power-on finds its own contact: standard deviation of the clearance, rad.
+_CLEARANCE_RAD = 0.5
+#: Pads soften with heat, never stiffen: what was calibrated holds within a third or this, and never beyond the most, 1/K.
+_SOFTENING, _MOST_SOFTENING = 1e-4, 2e-3
+#: Phase runs away with the angle: an order is only ever touched up. Step and standard deviation, per turn.
+_ORDER_STEP, _ORDER = 1e-4, 0.1
+#: Standard deviation of an effect's shape, at least; over its size where that is larger.
+_SHAPE = 0.5
+
+
+def base_coordinates(calibration: Calibration, logs: int) -> list[Coordinate]:
+    """Coordinates of the base calibration; the contact angle has one for each log."""
+    clearance = parameter(calibration, "contact.clearance_rad")
+    moves = (Move(clearance.key, 1.0, 0.0, np.inf),)
+    result = [
+        Coordinate(clearance.key, "stiffness", clearance.value, clearance.step, _CLEARANCE_RAD, moves, unit="rad", log=log)
+        for log in range(logs)
+    ]
+    curves = calibration.stiffness.curves
+    mounted = int(np.argmin([abs(curve.pad_thickness_mm - calibration.pad_thickness_mm) for curve in curves]))
+    for index in range(max(len(curve.coefficients) for curve in curves)):
+        keys = [f"stiffness.curves[{n}].coefficients[{index}]" for n, c in enumerate(curves) if index < len(c.coefficients)]
+        # The mounted pads' curve stands for all: pads of other thickness are off by the same share.
+        keys.sort(key=lambda key: not key.startswith(f"stiffness.curves[{mounted}]"))
+        if any(value_of(calibration, key) for key in keys):
+            result.append(_scale(calibration, keys, "stiffness", _CURVE))
+    for name in ("per_K", "history_per_K"):
+        known = parameter(calibration, f"thermal.softening.{name}")
+        prior = max(abs(known.value) / 3.0, _SOFTENING)
+        move = (Move(known.key, 1.0, 0.0, _MOST_SOFTENING),)
+        low, high = min(0.0, known.value), max(_MOST_SOFTENING, known.value)
+        result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
+    result += [_scale(calibration, [key], channel, prior) for key, channel, prior in _BASE]
+    return result + _friction(calibration)
+
+
+def _scale(calibration: Calibration, keys: list[str], channel: str, prior: float) -> Coordinate:
+    """Keys in proportion, as multiples of their size; the first gives the name."""
+    known = [parameter(calibration, key) for key in keys]
+    first = known[0]
+    # A step is a thousandth of the size: of the value, or of the usual size where the value is next to nothing.
+    sizes = [abs(p.value) if p.relative else _usual(p.step) for p in known]
+    moves = tuple(Move(p.key, size, p.low, p.high) for p, size in zip(known, sizes, strict=True))
+    start = first.value / sizes[0]
+    least = _LEAST * start if first.low > 0.0 else first.low / sizes[0]
+    known_to = prior * abs(start) if abs(start) > _NEXT_TO_NOTHING else prior * _OF_USUAL
+    return Coordinate(first.key, channel, start, first.step / sizes[0], known_to, moves, least, first.high / sizes[0])
+
+
+def _usual(step: float) -> float:
+    return 1e3 * step
+
+
+def _friction(calibration: Calibration) -> list[Coordinate]:
+    """The pads' friction table as a whole, and its slopes over force and disc speed."""
+    table = calibration.thermal.friction
+    coefficient = np.array(table.coefficient)
+    over_force = np.array(table.force_N)[:, None, None] / _FRICTION_FORCE_N - 1.0
+    over_speed = np.array(table.disc_speed_rad_per_s)[None, :, None] / _FRICTION_SPEED - 1.0
+    result = []
+    for name, weight, start, prior in (
+        ("", np.ones_like(coefficient), 1.0, _FRICTION),
+        (".over_force", over_force + np.zeros_like(coefficient), 0.0, _SLOPE),
+        (".over_speed", over_speed + np.zeros_like(coefficient), 0.0, _SLOPE),
+    ):
+        moves = tuple(
+            Move(f"thermal.friction.coefficient[{i}][{j}][{k}]", float(coefficient[i, j, k] * weight[i, j, k]), 0.0, 1.0)
+            for i, j, k in np.ndindex(coefficient.shape)
+        )
+        low = _LEAST if start else -np.inf
+        result.append(Coordinate(f"thermal.friction.coefficient{name}", "brake_torque", start, 1e-3, prior, moves, low))
+    return result
+
+
+def effect_coordinates(calibration: Calibration, effect: Effect, channel: str) -> dict[str, Coordinate]:
+    """By parameter; an effect that is off starts at zero, its shapes too, until one is chosen."""
+    on = calibration.effects.get(effect.name, {})
+    result = {}
+    for p in effect.parameters:
+        known = parameter(calibration, f"effects.{effect.name}.{p.name}")
+        start, step, prior = on.get(p.name, 0.0), known.step, np.inf
+        if effect.harmonic and p.name == effect.harmonic.order:
+            step, prior = _ORDER_STEP, _ORDER
+        elif p.starts:
+            prior = max(abs(start) or p.prior, _SHAPE)
+        elif start:
+            prior = abs(start)
+        moves = (Move(known.key, 1.0, p.low, p.high),)
+        result[p.name] = Coordinate(
+            known.key, channel, start, step, prior, moves, p.low, p.high, p.unit, effect.name, p.name
+        )  # fmt: skip
+    return result
+
+
+def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, float]:
+    """What coordinates say of the calibration's numbers.
+
+    Args:
+        middle: motor angle in rad about which harmonics are fitted, see `about_middle`.
+        log: only what acts on this log; None: what acts on single logs counts with its mean.
+    """
+    sums: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    limits: dict[str, tuple[float, float]] = {}
+    for coordinate, value in values.items():
+        if log is not None and coordinate.log not in (None, log):
+            continue
+        for move in coordinate.moves:
+            sums[move.key] = sums.get(move.key, 0.0) + move.weight * value
+            counts[move.key] = counts.get(move.key, 0) + (coordinate.log is not None)
+            limits[move.key] = move.low, move.high
+    found = {key: total / max(counts[key], 1) for key, total in sums.items()}
+    for order, cosine, sine, (low, high) in _HARMONICS:
+        if order in found:
+            found[cosine], found[sine] = _turn(found.get(cosine, 0.0), found.get(sine, 0.0), found[order] * middle)
+            limits[cosine] = limits[sine] = low, high
+    return {key: float(np.clip(value, *limits[key])) for key, value in found.items()}
+
+
+def about_middle(values: Values, middle: float) -> dict[Coordinate, float]:
+    """Values as the calibration states them, with its harmonics as they are fitted.
+
+    The motor angle counts from anywhere, so a small change of an order would turn the phase by much. Fits therefore move
+    cosine and sine over the angle from the ``middle`` of those that occur.
+    """
+    result, named = dict(values), {c.name: c for c in values}
+    for order, cosine, sine, _ in _HARMONICS:
+        if order in named:
+            keys = named[cosine], named[sine]
+            found = _turn(values[keys[0]], values[keys[1]], -values[named[order]] * middle)
+            result |= dict(zip(keys, found, strict=True))
+    return result
+
+
+def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
+    size = complex(cosine, sine) * np.exp(1j * angle)
+    return float(size.real), float(size.imag)
+
+
+#: Keys of order, cosine and sine of every harmonic, and the amplitudes' bounds.
+_HARMONICS = [
+    (
+        *(f"effects.{effect.name}.{name}" for name in (effect.harmonic.order, effect.harmonic.cosine, effect.harmonic.sine)),
+        (effect.parameter(effect.harmonic.cosine).low, effect.parameter(effect.harmonic.cosine).high),
+    )
+    for effect in REGISTRY
+    if effect.harmonic
+]

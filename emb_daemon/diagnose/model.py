@@ -1,0 +1,188 @@
+"""The state of a search, immutable: what is free, where it stands, and what that leaves."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
+from emb_daemon.diagnose.evidence import Evidence, Moments, judge
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
+from emb_daemon.effects import REGISTRY
+from emb_daemon.offline.fit import Block, Fit, Free, fit
+from emb_daemon.offline.score import rmse
+
+#: Least number of samples that are worth one, when priors are weighed against data: twenty milliseconds, the shortest time
+#: over which a residual of either path stays the same.
+_INFLATION = 5.0
+#: A fit ends when the cost falls by less than this share, or after so many evaluations: screening and the next round follow.
+_TOLERANCE, _EVALUATIONS = 2e-3, 8
+
+
+@dataclass(frozen=True)
+class Model:
+    """Coordinates with their values, and the residual there.
+
+    Attributes:
+        values: of every coordinate that has been entered; effects' shapes included.
+        centre: where a coordinate's prior is centred, if not at the calibration: a shape is touched up about the start at
+            which it was chosen.
+        chosen: coordinates that stand as chosen and are not fitted: whole numbers.
+        residual: by channel.
+        columns: regressors, minus the derivative of the channel's residual, at the last fit.
+        fits: by channel.
+    """
+
+    bench: Bench
+    values: dict[Coordinate, float]
+    residual: dict[str, np.ndarray] = field(repr=False)
+    centre: Values = field(default_factory=dict)
+    chosen: frozenset[Coordinate] = frozenset()
+    columns: Mapping[Coordinate, np.ndarray] = field(default_factory=dict, repr=False)
+    fits: Mapping[str, Fit] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, bench: Bench) -> "Model":
+        """The calibration as it is: its base parameters and its effects free, nothing moved."""
+        coordinates = []
+        for coordinate in base_coordinates(bench.calibration, len(bench.trials)):
+            if channel := bench.channel_of(coordinate.channel):
+                coordinates.append(replace(coordinate, channel=channel))
+        for effect in REGISTRY:
+            on, channel = bench.calibration.effects.get(effect.name, {}), bench.channel_of(effect.channel)
+            if channel and any(on.get(p.name, 0.0) for p in effect.amplitudes):
+                coordinates += effect_coordinates(bench.calibration, effect, channel).values()
+        start = about_middle({c: c.start for c in coordinates}, bench.middle)
+        return cls(bench, start, bench.residuals(start), centre=start)
+
+    def own(self, channel: str) -> list[Coordinate]:
+        """What is fitted in a channel."""
+        return [c for c in self.values if c.channel == channel and c not in self.chosen]
+
+    def of_effect(self, name: str) -> list[Coordinate]:
+        return [c for c in self.values if c.effect == name]
+
+    def entered(self, values: Values, chosen: Iterable[Coordinate] = (), centre: Values | None = None) -> "Model":
+        """With more coordinates, or some elsewhere."""
+        every = self.values | dict(values)
+        return replace(
+            self,
+            values=every,
+            residual=self.bench.residuals(every),
+            centre={**self.centre, **(centre or {})},
+            chosen=self.chosen | frozenset(chosen),
+        )
+
+    def without(self, gone: Iterable[Coordinate]) -> "Model":
+        """With some coordinates taken out again, not refitted."""
+        gone = set(gone)
+        left = {c: value for c, value in self.values.items() if c not in gone}
+        return replace(self, values=left, residual=self.bench.residuals(left), chosen=self.chosen - gone)
+
+    # -- fitting ------------------------------------------------------------------------------------------------------
+
+    def noise(self, channel: str) -> float:
+        """Mean square of the residual where there is one."""
+        counted = self.residual[channel][self.residual[channel] != 0.0]
+        return rmse(counted) ** 2 if len(counted) else 0.0
+
+    def inflation(self, channel: str) -> float:
+        """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""
+        residual, episode = self.residual[channel], self.bench.episode[channel]
+        sums = np.bincount(episode, residual, minlength=self.bench.episodes)
+        squares = np.bincount(episode, residual**2, minlength=self.bench.episodes)
+        return max(_INFLATION, float((sums**2).sum() / max(squares.sum(), 1e-300)))
+
+    def refined(self, channels: Iterable[str]) -> "Model":
+        """Everything free in some channels fitted through the estimator: heat first, on which stiffness rests."""
+        model, channels = self, set(channels)
+        for channel in (*HEAT_CHANNELS, *FORCE_CHANNELS):
+            if channel in channels and model.own(channel):
+                model = model._fitted(channel)
+        return model
+
+    def _fitted(self, channel: str) -> "Model":
+        own, episode = tuple(self.own(channel)), self.bench.episode[channel]
+        # In units of what an episode knows, as priors are.
+        scale = float(np.sqrt(self.inflation(channel) * max(self.noise(channel), 1e-12)))
+        known: dict[tuple, np.ndarray] = {}
+        slopes: dict[tuple, np.ndarray] = {}
+
+        def residual(tried: Values) -> np.ndarray:
+            key = tuple(tried[c] for c in own)
+            if key not in known:
+                known[key] = self.bench.residuals(self.values | dict(tried))[channel] / scale
+            return known[key]
+
+        def derivative(tried: Values) -> np.ndarray:
+            # Heat answers to its parameters so nearly in proportion that one derivative serves all iterations.
+            key = tuple(tried[c] for c in own) if channel in FORCE_CHANNELS else ()
+            if key not in slopes:
+                at = {channel: scale * residual(tried)}
+                found = self.bench.regressors(self.values | dict(tried), [Probe(c) for c in own], at)
+                slopes[key] = -np.column_stack(found) / scale
+            return slopes[key]
+
+        prior = {c: (self.centre.get(c, c.start), c.prior) if np.isfinite(c.prior) else None for c in own}
+        free = {c: Free(self.values[c], c.step, c.low, c.high, prior[c]) for c in own}
+        found = fit([Block(residual, own, episode, derivative)], free, tolerance=_TOLERANCE, evaluations=_EVALUATIONS)
+        values = self.values | found.values
+        table = -scale * derivative(found.values)
+        return replace(
+            self,
+            values=values,
+            residual=self.bench.residuals(values),
+            columns={**self.columns, **dict(zip(own, table.T, strict=True))},
+            fits={**self.fits, channel: found},
+        )
+
+    # -- testing ------------------------------------------------------------------------------------------------------
+
+    def penalty(self, coordinates: Sequence[Coordinate], channel: str) -> np.ndarray:
+        """What priors add to the normal equations."""
+        prior = np.array([c.prior for c in coordinates])
+        return self.inflation(channel) * max(self.noise(channel), 1e-12) / prior**2
+
+    def moments(self, channel: str, columns: Sequence[np.ndarray], residual: np.ndarray | None = None) -> Moments:
+        """Of regressors, (N,) or (N, k) each, and the channel's residual or another."""
+        residual = self.residual[channel] if residual is None else residual
+        table = np.column_stack(columns) if len(columns) else np.zeros((len(residual), 0))
+        return Moments.of(table, residual, self.bench.episode[channel], self.bench.episodes)
+
+    def evidence(self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = ()) -> Evidence:
+        """Of regressors that are not in the model, everything in it and ``given`` ones free."""
+        free = self.own(channel)
+        moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own])
+        penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
+        first = len(free) + len(given)
+        return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
+
+    def evidence_against(self, values: Values) -> Evidence:
+        """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free.
+
+        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
+        tested = list(values)
+        channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
+        free = [c for c in self.own(channel) if c in values or c.effect not in effects or not is_shape(c)]
+        from_ = {c: values.get(c, self.centre.get(c, c.start)) for c in free}
+        moved = np.array([self.values[c] - from_[c] for c in free])
+        restored = self.residual[channel] + np.column_stack([self.columns[c] for c in free]) @ moved
+        moments = self.moments(channel, [self.columns[c] for c in free], restored)
+        rest = [index for index, c in enumerate(free) if c not in values]
+        return judge(moments, rest, [free.index(c) for c in tested], self.penalty(free, channel))
+
+    def counted(self, channel: str) -> int:
+        """Residuals of a channel that say something."""
+        return max(int(np.count_nonzero(self.residual[channel])), 1)
+
+    def rms(self, gain: float, channel: str) -> float:
+        """A fall of the summed squared error as RMS in the channel's unit."""
+        return float(np.sqrt(max(gain, 0.0) / self.counted(channel)))
+
+
+_SHAPES = {f"effects.{effect.name}.{parameter.name}" for effect in REGISTRY for parameter in effect.shapes}
+
+
+def is_shape(coordinate: Coordinate) -> bool:
+    """Whether a coordinate shapes an effect without switching it on."""
+    return coordinate.name in _SHAPES

@@ -1,0 +1,125 @@
+"""Contents of report.json."""
+
+import numpy as np
+
+from emb_daemon.diagnose.diagnosis import Diagnosis, Recalibrated
+from emb_daemon.diagnose.residuals import UNITS
+from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.unexplained import Left
+
+#: Dependences listed for each channel.
+_LISTED = 6
+
+
+def report(diagnosis: Diagnosis) -> dict:
+    """Everything, for scripts."""
+    return {
+        "paths": {
+            path: {
+                **{key: part["total"][key] for key in ("rmse_before_N", "rmse_after_N")},
+                **{key: part["total"][key] for key in ("interval_before_N", "interval_after_N")},
+                "conditions": {name: value for name, value in part.items() if name != "total"},
+            }
+            for path, part in diagnosis.figures().items()
+        },
+        "judged_on": diagnosis.judged_on,
+        "reference": "clamp_force" if diagnosis.bench.has_reference else "innovation",
+        "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],
+        "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
+        "noise": {
+            name: {"before": getattr(diagnosis.original.noise, name), "after": getattr(diagnosis.calibration.noise, name)}
+            for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
+            if getattr(diagnosis.original.noise, name) != getattr(diagnosis.calibration.noise, name)
+        },
+        "unexplained": _unexplained(diagnosis),
+        "judged_residual": {
+            channel: {"unit": UNITS[channel], "rms_before": before, "rms_after": after}
+            for channel, (before, after) in diagnosis.judged_residual.items()
+        },
+        "episodes": diagnosis.bench.episodes,
+        "seconds": diagnosis.seconds,
+    }
+
+
+def _unexplained(diagnosis: Diagnosis) -> dict:
+    left = diagnosis.unexplained
+    strongest = left.strongest if left else None
+    every = [d.share for part in diagnosis.left.values() for d in part.dependences]
+    return {
+        "present": left is not None,
+        "share": strongest.share if strongest else max(every, default=0.0),
+        "strongest_dependence": strongest.signal if strongest else None,
+        "path": left.channel if left else None,
+        "rms_N": left.rms if left and UNITS[left.channel] == "N" else 0.0,
+        "paths": {channel: _left(part) for channel, part in diagnosis.left.items()},
+    }
+
+
+def _left(left: Left) -> dict:
+    return {
+        "present": left.present,
+        "unit": UNITS[left.channel],
+        "rms": left.rms,
+        "achieved_by_calibration": left.achieved if np.isfinite(left.achieved) else None,
+        "share": left.share,
+        "dependences": [
+            {"signal": d.signal, "share": d.share, "rms": d.rms, "certainty": d.certainty} for d in left.dependences[:_LISTED]
+        ],
+    }
+
+
+def _recalibrated(found: Recalibrated) -> dict:
+    entry = {"before": found.before, "value": found.value, "sigma": found.sigma, "unit": found.unit}
+    return entry | _gain(found.gain, found.channel)
+
+
+def _gain(gain: float, channel: str | None) -> dict:
+    unit = UNITS.get(channel or "", "N")
+    return {"gain_N": gain} if unit == "N" else {"gain_N": 0.0, "gain": {"value": gain, "unit": unit}}
+
+
+def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
+    """One entry of ``effects``."""
+    effect = finding.effect
+    parameters = {
+        p.name: {"value": finding.values[p.name], "sigma": finding.sigmas.get(p.name, 0.0), "unit": p.unit}
+        | ({"before": finding.before[p.name]} if p.name in finding.before else {})
+        for p in effect.parameters
+        if p.name in finding.values
+    }
+    entry = {
+        "name": effect.name,
+        "path": effect.path,
+        "accepted": finding.accepted,
+        "share_explained": finding.share_explained,
+        **_gain(finding.gain, finding.channel),
+        "q_value": finding.q_value,
+        "parameters": parameters | amplitudes(finding),
+        "equation": effect.equation,
+        "reason": finding.reason,
+        "in_calibration": finding.in_calibration,
+    }
+    if finding.placebos:
+        entry |= {"placebo_share": max(finding.placebos.values()), "placebos": dict(finding.placebos)}
+    if finding.confounded_with:
+        entry |= {"confounded_with": finding.confounded_with, "manoeuvre": finding.manoeuvre}
+    if effect.name in diagnosis.validated:
+        entry["gain_on_validation"] = diagnosis.validated[effect.name]
+    return entry
+
+
+def amplitudes(finding: Candidate) -> dict:
+    """Amplitude of each order out of its cosine and sine."""
+    result = {}
+    for name, cosine in finding.values.items():
+        if "cosine" not in name:
+            continue
+        other = name.replace("cosine", "sine")
+        sine = finding.values.get(other, 0.0)
+        size = float(np.hypot(cosine, sine))
+        if size == 0.0:
+            continue
+        spread = np.hypot(cosine * finding.sigmas.get(name, 0.0), sine * finding.sigmas.get(other, 0.0)) / size
+        unit = finding.effect.parameter(name).unit
+        result[name.replace("cosine", "amplitude")] = {"value": size, "sigma": float(spread), "unit": unit}
+    return result

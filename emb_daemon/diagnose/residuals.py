@@ -1,0 +1,223 @@
+"""Residuals: what the running estimator's paths leave unexplained, and how they answer to its parameters.
+
+Everything comes from the production `estimator.step`, run over the log with parameters moved by a little, so that what a
+candidate is credited with is what the daemon will do with it. Only the learning of the contact angle is held here: it
+would spread an error of one path over both, and hide slow effects in an angle that wanders.
+"""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.diagnose.coordinates import Coordinate, Values, by_key
+from emb_daemon.diagnose.episodes import episodes
+from emb_daemon.errors import InputError
+from emb_daemon.offline.log import Log
+from emb_daemon.offline.run import held, run_step
+
+#: Residuals by channel and their unit. `innovation` stands for the paths' reference where a log has none.
+UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
+FORCE_CHANNELS = ("stiffness", "torque", "innovation")
+HEAT_CHANNELS = ("temperature", "brake_torque")
+#: Disc speed (rad/s) below which the brake torque sensor shows static friction.
+_SLIDING = 1.0
+_TOUCHING_N = 300.0
+#: Brake torque (N m) below which a sensor shows nothing but its noise.
+_BRAKING_NM = 20.0
+#: Share of the samples that must have a value before a log counts as having the signal.
+_RECORDED = 0.1
+
+
+@dataclass
+class Trial:
+    """One log, cut into episodes, with its references on the samples' clock."""
+
+    log: Log
+    index: int
+    #: Reference force at the samples, moved by the instrument's own time stamps (not only to the nearest frame).
+    force_N: np.ndarray
+    episode: np.ndarray
+    temperature_rows: np.ndarray
+    temperature_C: np.ndarray
+    brake_torque_Nm: np.ndarray
+
+    @property
+    def has_force(self) -> bool:
+        return bool(np.isfinite(self.force_N).mean() > _RECORDED)
+
+
+def make_trial(log: Log, index: int, stiffness_N: np.ndarray) -> Trial:
+    """Prepare a log. ``stiffness_N``: an estimate of the clamp force, to cut episodes where no reference is."""
+    force, torque = _synchronous(log)
+    rows, measured = _temperatures(log)
+    known = np.isfinite(force).mean() > _RECORDED
+    cut = episodes(log.time_s, np.nan_to_num(force if known else stiffness_N), log.samples["angle"])
+    return Trial(log, index, force, cut, rows, measured, torque)
+
+
+def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Reference force (N) and brake torque (N m) at the samples; NaN where there is none.
+
+    The instrument's frames are stamped a constant while after the resolver's: the force moves by it, not by the jitter."""
+    reference, time, force = log.reference, log.time_ns, log.force_N
+    if not len(reference.time_ns) or not np.isfinite(force).any():
+        return force, np.full(len(time), np.nan)
+    nearest = np.clip(np.searchsorted(reference.time_ns, time), 1, len(reference.time_ns) - 1)
+    before = reference.time_ns[nearest] - time > time - reference.time_ns[nearest - 1]
+    nearest = nearest - before
+    near = np.abs(reference.time_ns[nearest] - time) < 2_000_000
+    offset = np.median((reference.time_ns[nearest] - time)[near]) if near.any() else 0.0
+    share = float(np.clip(offset / np.median(np.diff(reference.time_ns)), -0.5, 0.5))
+    shifted = force.copy()
+    if share > 0.0:
+        shifted[1:] = (1.0 - share) * force[1:] + share * force[:-1]
+    elif share < 0.0:
+        shifted[:-1] = (1.0 + share) * force[:-1] - share * force[1:]
+    return shifted, reference.at(time, reference.brake_torque_Nm)
+
+
+def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Thermocouples inside the pads and the disc's, degC, shape (n, 9), and the sample row that each belongs to."""
+    reference, time = log.reference, log.time_ns
+    at, inner = reference.pads["inner"]
+    keep = (at >= time[0]) & (at <= time[-1])
+    at = at[keep]
+    rows = np.searchsorted(time, at, side="right") - 1
+    measured = np.full((len(rows), 9), np.nan)
+    if not len(rows):
+        return rows, measured
+    measured[:, :4] = inner[:, keep].T
+    outer_time, outer = reference.pads["outer"]
+    if len(outer_time):
+        measured[:, 4:8] = outer[:, np.clip(np.searchsorted(outer_time, at), 0, len(outer_time) - 1)].T
+    if len(reference.time_ns):
+        measured[:, 8] = reference.disc_C[np.clip(np.searchsorted(reference.time_ns, at), 0, len(reference.time_ns) - 1)]
+    # An instrument that is not there reports a constant.
+    measured[:, np.nanstd(measured, axis=0) == 0.0] = np.nan
+    return rows, measured
+
+
+class Bench:
+    """Logs on which a calibration's parameters are tried: runs the estimator and returns residuals, channel by channel.
+
+    Attributes:
+        channels: those that these logs can judge.
+        episode: by channel, the episode number of every residual, shape (N,), counted over all logs.
+        middle: of the motor angles that occur, rad; harmonics are fitted about it.
+    """
+
+    def __init__(self, logs: Sequence[Log], calibration: Calibration, workers: int = 2):
+        self.calibration = calibration
+        self._pool = ThreadPoolExecutor(workers)
+        parameters = held(to_parameters(calibration))
+        forces = self._pool.map(lambda log: run_step(log.samples, parameters)["force"], logs)
+        self.trials = [make_trial(log, index, force) for index, (log, force) in enumerate(zip(logs, forces, strict=True))]
+        self.has_reference = all(trial.has_force for trial in self.trials)
+        self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
+        self.channels = self._channels()
+        self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
+        #: Converts unexplained current to force: what it would be on the spindle.
+        self.newton_per_ampere = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
+        offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
+        self.episodes = int(offsets[-1])
+        by_sample = [trial.episode + offset for trial, offset in zip(self.trials, offsets, strict=False)]
+        by_temperature = [np.repeat(e[trial.temperature_rows], 9) for trial, e in zip(self.trials, by_sample, strict=True)]
+        self.sample_episode = np.concatenate(by_sample)
+        self.episode = {
+            channel: np.concatenate(by_temperature) if channel == "temperature" else self.sample_episode
+            for channel in self.channels
+        }
+
+    def _channels(self) -> list[str]:
+        if self.has_reference:
+            channels = ["stiffness", "torque"] if self.has_current else ["stiffness"]
+        elif self.has_current:
+            channels = ["innovation"]
+        else:
+            raise InputError(f"{self.trials[0].log.path}: neither a clamp force reference nor motor current to judge by")
+        if any(np.isfinite(trial.temperature_C).any() for trial in self.trials):
+            channels.append("temperature")
+        if any(np.nanmax(np.append(trial.brake_torque_Nm, 0.0)) > _BRAKING_NM for trial in self.trials):
+            channels.append("brake_torque")
+        return channels
+
+    def channel_of(self, channel: str) -> str | None:
+        """Channel in which a change shows that shows in ``channel`` where all is measured; None where these logs have none."""
+        if channel in ("stiffness", "torque") and not self.has_reference:
+            channel = "innovation"
+        return channel if channel in self.channels else None
+
+    def disturbed(self, disturb: Callable, random: np.random.Generator) -> "Bench":
+        """The same logs with samples disturbed: (SAMPLE rows, episode of each, generator) → rows."""
+        result = copy.copy(self)
+        result.trials = [
+            replace(trial, log=replace(trial.log, samples=disturb(trial.log.samples, trial.episode, random)))
+            for trial in self.trials
+        ]
+        return result
+
+    def under(self, calibration: Calibration) -> "Bench":
+        """The same logs under another calibration."""
+        result = copy.copy(self)
+        result.calibration = calibration
+        return result
+
+    def calibrated(self, values: Values, log: int | None = None) -> Calibration:
+        """The calibration with coordinates at ``values``, as they apply to a log."""
+        return moved(self.calibration, by_key(values, self.middle, log))
+
+    def residuals(self, values: Values) -> dict[str, np.ndarray]:
+        """Residual by channel over all logs."""
+        return self._joined(list(self._pool.map(lambda trial: self._residual(trial, values), self.trials)))
+
+    def _joined(self, parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        return {channel: np.concatenate([part[channel] for part in parts]) for channel in self.channels}
+
+    def _residual(self, trial: Trial, values: Values) -> dict[str, np.ndarray]:
+        samples, force = trial.log.samples, trial.force_N
+        trace = run_step(samples, held(to_parameters(self.calibrated(values, trial.index))))
+        judged = force if self.has_reference else trace["force"]
+        mean = judged.copy()
+        mean[1:] = 0.5 * (judged[1:] + judged[:-1])
+        if not self.has_reference:
+            mean[0] *= 0.5
+        # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
+        current = (trace["torque"] - trace["leverage"] * mean) / trace["torque_constant"]
+        torque = np.nan_to_num(current * self.newton_per_ampere, nan=0.0)
+        result = {"stiffness": np.nan_to_num(force - trace["force"]), "torque": torque, "innovation": torque}
+        if "temperature" in self.channels:
+            temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]
+            result["temperature"] = np.nan_to_num(trial.temperature_C - temperature).ravel()
+        if "brake_torque" in self.channels:
+            wheel = np.where(samples["has_wheel_speed"], samples["wheel_speed"], 0.0)
+            sliding = (wheel > _SLIDING) & (trace["power"] > 0.0) & (trial.brake_torque_Nm > 0.0)
+            sliding &= np.nan_to_num(force, nan=0.0) > _TOUCHING_N if self.has_reference else True
+            left = trial.brake_torque_Nm - trace["power"] / np.maximum(wheel, _SLIDING)
+            result["brake_torque"] = np.where(sliding, left, 0.0)
+        return result
+
+    def regressors(self, values: Values, probes: Sequence["Probe"], at: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """How the probed coordinates' own channels answer: minus the derivative of the residual."""
+
+        def answer(probe: Probe) -> np.ndarray:
+            coordinate, tried = probe.coordinate, {**values, **dict(probe.shape)}
+            now = tried.get(coordinate, coordinate.start)
+            step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
+            tried[coordinate] = now + step
+            residual = self._joined([self._residual(trial, tried) for trial in self.trials])[coordinate.channel]
+            return (at[coordinate.channel] - residual) / step
+
+        return list(self._pool.map(answer, probes))
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A coordinate to be moved a little, with the shape that its effect has meanwhile."""
+
+    coordinate: Coordinate
+    shape: tuple[tuple[Coordinate, float], ...] = ()

@@ -1,0 +1,276 @@
+"""Screening: what speaks for and against each effect of the catalogue, given a model.
+
+A candidate is refused unless it passes all of
+
+1. a cluster-robust test over episodes, with the channel's base parameters and all accepted effects free, corrected for the
+   shapes tried; false discovery rate over the whole catalogue at most 1 % (Benjamini and Hochberg),
+2. a gain on episodes left out of the fit that matters: a share of the residual and of the force,
+3. values inside the physical bounds,
+4. comparison with what no model at all can say: if a smooth function of a single signal explains much more, the candidate
+   is a shadow of something else,
+5. placebos: with what it rests on disturbed it must do much worse.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+
+import numpy as np
+
+from emb_daemon.diagnose.coordinates import Coordinate, effect_coordinates
+from emb_daemon.diagnose.evidence import NOT_EXCITED, Evidence, false_discovery, leave_out
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.orders import strongest_order
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.signals import signals, smooth_basis
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import HOOKS, Effect, Placebo
+from emb_daemon.offline.score import rmse
+
+#: False discovery rate over the catalogue.
+Q_VALUE = 0.01
+#: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference: two parts in a
+#: thousand of the force is what force sensors of test rigs are good for.
+_RESIDUAL_SHARE, _SIGNAL_SHARE = 0.06, 0.002
+#: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
+_FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
+#: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
+_OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
+#: Draws of a placebo that runs through the estimator, and of one that does not.
+_DRAWS, _SHUFFLES = 2, 5
+#: Signals that are no rivals in a channel: what a base parameter answers for (smoothed, the acceleration shows inertia better
+#: than the estimator's own difference of noisy speeds can), and the current of which the residual itself is made.
+_NO_RIVALS = {"torque": ("motor_acceleration", "current"), "innovation": ("current",)}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What became of one effect of the catalogue.
+
+    Attributes:
+        channel: that shows it, or None where these logs have none.
+        amplitudes, shape: the coordinates tested, and the shape in which they were.
+        columns: their regressors.
+        gain: RMS that it takes away on left-out episodes, in the channel's unit; share_explained of the first residual's mean
+            square.
+        placebos: share of the gain that it reaches with what it rests on disturbed, by what is disturbed.
+        reason: why it is not accepted, or what it rests on.
+        values, sigmas: by parameter; before: as calibrated, for an effect that was.
+    """
+
+    effect: Effect
+    channel: str | None
+    amplitudes: tuple[Coordinate, ...] = ()
+    shape: tuple[tuple[Coordinate, float], ...] = ()
+    columns: tuple[np.ndarray, ...] = field(default=(), repr=False)
+    evidence: Evidence = field(default=NOT_EXCITED, repr=False)
+    p_value: float = 1.0
+    q_value: float = 1.0
+    gain: float = 0.0
+    share_explained: float = 0.0
+    placebos: Mapping[str, float] = field(default_factory=dict)
+    accepted: bool = False
+    in_calibration: bool = False
+    reason: str = ""
+    values: Mapping[str, float] = field(default_factory=dict)
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+    before: Mapping[str, float] = field(default_factory=dict)
+    confounded_with: str | None = None
+    manoeuvre: str | None = None
+
+
+class Screening:
+    """What is the same in all rounds: signals, coordinates of the effects that are off, and the residual at the beginning."""
+
+    def __init__(self, bench: Bench, model: Model):
+        self.bench, self.initial = bench, model.residual
+        self.signals = signals(bench)
+        channels = {effect.name: bench.channel_of(effect.channel) for effect in REGISTRY}
+        #: Coordinates by parameter, of each effect that is off.
+        self.coordinates = {
+            effect.name: effect_coordinates(bench.calibration, effect, channels[effect.name])
+            for effect in REGISTRY
+            if channels[effect.name] and not model.of_effect(effect.name)
+        }
+        braking = self.signals["brake_torque"][self.signals["brake_torque"] > 0.0]
+        self._size = dict.fromkeys(bench.channels, rmse(self.signals["clamp_force"]))
+        self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
+
+    def floor(self, model: Model, channel: str) -> float:
+        """Least RMS of an effect that matters, in the channel's unit."""
+        if channel == "temperature":
+            return _FLOOR_K
+        share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
+        return max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel])
+
+    # -- tests --------------------------------------------------------------------------------------------------------
+
+    def tested(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
+        """Each effect in the shape that does best, with its chance corrected for all that were tried."""
+        shapes = {effect.name: self._shapes(model, effect) for effect in effects}
+        probes = [
+            Probe(self.coordinates[effect.name][p.name], shape)
+            for effect in effects
+            for shape in shapes[effect.name][0]
+            for p in effect.amplitudes
+        ]
+        columns = dict(zip(probes, self.bench.regressors(model.values, probes, model.residual), strict=True))
+        found = [self._best(model, effect, *shapes[effect.name], columns) for effect in effects]
+        chances = np.array([c.p_value for c in found] + [1.0] * (len(REGISTRY) - len(found)))
+        return [replace(c, q_value=float(q)) for c, q in zip(found, false_discovery(chances), strict=False)]
+
+    def _shapes(self, model: Model, effect: Effect) -> tuple[list[tuple[tuple[Coordinate, float], ...]], int]:
+        """Shapes in which to test an effect, and how many were looked at to choose them."""
+        own = self.coordinates.get(effect.name)
+        if not own:
+            return [], 1
+        if not effect.shapes:
+            return [()], 1
+        parameter = effect.shapes[0]
+        if effect.harmonic:
+            order, tried = strongest_order(model, effect, own[parameter.name].channel, self.signals)
+            return ([((own[parameter.name], order),)] if order else []), tried
+        return [((own[parameter.name], start),) for start in parameter.starts], len(parameter.starts)
+
+    def _best(self, model: Model, effect: Effect, shapes: list, tried: int, columns: dict) -> Candidate:
+        own = self.coordinates.get(effect.name)
+        if not own:
+            return Candidate(effect, None)
+        channel = next(iter(own.values())).channel
+        parts = _parts(effect, [own[p.name] for p in effect.amplitudes])
+        best = Candidate(effect, channel, tuple(parts[-1]))
+        for shape in shapes:
+            for part in parts:
+                regressors = tuple(columns[Probe(c, shape)] for c in part)
+                evidence = model.evidence(channel, regressors)
+                earlier = best.evidence
+                if not best.columns or (evidence.p_value, -evidence.gain) < (earlier.p_value, -earlier.gain):
+                    best = Candidate(effect, channel, tuple(part), shape, regressors, evidence)
+        evidence = best.evidence
+        names = [c.parameter for c in best.amplitudes]
+        first = float(self.initial[channel] @ self.initial[channel])
+        return replace(
+            best,
+            p_value=min(1.0, evidence.p_value * tried * len(parts)),
+            gain=model.rms(evidence.gain, channel),
+            share_explained=max(evidence.gain, 0.0) / first if first > 0.0 else 0.0,
+            values=dict(zip(names, evidence.values.tolist(), strict=False)),
+            sigmas=dict(zip(names, evidence.sigmas.tolist(), strict=False)),
+        )
+
+    # -- objections ---------------------------------------------------------------------------------------------------
+
+    def judged(self, model: Model, candidate: Candidate, rivals: dict) -> Candidate:
+        """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked."""
+        effect, evidence = candidate.effect, candidate.evidence
+        if candidate.channel is None:
+            return replace(candidate, reason="these logs hold no reference on which it would show")
+        if not candidate.columns or not len(evidence.values):
+            return replace(candidate, reason=f"not excited by these logs; {effect.manoeuvre}")
+        if candidate.q_value > Q_VALUE:
+            clusters = f"{evidence.clusters:.0f} effective episodes (q = {candidate.q_value:.2g})"
+            return replace(candidate, reason=f"not significant over {clusters}")
+        return self.plausible(model, candidate, rivals)
+
+    def plausible(self, model: Model, candidate: Candidate, rivals: dict) -> Candidate:
+        """The same but for chance."""
+        channel, evidence, unit = candidate.channel, candidate.evidence, UNITS[candidate.channel]
+        floor = self.floor(model, channel)
+        if evidence.gain <= 0.0:
+            return replace(candidate, reason="no gain on left-out episodes")
+        if candidate.gain < floor:
+            too_little = f"explains {candidate.gain:.3g} {unit} RMS, too little to matter (limit {floor:.3g} {unit})"
+            return replace(candidate, reason=too_little)
+        for c, value, sigma in zip(candidate.amplitudes, evidence.values, evidence.sigmas, strict=True):
+            if not c.low - 2.0 * sigma <= value <= c.high + 2.0 * sigma:
+                return replace(candidate, reason=f"{c.parameter} = {value:.3g} {c.unit} is outside what physics allows")
+        gain, signal = self.rival(model, channel, rivals)
+        if evidence.gain < _OF_MODEL_FREE * gain:
+            shadow = (
+                f"explains {candidate.gain:.3g} {unit} RMS where a smooth function of {signal} explains "
+                f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
+            )
+            return replace(candidate, reason=shadow)
+        candidate = self.with_placebos(model, candidate)
+        for text, share in candidate.placebos.items():
+            if share > _OF_PLACEBO:
+                return replace(candidate, reason=f"its placebo ({text}) explains {100 * share:.0f} % of the same")
+        return replace(candidate, reason="")
+
+    def rival(self, model: Model, channel: str, rivals: dict) -> tuple[float, str]:
+        """Largest gain on left-out episodes of a smooth function of one signal, and that signal; kept in ``rivals``."""
+        if channel not in rivals:
+            gains = {
+                name: float((without - with_).sum())
+                for name, (without, with_) in self.dependence(model, channel).items()
+                if name not in _NO_RIVALS.get(channel, ())
+            }
+            name = max(gains, key=gains.__getitem__, default="")
+            rivals[channel] = (max(gains.get(name, 0.0), 0.0), name)
+        return rivals[channel]
+
+    def dependence(self, model: Model, channel: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Squared error of each left-out episode, without and with a smooth function of each signal."""
+        if channel not in FORCE_CHANNELS:
+            return {}
+        own = model.own(channel)
+        base, prior = [model.columns[c] for c in own], model.penalty(own, channel)
+        keep = model.residual[channel] != 0.0
+        plain = leave_out(model.moments(channel, base), prior).left_out
+        result = {}
+        for name, signal in self.signals.items():
+            basis = smooth_basis(name, signal, self.signals["clamp_force"]) * keep[:, None]
+            if not basis.shape[1]:
+                continue
+            moments = model.moments(channel, [*base, basis])
+            size = np.einsum("gii->i", moments.products)[len(own) : -1]
+            penalty = np.concatenate([prior, 1e-3 * np.maximum(size, 1e-300) + 1e-12])
+            result[name] = (plain, leave_out(moments, penalty).left_out)
+        return result
+
+    # -- placebos -----------------------------------------------------------------------------------------------------
+
+    def with_placebos(self, model: Model, candidate: Candidate) -> Candidate:
+        """With the share of its gain that it reaches with what it rests on disturbed, if it gains anything."""
+        if candidate.evidence.gain <= 0.0:
+            return candidate
+        random, result = np.random.default_rng(0), {}
+        for placebo in candidate.effect.placebos:
+            tables = self._disturbed(model, candidate, placebo, random)
+            gains = [model.evidence(candidate.channel, own).gain for own in tables]
+            if gains:
+                result[placebo.text] = max(0.0, *gains) / candidate.evidence.gain
+        return replace(candidate, placebos=result)
+
+    def _disturbed(self, model: Model, candidate: Candidate, placebo: Placebo, random) -> list[list[np.ndarray]]:
+        """Regressors of a candidate under a placebo, drawn a few times."""
+        if placebo.order:
+            [(order, found)] = candidate.shape
+            return [self._columns(model, self.bench, candidate, ((order, other),)) for other in placebo.order(found)]
+        if placebo.samples:
+            benches = [self.bench.disturbed(placebo.samples, random) for _ in range(_DRAWS)]
+            return [self._columns(model, bench, candidate, candidate.shape) for bench in benches]
+        like = [model.columns[c] for c in model.own(candidate.channel) if c.name == HOOKS[candidate.effect.hook].like]
+        if not like:
+            return []
+        signal, episode = self.signals[candidate.effect.signal], self.bench.sample_episode
+        shuffled = [placebo.signal(signal - signal[0], episode, random) for _ in range(_SHUFFLES)]
+        return [[np.sum(like, axis=0) * follows] for follows in shuffled]
+
+    def _columns(self, model: Model, bench: Bench, candidate: Candidate, shape: tuple) -> list[np.ndarray]:
+        at = model.residual if bench is self.bench else bench.residuals(model.values)
+        return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at)
+
+
+def groups(effect: Effect, coordinates: Sequence[Coordinate]) -> list[list[Coordinate]]:
+    """Amplitudes that stand or fall together."""
+    found: dict[str, list[Coordinate]] = {}
+    for coordinate in coordinates:
+        found.setdefault(effect.parameter(coordinate.parameter).group, []).append(coordinate)
+    return list(found.values())
+
+
+def _parts(effect: Effect, coordinates: Sequence[Coordinate]) -> list[list[Coordinate]]:
+    """The first group only, the first two, ..., all: few episodes cannot carry a test of many numbers."""
+    every = groups(effect, coordinates)
+    return [list(chain.from_iterable(every[: count + 1])) for count in range(len(every))] or [[]]

@@ -1,0 +1,291 @@
+"""Selection: which effects of the catalogue do these logs prove?
+
+Stepwise: the base calibration is refitted, then every candidate is screened against what that leaves (`screening`). The best
+one of each channel is added and everything is refitted through the estimator, until none is left. Then each accepted effect
+is tested once more in the presence of the others. Stepwise selection alone would be greedy where two effects only work
+together (a slow branch without slip gains nothing), so effects that lost are tried again each round.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from emb_daemon.diagnose.coordinates import Coordinate, about_middle
+from emb_daemon.diagnose.evidence import leave_out
+from emb_daemon.diagnose.model import Model, is_shape
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench
+from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
+from emb_daemon.diagnose.unexplained import Dependence, dependences
+from emb_daemon.effects import REGISTRY
+
+#: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
+_CONFOUNDED = 0.8
+#: ... and are as good as each other from here.
+_EQUAL = 0.97
+#: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
+#: before it is judged.
+_UNSURE, _LARGE = 0.05, 0.25
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What a search has chosen so far.
+
+    Attributes:
+        candidates: what became of each effect that was off, by name; the accepted ones are those in the model.
+        recalibrated: channels whose base parameters were off, with the RMS that refitting them gains on left-out episodes.
+        dropped: effects that were accepted and are not to be tried again.
+        at_first: what the residual depended on before any effect was accepted, by channel.
+    """
+
+    model: Model
+    screening: Screening
+    candidates: dict[str, Candidate] = field(default_factory=dict)
+    recalibrated: dict[str, float] = field(default_factory=dict)
+    dropped: frozenset[str] = frozenset()
+    at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> list[str]:
+        return [name for name, candidate in self.candidates.items() if candidate.accepted]
+
+    @property
+    def suspects(self) -> list[str]:
+        """What can be taken out again: accepted effects, and channels that were only recalibrated."""
+        with_effects = {self.candidates[name].channel for name in self.accepted}
+        return [*self.accepted, *(channel for channel in self.recalibrated if channel not in with_effects)]
+
+    def channel_of(self, suspect: str) -> str:
+        return suspect if suspect in self.recalibrated else self.candidates[suspect].channel
+
+    @property
+    def touched(self) -> set[str]:
+        """Channels whose fit is applied."""
+        return {self.channel_of(suspect) for suspect in self.suspects}
+
+    def applied(self, without: str = "") -> dict[Coordinate, float]:
+        """What differs from the calibration; ``without`` one suspect, the others where they are."""
+        return {
+            c: value
+            for c, value in self.model.values.items()
+            if c.channel in self.touched and without not in (c.effect or c.channel, c.channel)
+        }
+
+    def noted(self, candidates: Iterable[Candidate]) -> "Selection":
+        """With what became of some effects; regressors are not kept."""
+        return replace(self, candidates=self.candidates | {c.effect.name: replace(c, columns=()) for c in candidates})
+
+    def without(self, suspect: str, reason: str) -> "Selection":
+        """An accepted effect, or the recalibration of a channel, taken out; what remains of its channel refitted."""
+        if suspect in self.recalibrated:
+            return replace(self, recalibrated={c: gain for c, gain in self.recalibrated.items() if c != suspect})
+        candidate, own = self.candidates[suspect], self.model.of_effect(suspect)
+        if candidate.in_calibration:
+            as_before = about_middle({c: c.start for c in own}, self.model.bench.middle)
+            model = self.model.entered(as_before, chosen=own).refined({candidate.channel})
+        else:
+            model = self.model.without(own).refined({candidate.channel})
+        refused = replace(candidate, accepted=False, reason=reason)
+        return replace(self.noted([refused]), model=model, dropped=self.dropped | {suspect})
+
+    def _entered(self, winners: list[Candidate]) -> "Selection":
+        """Effects accepted, one for each channel, and refitted; one that leaves its channel worse than before goes out."""
+        before = self.model
+        values, chosen, centre = {}, [], {}
+        for winner in winners:
+            shape, harmonic = dict(winner.shape), winner.effect.harmonic
+            own = self.screening.coordinates[winner.effect.name]
+            # An effect enters with all its amplitudes; those that prove nothing go at the end.
+            values |= {own[p.name]: 0.0 for p in winner.effect.amplitudes} | shape
+            fitted = zip(winner.amplitudes, winner.evidence.values, strict=True)
+            values |= {c: float(np.clip(value, c.low, c.high)) for c, value in fitted}
+            centre |= shape
+            chosen += shape if harmonic and harmonic.whole else []
+        channels = {winner.channel for winner in winners}
+        model = before.entered(values, chosen, centre).refined(channels)
+        if "stiffness" in channels:
+            # The force that heats the pads has changed, and with their temperatures what softening and growth mean.
+            model = model.refined({*HEAT_CHANNELS, *channels})
+        result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
+        for winner in winners:
+            if result.model.noise(winner.channel) >= before.noise(winner.channel):
+                reason = "no fit of it with the calibration's own parameters is better than without it"
+                result = result.without(winner.effect.name, reason)
+        return result
+
+
+def select(bench: Bench, progress: Progress) -> Selection:
+    """Recalibrate, accept effects until none is proven any more, and revise. ``progress``: what is being done, share done."""
+    progress("recalibrating", 0.1)
+    start = Model.of(bench)
+    model = start.refined(bench.channels)
+    screening = Screening(bench, start)
+    at_first = {
+        channel: dependences(channel, screening.dependence(model, channel), model.counted(channel), 0.0)
+        for channel in bench.channels
+        if channel in FORCE_CHANNELS
+    }
+    selection = Selection(model, screening, at_first=at_first)
+    selection = replace(selection, recalibrated=_recalibrated(selection, start))
+    for number in range(len(REGISTRY)):
+        progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
+        before = selection.accepted
+        selection = _round(selection)
+        if selection.accepted == before:
+            break
+    progress("refitting what is applied", 0.75)
+    return _changes(_revised(_settled_heat(selection)))
+
+
+def _settled_heat(selection: Selection) -> Selection:
+    """Heat that is not applied goes back to the calibration, and what is applied is fitted to that.
+
+    While searching, a friction or a heat capacity that is a little off must not pass for an effect; but growth and softening
+    that were fitted to other temperatures than the estimator will have would be wrong."""
+    model = selection.model
+    idle = [c for c in model.values if c.channel in HEAT_CHANNELS and c.channel not in selection.touched]
+    start = about_middle({c: c.start for c in idle}, model.bench.middle)
+    return replace(selection, model=model.entered(start, chosen=idle).refined(selection.touched))
+
+
+def _recalibrated(selection: Selection, start: Model) -> dict[str, float]:
+    """Channels in which refitting the base parameters gains on left-out episodes what matters."""
+    model, result = selection.model, {}
+    for channel in model.bench.channels:
+        own = model.own(channel)
+        # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
+        if not own or channel == "innovation":
+            continue
+        moments = model.moments(channel, [model.columns[c] for c in own], start.residual[channel])
+        left_out = leave_out(moments, model.penalty(own, channel)).left_out
+        gain = model.rms(float((moments.products[:, -1, -1] - left_out).sum()), channel)
+        if gain > 0.0 and gain >= selection.screening.floor(model, channel):
+            result[channel] = gain
+    return result
+
+
+def _round(selection: Selection) -> Selection:
+    """One round: screen what is left, and accept the best of each channel, if any."""
+    model, screening = selection.model, selection.screening
+    gone = {*selection.accepted, *selection.dropped}
+    left = [e for e in REGISTRY if e.name not in gone and not model.of_effect(e.name)]
+    rivals: dict = {}
+    tested = [screening.judged(model, c, rivals) for c in screening.tested(model, left)]
+    winners, losers = [], []
+    for channel in model.bench.channels:
+        passed = [c for c in tested if c.channel == channel and not c.reason]
+        if passed:
+            winner, beaten = _settled(model, passed)
+            winners.append(winner)
+            losers += beaten
+    if not winners:
+        # The report states every placebo as a number, also of what fell for another reason.
+        tested = [screening.with_placebos(model, c) for c in tested]
+    confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
+    selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
+    return selection._entered(winners) if winners else _tried(selection, tested, rivals)
+
+
+def _settled(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
+    """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not.
+
+    Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
+    that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so."""
+
+    def says(own: Candidate, beside: Candidate) -> bool:
+        evidence = model.evidence(own.channel, own.columns, beside.columns)
+        return evidence.p_value < Q_VALUE and evidence.gain > 0.0
+
+    best = max(passed, key=lambda c: c.evidence.gain)
+    rivals, beaten = [], []
+    for other in passed:
+        if other is best or other.evidence.gain < _CONFOUNDED * best.evidence.gain or says(other, best):
+            continue
+        if says(best, other):
+            beaten.append(replace(other, reason=f"explained by {best.effect.name}, beside which it says nothing"))
+        else:
+            rivals.append(other)
+    equal = [best, *(rival for rival in rivals if rival.evidence.gain >= _EQUAL * best.evidence.gain)]
+    winner = min(equal, key=lambda c: REGISTRY.index(c.effect))
+    for loser in (c for c in (best, *rivals) if c is not winner):
+        reason = (
+            f"confounded with {winner.effect.name} on these logs, which is simpler or explains more; to separate them: "
+            f"{loser.effect.manoeuvre}"
+        )
+        beaten.append(replace(loser, reason=reason, confounded_with=winner.effect.name, manoeuvre=loser.effect.manoeuvre))
+    if len(rivals):
+        other = next(c for c in (best, *rivals) if c is not winner)
+        return replace(winner, confounded_with=other.effect.name, manoeuvre=other.effect.manoeuvre), beaten
+    return winner, beaten
+
+
+def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selection:
+    """With a candidate that would explain much, is not sure in the linear test, but is once it has been fitted.
+
+    Far from the solution the rest of a strong effect, whose shape was only guessed, is what makes it unsure. The fitted
+    effect must then pass for itself and all others that might have been tried (Bonferroni)."""
+    model = selection.model
+    large = [
+        c
+        for c in tested
+        if c.channel in FORCE_CHANNELS
+        and c.p_value < _UNSURE
+        and c.q_value > Q_VALUE
+        and c.gain**2 > _LARGE * model.noise(c.channel)
+    ]
+    plausible = [(c, selection.screening.plausible(model, c, rivals)) for c in large]
+    plausible = [pair for pair in plausible if not pair[1].reason]
+    if not plausible:
+        return selection
+    candidate, winner = max(plausible, key=lambda pair: pair[0].gain ** 2 / model.noise(pair[0].channel))
+    name, shapes = candidate.effect.name, candidate.p_value / max(candidate.evidence.p_value, 1e-300)
+    entered = selection._entered([winner])
+    if name not in entered.accepted:
+        return entered
+    amplitudes = [c for c in entered.model.of_effect(name) if not is_shape(c)]
+    evidence = entered.model.evidence_against(dict.fromkeys(amplitudes, 0.0))
+    chance = min(1.0, evidence.p_value * shapes * len(REGISTRY))
+    if chance > Q_VALUE or evidence.gain <= 0.0:
+        return entered.without(name, candidate.reason)
+    gain = entered.model.rms(evidence.gain, candidate.channel)
+    sure = replace(entered.candidates[name], p_value=evidence.p_value * shapes, q_value=chance, gain=gain)
+    return entered.noted([sure])
+
+
+def _revised(selection: Selection) -> Selection:
+    """Each accepted effect tested once more with all others in place; what, or which order, no longer holds goes."""
+    for name in selection.accepted:
+        model, candidate = selection.model, selection.candidates[name]
+        amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
+        gone = []
+        for group in groups(candidate.effect, amplitudes):
+            evidence = model.evidence_against(dict.fromkeys(group, 0.0))
+            if evidence.p_value > Q_VALUE or evidence.gain <= 0.0:
+                gone += group
+        if len(gone) == len(amplitudes):
+            selection = selection.without(name, "no longer holds beside the other effects")
+        elif gone:
+            selection = replace(selection, model=model.without(gone).refined({candidate.channel}))
+    return selection
+
+
+def _changes(selection: Selection) -> Selection:
+    """With what became of the effects that the calibration has already: one that is not as calibrated counts as found."""
+    model, found = selection.model, []
+    for effect in REGISTRY:
+        own = model.of_effect(effect.name)
+        if not own or effect.name in selection.candidates:
+            continue
+        channel = own[0].channel
+        start = about_middle({c: c.start for c in own}, model.bench.middle)
+        fitted = [c for c in own if c not in model.chosen]
+        evidence = model.evidence_against({c: start[c] for c in fitted})
+        gain = model.rms(evidence.gain, channel)
+        changed = evidence.p_value < Q_VALUE and gain >= selection.screening.floor(model, channel)
+        known = Candidate(effect, channel, tuple(fitted), evidence=evidence, in_calibration=True, accepted=changed)
+        reason = "" if changed else "already in the calibration, and as it says"
+        found.append(replace(known, p_value=evidence.p_value, q_value=evidence.p_value, gain=gain, reason=reason))
+    return selection.noted(found)

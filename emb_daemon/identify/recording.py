@@ -1,0 +1,219 @@
+"""What heats and cools the pads of a log, on an even grid, and the estimator's heat chain run over it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.heat import TOUCHING_N, TURNING_RAD_PER_S
+from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.jit import njit
+from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, friction_power, heat_step, mean_temperature
+from emb_daemon.offline import Log
+
+#: Grid on which flags and torque are put together before they are averaged over a step.
+_FINE_S = 0.1
+#: A reference force at least this often tells when the pads touch; a rarer one leaves it to the brake request.
+_OFTEN_S = 0.25
+#: Time over which backing plate readings are averaged: they creep, their noise does not.
+_PLATE_WINDOW_S = 1.0
+#: Grids beyond this, of logs that last for hours, are stepped whole.
+_COARSE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What heats and cools the pads, on an even grid, and what was measured in them.
+
+    Arrays have shape (n,) unless stated; temperatures in degC. Means hold for the step that starts at their row.
+
+    Attributes:
+        step_s: grid.
+        inner, outer: backing plates.
+        power: mean friction power, W, from the brake torque sensor.
+        touching: pads press on the disc.
+        speed: mean wheel speed, rad/s.
+        force: mean reference clamp force, N.
+        measured: shape (9, n): inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; NaN where there is none.
+        dense: force and torque were recorded often enough for a friction coefficient at each row.
+    """
+
+    name: str
+    step_s: float
+    inner: np.ndarray
+    outer: np.ndarray
+    ambient: np.ndarray
+    power: np.ndarray
+    touching: np.ndarray
+    speed: np.ndarray
+    force: np.ndarray
+    measured: np.ndarray
+    dense: bool
+
+    @property
+    def time_s(self) -> np.ndarray:
+        return self.step_s * np.arange(len(self.power))
+
+
+def _mean_between(start: np.ndarray, end: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Mean of straight lines between (times, values), held at the ends, over each [start, end]."""
+    times, values = (
+        np.concatenate([[min(start[0], times[0]) - 1.0], times, [max(end[-1], times[-1]) + 1.0]]),
+        np.concatenate([values[:1], values, values[-1:]]),
+    )
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times))])
+
+    def integral(t):
+        index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        elapsed = t - times[index]
+        slope = (values[index + 1] - values[index]) / np.maximum(times[index + 1] - times[index], 1e-12)
+        return area[index] + elapsed * (values[index] + 0.5 * slope * elapsed)
+
+    return (integral(end) - integral(start)) / (end - start)
+
+
+def default_step(duration_s: float) -> float:
+    """Grid fine enough for what a log of that length does: 0.2 s up to fifteen minutes, 1 s over hours."""
+    return 0.2 if duration_s < 930.0 else 0.5 if duration_s < 3600.0 else 1.0
+
+
+def recording(log: Log, step_s: float | None = None) -> Recording:
+    """Inputs and thermocouples of a log on an even grid.
+
+    Motor frames of thermal logs are rare, so that vehicle and thermocouple frames are taken at their own rate: a brake
+    application that ends a second late would heat the disc by degrees.
+
+    Raises:
+        InputError: no backing plate, wheel speed, force, torque or pad temperature in the log.
+    """
+    _check(log)
+    reference, slow = log.reference, log.slow
+
+    def seconds(time_ns):
+        return 1e-9 * (time_ns - log.time_ns[0])
+
+    duration = min(log.time_s[-1], seconds(reference.pads["inner"][0][-1]))
+    step = default_step(duration) if step_s is None else step_s
+    count = int(duration / step)
+    if count < 10:
+        raise InputError(f"{log.path}: {duration:.0f} s long; at least {10 * step:.0f} s are needed to identify heat")
+    grid, window = step * np.arange(count), max(_PLATE_WINDOW_S, step)
+
+    def plate(values):
+        return _mean_between(grid - 0.5 * window, grid + 0.5 * window, seconds(slow.thermocouples["time_ns"]), values)
+
+    measured = np.full((9, count), np.nan)
+    channels = [(stamps, row) for stamps, depths in (reference.pads["inner"], reference.pads["outer"]) for row in depths]
+    for row, (stamps, values) in enumerate([*channels, (reference.time_ns, reference.disc_C)]):
+        known = np.isfinite(values)
+        if known.sum() > 1:
+            measured[row] = np.interp(grid, seconds(stamps)[known], values[known])
+    power, touching, speed, force, often = _braking(log, seconds, count, step)
+    return Recording(
+        name=str(log.path),
+        step_s=step,
+        inner=plate(slow.thermocouples["InnerBackplateTemp"]),
+        outer=plate(slow.thermocouples["OuterBackplateTemp"]),
+        ambient=np.interp(grid, seconds(slow.status["time_ns"]), slow.status["AmbientTemp"]),
+        power=power,
+        touching=touching > 0.5,
+        speed=speed,
+        force=force,
+        measured=measured,
+        dense=bool(np.mean(often) > 0.9),
+    )
+
+
+def _check(log: Log) -> None:
+    for what, times in (
+        ("backing plate temperatures", log.slow.thermocouples["time_ns"]),
+        ("wheel speeds", log.slow.wheel_speed["time_ns"]),
+        ("vehicle status", log.slow.status["time_ns"]),
+        ("reference clamp force", log.reference.clamp_force_N[np.isfinite(log.reference.clamp_force_N)]),
+        ("reference brake torque", log.reference.brake_torque_Nm[np.isfinite(log.reference.brake_torque_Nm)]),
+        ("pad thermocouples", log.reference.pads["inner"][0]),
+        ("pad thermocouples", log.reference.pads["outer"][0]),
+    ):
+        if len(times) < 2:
+            raise InputError(f"{log.path}: no {what}; needed to identify heat")
+
+
+def _braking(log: Log, seconds, count: int, step: float) -> np.ndarray:
+    """Friction power (W), whether pads touch (0 to 1), wheel speed (rad/s), clamp force (N) and whether force was recorded
+    often, each a mean over the steps; shape (5, count)."""
+    per_step = max(round(step / _FINE_S), 1)
+    fine = np.arange(count * per_step) * (step / per_step)
+    middle = fine + 0.5 * step / per_step
+    reference, slow = log.reference, log.slow
+    times, wheel_times = seconds(reference.time_ns), seconds(slow.wheel_speed["time_ns"])
+    speeds = slow.wheel_speed[f"WheelSpeed{log.corner}"]
+    force = np.interp(middle, times, reference.clamp_force_N)
+    often = np.interp(middle, 0.5 * (times[1:] + times[:-1]), np.diff(times)) <= _OFTEN_S
+    speed = _mean_between(fine, fine + step / per_step, wheel_times, speeds)
+    turning = speed > TURNING_RAD_PER_S
+    latest = np.clip(np.searchsorted(seconds(slow.status["time_ns"]), middle) - 1, 0, None)
+    requested = slow.status["BrakeRequest"][latest] > 0.5
+    # The request also covers clamping at standstill, for which only the force tells.
+    touching = np.where(often | ~turning, force > TOUCHING_N, requested)
+    torque = np.interp(middle, times, reference.brake_torque_Nm)
+    pressed = (reference.clamp_force_N > TOUCHING_N) & (np.interp(times, wheel_times, speeds) > TURNING_RAD_PER_S)
+    if pressed.any():
+        torque = np.where(often, torque, np.interp(middle, times[pressed], reference.brake_torque_Nm[pressed]))
+    power = np.where(touching & turning, np.maximum(torque, 0.0) * speed, 0.0)
+    columns = np.array([power, touching, speed, np.maximum(force, 0.0), often], float)
+    return columns.reshape(5, count, per_step).mean(axis=2)
+
+
+@njit
+def _simulate(parameters, step, longest, every, inner, outer, ambient, power, known, touching, speed, force, out):
+    p = parameters[0]
+    positions = p.node_position
+    pads, work = np.empty((2, NODES)), np.empty((4, CHAIN))
+    pads[0, :], pads[1, :] = inner[0], outer[0]
+    disc = 0.5 * (inner[0] + outer[0])
+    for row in range(len(power)):
+        if row > 0:
+            watts = 0.0
+            if known:
+                watts = power[row - 1]
+            elif touching[row - 1] and speed[row - 1] > TURNING_RAD_PER_S:
+                watts = friction_power(p, force[row - 1], speed[row - 1], 0.5 * (pads[0, 0] + pads[1, 0]))
+            disc = heat_step(
+                p,
+                pads,
+                disc,
+                inner[row],
+                outer[row],
+                ambient[row],
+                watts,
+                touching[row - 1],
+                speed[row - 1],
+                step,
+                work,
+                longest,
+            )
+        if row % every == 0:
+            into = out[row // every]
+            for side in range(2):
+                for index in range(len(DEPTHS_M)):
+                    into[4 * side + index] = at_depth(pads[side], positions, DEPTHS_M[index])
+                into[9 + side] = pads[side, 0]
+                into[11 + side] = mean_temperature(pads[side], positions)
+            into[8] = disc
+
+
+def simulate(parameters: np.ndarray, r: Recording, torque_known: bool = True, every: int = 1) -> np.ndarray:
+    """Temperatures by the estimator's heat chain over a recording, every ``every``-th row.
+
+    Args:
+        parameters: THERMAL, shape (1,).
+        torque_known: heat by the brake torque sensor, else by the friction table and the reference force.
+
+    Returns:
+        Shape (rows, 13), degC: the nine of `Recording.measured`, both pad surfaces, both pad means.
+    """
+    out = np.empty((-(-len(r.power) // every), 13))
+    longest = LONGEST_S if r.step_s <= _COARSE_S else r.step_s
+    inputs = (r.inner, r.outer, r.ambient, r.power, torque_known, r.touching, r.speed, r.force)
+    _simulate(parameters, r.step_s, longest, every, *inputs, out)
+    return out

@@ -1,0 +1,54 @@
+"""Contact angle: where it is found at power-on, and how far it wanders."""
+
+import numpy as np
+
+from emb_daemon.calibration.types import Contact
+from emb_daemon.identify.dynamics import simulate
+from emb_daemon.identify.steps import Step
+from emb_daemon.identify.steps.stiffness import StiffnessStep
+from emb_daemon.wire.contract import CYCLE_S
+
+#: Samples over which one contact angle is estimated: ten seconds, in which it hardly wanders.
+_ROWS = 2500
+#: Step of the derivative by the clearance, rad.
+_STEP = 1e-3
+
+
+def identify(stiffness: StiffnessStep, count_rad: float) -> Step:
+    """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it.
+
+    Args:
+        count_rad: the resolver's smallest step.
+    """
+    curves = stiffness.fit.curves
+    found = np.concatenate([curve.clearances_rad for curve in curves])
+    errors = np.concatenate([curve.clearance_sigmas_rad for curve in curves])
+    spread = float(np.std(found, ddof=1)) if len(found) > 1 else 0.0
+    contact = Contact(
+        clearance_rad=float(np.mean(found)),
+        clearance_sigma_rad=float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
+        walk_rad_per_sqrt_s=_walk(stiffness),
+    )
+    return Step(values={"contact": contact})
+
+
+def _walk(stiffness: StiffnessStep) -> float:
+    """Root of the contact angle's wandering per second, rad: between tens of seconds of the fitted logs.
+
+    The scatter of each estimate is in it, so that it errs to the safe side.
+    """
+    squares, seconds = 0.0, 0.0
+    values = stiffness.fit.values
+    for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
+        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
+            at, moved = (simulate(log, values, curve.coefficients, clearance + s) for s in (0.0, _STEP))
+            slope, error = (moved - at) / _STEP, at - log.force_N
+            shifts = []
+            for start in range(0, len(error) - _ROWS + 1, _ROWS):
+                part = slice(start, start + _ROWS)
+                weight = float(slope[part] @ slope[part])
+                if weight > 0.0 and np.isfinite(error[part]).all():
+                    shifts.append(-float(slope[part] @ error[part]) / weight)
+            squares += float(np.sum(np.diff(shifts) ** 2))
+            seconds += _ROWS * CYCLE_S * max(len(shifts) - 1, 0)
+    return float(np.sqrt(squares / seconds)) if seconds else 0.0

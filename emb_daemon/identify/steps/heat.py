@@ -1,0 +1,178 @@
+"""Pads and disc out of logs with thermocouples: the estimator's own heat chain, its parameters by least squares.
+
+Thesis 8.1 tunes conductivity and heat shares by hand on one log, 8.2 takes the disc's cooling from others; here one fit
+takes both from all logs, because the pads lend heat to the disc and take it back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec.structs import replace
+
+from emb_daemon.calibration.types import Disc, Pad, Softening, Thermal, fill_thermal
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import DEPTHS_M, THERMAL
+from emb_daemon.identify.campaign import Datasheet
+from emb_daemon.identify.recording import Recording, simulate
+from emb_daemon.identify.steps.friction import constant_friction
+from emb_daemon.offline.fit import Block, Free, fit
+
+#: Time between residuals. The model's errors, of the size of a thermocouple's noise (0.3 K), last for about a minute: each
+#: residual is worth a twelfth of an independent one, which this standard deviation makes it.
+_RESIDUAL_EVERY_S = 5.0
+_RESIDUAL_SIGMA_K = 1.0
+#: Pads that rise by less tell nothing.
+_LEAST_RISE_K = 30.0
+#: Fewer logs than this are cut into so many episodes each.
+_FEW_LOGS, _PIECES = 4, 6
+#: Positive values are sought within this factor of where they start; pads take no more than this share of the heat each.
+_REACH = float(np.exp(4.0))
+_MOST_HEAT_SHARE = 0.49
+#: A value of which its prior tells more than this share was hardly told by the logs.
+_UNEXCITED = 0.25
+#: Standard deviation of pad temperatures that no thermocouple has confirmed, K.
+_UNCONFIRMED_K = 50.0
+
+
+@dataclass(frozen=True)
+class _Unknown:
+    """``spread``: prior standard deviation; relative, or where ``scale`` is given of value / scale."""
+
+    spread: float
+    scale: float | None = None
+    low: float = 0.0
+    high: float = np.inf
+
+
+#: What is fitted, by key below ``thermal``. Datasheet values are told to 15 %, taken for two standard deviations; the rest is
+#: hardly known before.
+UNKNOWNS = {
+    "pad.conductivity_W_per_mK": _Unknown(0.075),
+    "pad.conductivity_rise_per_K": _Unknown(1.0, scale=1e-3, low=-1e-3, high=4e-3),
+    "pad.specific_heat_J_per_kgK": _Unknown(0.075),
+    "pad.inner_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
+    "pad.outer_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
+    "pad.contact_conductance_W_per_m2K": _Unknown(1.0),
+    "pad.gap_conductance_W_per_m2K": _Unknown(1.0),
+    "pad.surface_cooling_per_speed_J_per_rad_m2K": _Unknown(3.0, scale=0.1),
+    "pad.backplate_conductance_W_per_m2K": _Unknown(1.0),
+    "disc.heat_capacity_J_per_K": _Unknown(0.075),
+    "disc.cooling_W_per_K": _Unknown(1.0),
+    "disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
+    "disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
+}
+
+
+@dataclass(frozen=True)
+class HeatFit:
+    """Pads and disc.
+
+    Attributes:
+        thermal: with friction and softening as they were before.
+        parameters: THERMAL of it, shape (1,).
+        sigmas: by key below ``thermal``.
+        unexcited: keys of values that the logs hardly moved from where they started.
+    """
+
+    thermal: Thermal
+    parameters: np.ndarray
+    sigmas: dict[str, float]
+    unexcited: tuple[str, ...]
+
+
+def nominal_thermal(sheet: Datasheet) -> Thermal:
+    """The datasheet's values, and for what no datasheet states the usual size: where fits start, and what stays without logs.
+
+    Conductances of pads on a disc: Limpert, Brake Design and Safety, 3rd ed., ch. 3; a released pad sits some 0.1 mm of
+    air away (k / gap = 260 W/(m^2 K)). Free convection of a disc is 5 to 15 W/(m^2 K). Organic pads take some five per cent
+    of the heat each.
+    """
+    pad, disc = sheet.pad, sheet.disc
+    return Thermal(
+        pad=Pad(
+            area_m2=pad.frontal_area_m2,
+            density_kg_per_m3=pad.density_kg_per_m3,
+            conductivity_W_per_mK=pad.conductivity_W_per_mK,
+            conductivity_rise_per_K=5e-4,
+            specific_heat_J_per_kgK=pad.specific_heat_J_per_kgK,
+            inner_heat_share=0.05,
+            outer_heat_share=0.05,
+            contact_conductance_W_per_m2K=1500.0,
+            gap_conductance_W_per_m2K=300.0,
+            surface_cooling_per_speed_J_per_rad_m2K=0.1,
+            backplate_conductance_W_per_m2K=5000.0,
+        ),
+        disc=Disc(
+            heat_capacity_J_per_K=disc.mass_kg * disc.specific_heat_J_per_kgK,
+            effective_radius_m=disc.effective_radius_m,
+            cooling_W_per_K=10.0 * disc.cooling_area_m2,
+            cooling_per_speed_J_per_rad_K=1.5 * disc.cooling_area_m2,
+            radiating_area_m2=0.5 * disc.cooling_area_m2,
+        ),
+        friction=constant_friction(sheet.friction_coefficient),
+        softening=Softening(),
+        sigma_K=_UNCONFIRMED_K,
+    )
+
+
+def thermal_parameters(thermal: Thermal, pad_thickness_mm: float) -> np.ndarray:
+    """THERMAL, shape (1,)."""
+    parameters = np.zeros(1, THERMAL)
+    fill_thermal(parameters[0], thermal, 1e-3 * pad_thickness_mm)
+    return parameters
+
+
+def with_values(thermal: Thermal, values: dict[str, float]) -> Thermal:
+    """Values by key below ``thermal``, such as ``pad.inner_heat_share``, set."""
+    sections: dict[str, dict[str, float]] = {}
+    for key, value in values.items():
+        section, _, name = key.partition(".")
+        sections.setdefault(section, {})[name] = value
+    return replace(thermal, **{name: replace(getattr(thermal, name), **entries) for name, entries in sections.items()})
+
+
+def value_of(thermal: Thermal, key: str) -> float:
+    section, _, name = key.partition(".")
+    return getattr(getattr(thermal, section), name)
+
+
+def check_excitation(r: Recording) -> None:
+    """Raises InputError unless friction heats the pads enough to tell how heat flows in them."""
+    rise = np.nanmax(r.measured[:8]) - np.nanmin(r.measured[:8, 0]) if np.isfinite(r.measured[:8]).any() else 0.0
+    if rise < _LEAST_RISE_K or r.power.max(initial=0.0) <= 0.0:
+        raise InputError(f"{r.name}: pads rise by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
+
+
+def fit_heat(recordings: list[Recording], start: Thermal, pad_thickness_mm: float) -> HeatFit:
+    """Pads and disc from recordings that heat and cool them.
+
+    Residuals are strongly correlated and the equations are not quite the rig's, so that a whole log is one episode, or, of
+    fewer than four logs, one sixth of each.
+    """
+    pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
+    blocks = [_block(r, start, pad_thickness_mm, pieces) for r in recordings]
+    found = fit(blocks, {key: _free(unknown, value_of(start, key)) for key, unknown in UNKNOWNS.items()}, tolerance=1e-4)
+    thermal = with_values(start, {key: float(f"{value:.6g}") for key, value in found.values.items()})
+    unexcited = tuple(key for key, share in found.from_prior.items() if share > _UNEXCITED)
+    return HeatFit(thermal, thermal_parameters(thermal, pad_thickness_mm), dict(found.sigmas), unexcited)
+
+
+def _free(unknown: _Unknown, start: float) -> Free:
+    if unknown.scale is None:
+        high = min(start * _REACH, unknown.high)
+        return Free(start, 1e-3, start / _REACH, high, (start, unknown.spread), logarithmic=True)
+    return Free(start, 1e-3 * unknown.scale, unknown.low, unknown.high, (start, unknown.spread * unknown.scale))
+
+
+def _block(r: Recording, start: Thermal, pad_thickness_mm: float, pieces: int) -> Block:
+    every = max(round(_RESIDUAL_EVERY_S / r.step_s), 1)
+    measured = r.measured[:, ::every].T
+    known = np.isfinite(measured)
+    known[:, :8] &= np.tile(np.array(DEPTHS_M) <= 1e-3 * pad_thickness_mm, 2)
+
+    def residual(values):
+        parameters = thermal_parameters(with_values(start, values), pad_thickness_mm)
+        return (simulate(parameters, r, every=every)[:, :9] - measured)[known] / _RESIDUAL_SIGMA_K
+
+    count = int(known.sum())
+    return Block(residual, tuple(UNKNOWNS), np.arange(count) * pieces // max(count, 1))

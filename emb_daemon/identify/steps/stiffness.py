@@ -1,0 +1,220 @@
+"""Characteristic curves and dynamics of all pads at once, and which effects the random logs ask for."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.calibration.types import Stiffness
+from emb_daemon.identify.dynamics import DYNAMICS, DynamicsFit, Pads, fit_dynamics, is_slow, simulate
+from emb_daemon.identify.steps import Step
+from emb_daemon.identify.text import with_sigma
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import Page, Panel, Section, Trace, shades, xy_figure
+from emb_daemon.report.figures import Style
+
+#: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
+_WORTH = 1.02
+#: Standard deviations by which an effect's amplitude must stand clear of zero.
+_CLEAR = 3.0
+#: Many measured points behind a line.
+_CLOUD = Style("#aab4c0", mode="markers", size=3.0)
+_STRUCTURES = {
+    (): "one lag alone",
+    ("second_relaxation",): "+ second relaxation",
+    ("stiffness_hysteresis",): "+ hysteresis",
+    ("second_relaxation", "stiffness_hysteresis"): "+ second relaxation + hysteresis",
+}
+_UNITS = {
+    "relaxation_time_s": ("relaxation time τ", 1e3, "ms"),
+    "second_relaxation.share": ("second relaxation, share w", 1e2, "%"),
+    "second_relaxation.time_constant_s": ("second relaxation, time constant τ₂", 1e3, "ms"),
+    "stiffness_hysteresis.share": ("hysteresis, share h", 1e2, "%"),
+    "stiffness_hysteresis.slip_angle_rad": ("hysteresis, slip angle", 1.0, "rad"),
+    "signal_delay.delay_s": ("reference later than resolver (not in the calibration)", 1e3, "ms"),
+}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One combination of effects in the choice of structure, fitted on the first halves of the random logs.
+
+    Attributes:
+        held_out: (error of the stiffness path, reference force) in N on what did not fit, one pair per log; slow logs, which
+            fit whole, count where no random log is.
+        clear: every amplitude stands clear of zero.
+    """
+
+    effects: tuple[str, ...]
+    fit: DynamicsFit
+    held_out: list[tuple[np.ndarray, np.ndarray]]
+    clear: bool
+
+    @property
+    def held_out_rmse(self) -> float:
+        return rmse(np.concatenate([error for error, _ in self.held_out]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StiffnessStep(Step):
+    """Attributes:
+    pads: the logs.
+    fit: over all pads at once.
+    candidates: structures that were compared.
+    chosen: the one that was taken.
+    separate: fits of each pair of pads alone, where it has random logs.
+    """
+
+    pads: list[Pads]
+    fit: DynamicsFit
+    candidates: list[Candidate]
+    chosen: Candidate
+    separate: list[DynamicsFit]
+
+
+def identify(pads: list[Pads], rated_force_N: float) -> StiffnessStep:
+    """Curves, dynamics and effects. ``pads`` in ascending order of thickness."""
+    candidates = [_candidate(pads, effects) for effects in _STRUCTURES]
+    chosen = _choose(candidates)
+    fit = fit_dynamics(pads, chosen.effects, start=chosen.fit.values, curves=chosen.fit.curves)
+    separate = [
+        fit_dynamics([own], chosen.effects, start=fit.values, curves=[curve])
+        for own, curve in zip(pads, fit.curves, strict=True)
+        if own.random
+    ]
+    reached = max(float(np.nanmax(log.force_N)) for own in pads for log in own.logs)
+    sigmas = {f"effects.{name}" if "." in name else f"stiffness.{name}": sigma for name, sigma in fit.sigmas.items()}
+    sigmas.pop("effects.signal_delay.delay_s", None)
+    for number, curve in enumerate(fit.curves):
+        for n, value in enumerate(np.sqrt(np.diag(curve.covariance))):
+            sigmas[f"stiffness.curves[{number}].coefficients[{n}]"] = float(value)
+    return StiffnessStep(
+        values=sections(fit, max(reached, rated_force_N)),
+        sigmas=sigmas,
+        pads=pads,
+        fit=fit,
+        candidates=candidates,
+        chosen=chosen,
+        separate=separate,
+    )
+
+
+def sections(fit: DynamicsFit, maximum_force_N: float) -> dict:
+    """Sections of the calibration that a fit fills."""
+    stiffness = Stiffness(
+        curves=tuple(curve.curve() for curve in fit.curves),
+        relaxation_time_s=float(fit.values["relaxation_time_s"]),
+        maximum_force_N=maximum_force_N,
+    )
+    return {"stiffness": stiffness, "effects": fit.effects()}
+
+
+def _candidate(groups: list[Pads], effects: tuple[str, ...]) -> Candidate:
+    fit = fit_dynamics(groups, effects, fraction=0.5)
+    any_random = any(pads.random for pads in groups)
+    held_out = []
+    for pads, curve in zip(groups, fit.curves, strict=True):
+        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
+            if is_slow(log) and any_random:
+                continue
+            rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
+            force = log.force_N[rows]
+            held_out.append((simulate(log, fit.values, curve.coefficients, clearance)[rows] - force, force))
+    shares = [f"{effect}.share" for effect in effects]
+    return Candidate(effects, fit, held_out, all(fit.values[s] > _CLEAR * fit.sigmas[s] for s in shares))
+
+
+def _choose(candidates: list[Candidate]) -> Candidate:
+    """Effects are compared in all combinations: one alone can gain nothing that pays with the other beside it."""
+    usable = [candidate for candidate in candidates if candidate.clear]
+    best = min(candidate.held_out_rmse for candidate in usable)
+    return min(
+        (candidate for candidate in usable if candidate.held_out_rmse <= _WORTH * best),
+        key=lambda candidate: (len(candidate.effects), candidate.held_out_rmse),
+    )
+
+
+def section(page: Page, step: StiffnessStep) -> None:
+    """Curves and dynamics in the report."""
+    curves = page.section(
+        "Characteristic curves",
+        "Clamp force over motor angle past contact (thesis 2.1, 2.2). Points: slow clamp and release; line: the static curve "
+        "of the joint fit, without the lag and the loop that the dynamics explain. Residual: of the full model.",
+    )
+    curves.figure(_curve_figure(step), "The joint fit leaves the reference's noise.")
+    _curve_table(curves, step)
+    dynamics = page.section(
+        "Dynamic stiffness",
+        "Output-error fit of the estimator's own stiffness path over all pads at once. Effects are tried in every combination "
+        "on the first halves of the random logs and kept if the second halves gain by more than 2 % and the amplitude stands "
+        "clear of zero by three sigma.",
+    )
+    _dynamics_tables(dynamics, step)
+
+
+def _curve_figure(step: StiffnessStep):
+    force, residual = [], []
+    for pads, curve, colour in zip(step.pads, step.fit.curves, shades(len(step.pads)), strict=True):
+        name = f"{pads.thickness_mm:g} mm"
+        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
+            if not is_slow(log):
+                continue
+            x = log.samples["angle"] - log.samples["angle"][0] - clearance
+            thin = slice(None, None, max(len(x) // 700, 1))
+            force.append(Trace("measured", x[thin], 1e-3 * log.force_N[thin], _CLOUD))
+            known = np.isfinite(log.force_N)
+            residual.append(Trace(name, x[known][thin], step.fit.residuals[str(log.path)][thin], Style(colour, 0.9)))
+        grid = np.linspace(0.0, curve.travel_rad, 200)
+        force.append(Trace(name, grid, 1e-3 * curve.force(grid), Style(colour, 1.8)))
+    panels = [Panel("Clamp force", "kN", force, 360), Panel("Residual", "N", residual, 220)]
+    return xy_figure(panels, "motor angle past contact / rad")
+
+
+def _curve_table(section: Section, step: StiffnessStep) -> None:
+    rows = []
+    for pads, curve in zip(step.pads, step.fit.curves, strict=True):
+        sigmas = np.sqrt(np.diag(curve.covariance))
+        full = np.array([curve.travel_rad])
+        slow = [step.fit.residuals[str(log.path)] for log in pads.slow]
+        rows.append(
+            [
+                f"{curve.thickness_mm:g}",
+                *(with_sigma(c, s) for c, s in zip(curve.coefficients, sigmas, strict=True)),
+                with_sigma(float(curve.force(full)[0]), float(curve.force_sigma(full)[0]), 1e-3),
+                with_sigma(float(np.mean(curve.clearances_rad)), float(np.max(curve.clearance_sigmas_rad))),
+                f"{rmse(np.concatenate(slow)):.0f}" if slow else "–",
+            ]
+        )
+    section.table(
+        ["pad / mm", "A0 / N/rad", "A1 / N/rad²", "A2 / N/rad³", "force at full travel / kN", "clearance / rad",
+         "residual, slow clamp / N"],
+        rows,
+        "± one standard deviation, jackknife over seconds.",
+    )  # fmt: skip
+
+
+def _dynamics_tables(section: Section, step: StiffnessStep) -> None:
+    rows = [
+        [
+            _STRUCTURES[c.effects],
+            f"{c.held_out_rmse:.1f}",
+            "yes" if c.clear else "no",
+            "chosen" if c is step.chosen else "",
+        ]
+        for c in step.candidates
+    ]
+    section.table(["structure", "held-out RMSE / N", "amplitudes clear of zero", ""], rows)
+    rows = []
+    for name in DYNAMICS:
+        if name in step.fit.sigmas:
+            title, factor, unit = _UNITS[name]
+            each = [fit.values[name] * factor for fit in step.separate]
+            span = f"{min(each):.4g} – {max(each):.4g}" if each else "–"
+            rows.append([title, with_sigma(step.fit.values[name], step.fit.sigmas[name], factor), unit, span])
+    section.table(["shared dynamics", "all pads at once", "unit", "each pad alone"], rows)
+    if len(step.separate) > 1:
+        alone = rmse(np.concatenate([r for fit in step.separate for r in fit.residuals.values()]))
+        enough = step.fit.rms < 1.05 * alone
+        section.text(
+            f"One set of dynamics for all thicknesses {'is enough' if enough else 'is not enough'}: "
+            f"{step.fit.rms:.1f} N together against {alone:.1f} N with dynamics of its own for each pad."
+        )

@@ -1,0 +1,276 @@
+"""Heat: pads, disc, friction and softening out of a rig's thermal logs, and how well temperatures are known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec.structs import replace
+
+from emb_daemon.calibration.types import Calibration, Thermal, to_parameters
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.recording import Recording, recording, simulate
+from emb_daemon.identify.steps import Step, cooling, friction, softening
+from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
+from emb_daemon.identify.steps.friction import FrictionFit, fit_friction
+from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat, nominal_thermal, thermal_parameters
+from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
+from emb_daemon.identify.text import with_sigma
+from emb_daemon.offline import Log, estimate
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import MODEL, PALE, Page, Panel, Trace, shades, time_figure
+from emb_daemon.report.figures import Style
+
+#: Pads are not known better than their thermocouples, K.
+_LEAST_SIGMA_K = 0.3
+_NEEDED = {
+    "tune": "braking with thermocouples in the pads, for conductivity, specific heat and heat shares",
+    "heat_flux_map": "braking at several forces and disc speeds, for friction over force, speed and temperature",
+    "pad_cooling": "bursts of clamps while the pads cool, for softening",
+    "validate": "braking with thermocouples in the pads; pad temperatures are not judged without it",
+    "integrated": "training and braking heat at full frame rate",
+}
+
+
+@dataclass(frozen=True)
+class Temperatures:
+    """One log's temperatures beside its thermocouples, every half second.
+
+    Attributes:
+        measured, known, unknown: shape (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with
+            the brake torque measured, ``unknown`` without it.
+    """
+
+    time_s: np.ndarray
+    measured: np.ndarray
+    known: np.ndarray
+    unknown: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThermalStep(Step):
+    """Attributes:
+    fitted: recordings that fitted, by name.
+    heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
+    figures: RMSE on logs that fitted nothing, by name with unit.
+    residuals: the same for what was fitted.
+    """
+
+    fitted: dict[str, Recording]
+    heat: HeatFit | None = None
+    law: CoolingLaw | None = None
+    friction: FrictionFit | None = None
+    softening: SofteningFit | None = None
+    temperatures: dict[str, Temperatures]
+    figures: dict[str, float]
+    residuals: dict[str, float]
+
+
+def _attempt(campaign: Campaign, action, *arguments):
+    """The result, or None after a word about what was wrong with a log, so that the others go on."""
+    try:
+        return action(*arguments)
+    except InputError as error:
+        campaign.fault(str(error))
+        return None
+
+
+def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
+    """Thermal section of the calibration.
+
+    Args:
+        cold: what is known without it: softening is identified with its stiffness path, and pads are judged as in a car by the
+            whole estimator, its own clamp force heating them.
+    """
+    logs, judged = _logs(campaign)
+    recordings = {name: found for name, log in logs.items() if (found := _attempt(campaign, _fitting, log)) is not None}
+    if not recordings:
+        campaign.fault(
+            "thermal: no log heats the pads with their thermocouples recorded; needed: thermal.tune, braking with "
+            "thermocouples in the pads; heat keeps the datasheet's nominal values and the force does not follow temperature"
+        )
+        return ThermalStep(values={"thermal": cold.thermal}, fitted={}, temperatures={}, figures={}, residuals={})
+    thickness = cold.pad_thickness_mm
+    heat = fit_heat(list(recordings.values()), cold.thermal, thickness)
+    dense = [r for r in recordings.values() if r.dense]
+    rubbed = _attempt(campaign, fit_friction, dense, heat.parameters) if dense else None
+    softened = None
+    if "pad_cooling" in recordings:
+        inputs = (logs["pad_cooling"], recordings["pad_cooling"], heat.parameters, np.array([to_parameters(cold)]))
+        softened = _attempt(campaign, fit_softening, *inputs)
+    thermal = replace(
+        heat.thermal,
+        friction=rubbed.table if rubbed else cold.thermal.friction,
+        softening=softened.softening if softened else cold.thermal.softening,
+    )
+    parameters = thermal_parameters(thermal, thickness)
+    if dense:
+        spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
+        thermal = replace(thermal, sigma_K=float(f"{max(spread, _LEAST_SIGMA_K):.3g}"))
+    law = cooling_law([r for name, r in recordings.items() if name.startswith("disc_cooling")], campaign.datasheet.disc)
+    temperatures, figures, residuals = _judge(campaign, recordings, judged, replace(cold, thermal=thermal), parameters)
+    if softened:
+        figures |= softened.figures()
+    if rubbed:
+        residuals["friction coefficient, weighted by force"] = rubbed.rms
+    if law:
+        residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
+    return ThermalStep(
+        values={"thermal": thermal},
+        sigmas=_sigmas(heat, rubbed, softened),
+        notes=_notes(heat, law, rubbed, softened),
+        fitted=recordings,
+        heat=heat,
+        law=law,
+        friction=rubbed,
+        softening=softened,
+        temperatures=temperatures,
+        figures=figures,
+        residuals=residuals,
+    )
+
+
+def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
+    """Logs that may fit and logs that judge, by name; those of a thermal rig that are not named become faults."""
+    part, fit, judged = campaign.file.thermal, {}, {}
+    for name, into in (("tune", fit), ("heat_flux_map", fit), ("pad_cooling", fit), ("validate", judged)) if part else ():
+        if getattr(part, name) is None:
+            campaign.fault(f"thermal.{name}: missing; needed: {_NEEDED[name]}")
+        into[name] = campaign.load(getattr(part, name), f"thermal.{name}", _NEEDED[name])
+    coolings = part.disc_cooling if part else ()
+    if part and not coolings:
+        campaign.fault("thermal.disc_cooling: missing; needed for the disc's cooling over speed")
+    for number, entry in enumerate(coolings, 1):
+        fit[f"disc_cooling {number}"] = campaign.load_cooling(entry)
+    pairs = campaign.file.integrated
+    for number, pair in enumerate(pairs, 1):
+        suffix = f" {number}" if len(pairs) > 1 else ""
+        fit[f"integrated fit{suffix}"] = campaign.load(pair.fit, "integrated.fit", _NEEDED["integrated"])
+        judged[f"integrated{suffix}"] = campaign.load(pair.judge, "integrated.judge", _NEEDED["integrated"])
+    return tuple({name: log for name, log in logs.items() if log is not None} for logs in (fit, judged))
+
+
+def _fitting(log: Log) -> Recording:
+    found = recording(log)
+    check_excitation(found)
+    return found
+
+
+def _errors(parameters: np.ndarray, r: Recording, torque_known: bool = True) -> np.ndarray:
+    """Of the modelled temperatures, shape (9, n), K."""
+    return simulate(parameters, r, torque_known)[:, :9].T - r.measured
+
+
+def _judge(campaign, recordings, judged: dict[str, Log], calibration: Calibration, parameters: np.ndarray):
+    """(temperatures to draw, figures on logs that fitted nothing, residuals of those that did)."""
+    temperatures, figures, residuals = {}, {}, {}
+    if "tune" in recordings:
+        temperatures["tune"] = _compare("tune", recordings["tune"], parameters, residuals)
+    for name, log in judged.items():
+        r = _attempt(campaign, recording, log)
+        if r is not None:
+            temperatures[name] = _compare(name, r, parameters, figures)
+            figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
+    for name, r in recordings.items():
+        error = _errors(parameters, r)
+        residuals[f"{name}: pads, torque known, K"] = rmse(error[:8])
+        residuals[f"{name}: disc, torque known, K"] = rmse(error[8])
+    return temperatures, figures, residuals
+
+
+def _compare(name: str, r: Recording, parameters: np.ndarray, into: dict[str, float]) -> Temperatures:
+    every, found = max(round(0.5 / r.step_s), 1), []
+    for torque_known, words in ((True, "torque known"), (False, "no torque")):
+        error = _errors(parameters, r, torque_known)
+        into[f"{name}: pads, {words}, K"] = rmse(error[:8])
+        into[f"{name}: disc, {words}, K"] = rmse(error[8])
+        found.append((error + r.measured)[:, ::every])
+    return Temperatures(r.time_s[::every], r.measured[:, ::every], *found)
+
+
+def _as_in_a_car(log: Log, calibration: Calibration) -> float:
+    """RMSE of the pads' temperatures (K) by the whole estimator."""
+    found = estimate(log.samples, to_parameters(calibration))
+    errors = []
+    for side, pad in enumerate(("inner", "outer")):
+        times, depths = log.reference.pads[pad]
+        for row in range(len(DEPTHS_M)):
+            errors.append(np.interp(times, log.time_ns, found["depth"][:, side, row]) - depths[row])
+    return rmse(np.concatenate(errors))
+
+
+def _sigmas(heat: HeatFit, rubbed: FrictionFit | None, softened: SofteningFit | None) -> dict[str, float]:
+    sigmas = {f"thermal.{key}": value for key, value in heat.sigmas.items()}
+    if rubbed:
+        sigmas["thermal.friction.coefficient"] = rubbed.sigma
+    if softened:
+        sigmas |= {f"thermal.softening.{key}": value for key, value in softened.sigmas.items()}
+    return sigmas
+
+
+def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
+    notes = [
+        f"thermal.{key}: these logs hardly tell it; the usual value, or the datasheet's, was mostly kept"
+        for key in heat.unexcited
+    ]
+    if rubbed:
+        notes.append(f"friction on the disc: {rubbed.equation}, residual {rubbed.rms:.4f}")
+    else:
+        notes.append("thermal.friction: no log tells it; the datasheet's coefficient was kept")
+    return (*notes, *([law.note()] if law else []), *([softened.note()] if softened else []))
+
+
+def section(page: Page, step: ThermalStep) -> None:
+    """Heat in the report."""
+    part = page.section("Pads and disc: heat")
+    if step.heat is None:
+        part.text(
+            "No log heats the pads: conductivity, specific heat and disc are the datasheet's nominal values, and the force "
+            "does not follow temperature. Needed: braking with thermocouples in the pads."
+        )
+        return
+    part.text(
+        "Backing plate, pad, disc, pad, backing plate as one implicit chain (thesis 7.4 to 8.2). Known torque uses the rig's "
+        "brake torque sensor; without it the heat comes from the estimated force and the friction map, as in a car."
+    )
+    rows = [[key, with_sigma(value, step.sigmas.get(f"thermal.{key}"))] for key, value in _numbers(step.values["thermal"])]
+    part.table(["parameter", "value"], rows)
+    part.items(list(step.notes))
+    for name, found in step.temperatures.items():
+        part.heading(f"Temperatures: {name}")
+        part.figure(time_figure(_panels(found)))
+    for module, found in ((cooling, step.law), (friction, step.friction), (softening, step.softening)):
+        if found is not None:
+            module.figure(part, found)
+    part.table(["figure on logs that fitted nothing", "value"], [[k, f"{v:.3g}"] for k, v in step.figures.items()])
+    part.table(["residual of what was fitted", "value"], [[k, f"{v:.3g}"] for k, v in step.residuals.items()])
+
+
+def _numbers(thermal: Thermal):
+    for name in ("pad", "disc", "softening"):
+        struct = getattr(thermal, name)
+        for key in struct.__struct_fields__:
+            yield f"{name}.{key}", getattr(struct, key)
+    yield "sigma_K", thermal.sigma_K
+
+
+def _panels(found: Temperatures) -> list[Panel]:
+    time, colours, grey = found.time_s, shades(4)[::-1], Style("#b3bcc7", 2.2)
+    panels = []
+    for name, rows in (("Inner pad", range(4)), ("Outer pad", range(4, 8))):
+        traces = [Trace("measured", time, found.measured[row], grey) for row in rows]
+        for row, colour, depth in zip(rows, colours, DEPTHS_M, strict=True):
+            traces.append(Trace(f"{1e3 * depth:g} mm", time, found.known[row], Style(colour, 1.2)))
+        panels.append(Panel(f"{name}, torque known", "°C", traces, 230))
+    disc = [Trace("measured", time, found.measured[8], grey), Trace("model", time, found.known[8], MODEL)]
+    errors = [
+        Trace(name, time, np.linalg.norm(modelled[:8] - found.measured[:8], axis=0) / np.sqrt(8.0), style)
+        for name, modelled, style in (("no torque sensor", found.unknown, PALE), ("torque known", found.known, MODEL))
+    ]
+    error = Panel("Error, RMS over the eight thermocouples", "K", errors, 180)
+    return [*panels, Panel("Disc", "°C", disc, 180), error]
+
+
+def nominal(campaign: Campaign) -> Step:
+    """The datasheet's thermal section, to start from."""
+    return Step(values={"thermal": nominal_thermal(campaign.datasheet)})

@@ -1,0 +1,121 @@
+"""How curves vary with pad thickness, and what predicting one from others costs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.calibration.types import Curve, curve_at
+from emb_daemon.errors import InputError
+from emb_daemon.identify.dynamics import TERMS, CurveFit, Pads, powers
+from emb_daemon.identify.steps import Step
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import Page, Panel, Trace, shades, xy_figure
+from emb_daemon.report.figures import Style
+
+#: Laws for each coefficient a over thickness: (degree of the polynomial, what is straight, and back); None is the one used.
+LAWS = {
+    "1/a straight between neighbours (used)": None,
+    "1/a straight through all": (1, lambda a: 1.0 / a, lambda y: 1.0 / y),
+    "ln a quadratic through all": (2, np.log, np.exp),
+    "a straight through all": (1, lambda a: a, lambda y: y),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThicknessStep(Step):
+    """Attributes:
+    curves: one per thickness.
+    laws: `thickness_laws`.
+    """
+
+    curves: list[CurveFit]
+    laws: dict[str, np.ndarray]
+
+    def interpolation_error(self, thickness_mm: float) -> float:
+        """Relative force error that interpolation adds at a thickness.
+
+        A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which leaving out each inner
+        thickness shows.
+        """
+        thicknesses = np.array([curve.thickness_mm for curve in self.curves])
+        if len(thicknesses) < 3 or np.any(np.abs(thicknesses - thickness_mm) < 1e-6):
+            return 0.0
+        left_out = self.laws[next(iter(LAWS))]
+        spans = (thicknesses[1:-1] - thicknesses[:-2]) * (thicknesses[2:] - thicknesses[1:-1])
+        curvature = rmse(left_out / spans)
+        upper = int(np.clip(np.searchsorted(thicknesses, thickness_mm), 1, len(thicknesses) - 1))
+        return curvature * abs((thickness_mm - thicknesses[upper - 1]) * (thicknesses[upper] - thickness_mm))
+
+
+def check_thickness(pads: list[Pads], thickness_mm: float) -> None:
+    """Raises InputError if pads of a thickness are too far from every measured one for a calibration."""
+    table = tuple(Curve(pad_thickness_mm=own.thickness_mm, coefficients=(1.0,)) for own in pads)
+    try:
+        curve_at(table, thickness_mm)
+    except InputError as error:
+        raise InputError(f"{error}; needed: curves of pads nearer to that thickness") from None
+
+
+def identify(curves: list[CurveFit]) -> ThicknessStep:
+    """``curves`` in ascending order of thickness."""
+    return ThicknessStep(curves=curves, laws=thickness_laws(curves))
+
+
+def thickness_laws(curves: list[CurveFit]) -> dict[str, np.ndarray]:
+    """Relative force error of each inner curve predicted from the others, weighted by force, by law.
+
+    Shape (curves - 2,); empty with fewer than three curves."""
+    found = {}
+    for name, law in LAWS.items():
+        errors = []
+        for index in range(1, len(curves) - 1):
+            target = curves[index]
+            predicted = predict_curve([c for c in curves if c is not target], target.thickness_mm, law)
+            x = np.linspace(0.05, 1.0, 50) * target.travel_rad
+            truth = target.force(x)
+            errors.append(rmse(powers(x) @ predicted - truth) / rmse(truth))
+        found[name] = np.array(errors)
+    return found
+
+
+def predict_curve(curves: list[CurveFit], thickness_mm: float, law=None) -> np.ndarray:
+    """Coefficients at a thickness from the curves of others, by one of `LAWS`; None is the calibration's own."""
+    coefficients = np.array([curve.coefficients for curve in curves])
+    if law is None or np.any(coefficients <= 0.0):
+        return curve_at(tuple(curve.curve() for curve in curves), thickness_mm)[:TERMS]
+    degree, forward, back = law
+    thicknesses = np.array([curve.thickness_mm for curve in curves])
+    degree = min(degree, len(curves) - 1)
+    return np.array([back(np.polyval(np.polyfit(thicknesses, forward(a), degree), thickness_mm)) for a in coefficients.T])
+
+
+def section(page: Page, step: ThicknessStep, thickness_mm: float) -> None:
+    """Pad thickness in the report; nothing with fewer than three curves."""
+    curves = step.curves
+    if len(curves) < 3:
+        return
+    part = page.section(
+        "Pad thickness",
+        "How the curve varies with thickness: each inner thickness predicted from the others, relative error of the force, "
+        "weighted by force. The gaps are then twice those that prediction has to bridge.",
+    )
+    rows = [
+        [name, *(f"{100 * error:.2f}" for error in errors), f"{100 * rmse(errors):.2f}"] for name, errors in step.laws.items()
+    ]
+    inner = (f"{curve.thickness_mm:g} mm / %" for curve in curves[1:-1])
+    part.table(["law for each coefficient a", *inner, "RMS / %"], rows)
+    part.text(
+        f"At {thickness_mm:g} mm interpolation is expected to add {100 * step.interpolation_error(thickness_mm):.2f} % of the "
+        "force, which the noise level of the stiffness path contains."
+    )
+    thicknesses = np.array([curve.thickness_mm for curve in curves])
+    traces = []
+    for n, colour in enumerate(shades(TERMS)):
+        found = np.array([curve.coefficients[n] for curve in curves])
+        sigma = np.array([np.sqrt(curve.covariance[n, n]) for curve in curves])
+        spread = np.abs(found[0] * sigma / found**2)
+        traces.append(Trace(f"1/A{n}", thicknesses, found[0] / found, Style(colour, 1.4, mode="lines+markers"), spread))
+    part.figure(
+        xy_figure([Panel("Compliance over that of the thinnest pad", "1", traces, 280)], "pad thickness / mm"),
+        "Compliance adds up with thickness, so that the reciprocals run nearly straight.",
+    )

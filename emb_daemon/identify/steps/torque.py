@@ -1,0 +1,282 @@
+"""Torque path: torque constant, lumped inertia and friction from current, motion and the reference force.
+
+Thesis 2.4 and 4.2, T_m = gamma F + J dw/dt + (mu F + eta) s, turned round so that the noisy current is what is explained:
+
+    iq = (gamma / K_m) F + (J / K_m) dw/dt + (eta / K_m) s + (mu / K_m) s F
+
+gamma is geometry, so that the first coefficient gives the torque constant. The speed's noise would pull the inertia down
+(attenuation); the second difference of the angle, whose noise is independent of it, serves as instrument.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from emb_daemon.calibration.types import Friction, Motor
+from emb_daemon.errors import InputError
+from emb_daemon.identify.campaign import Campaign, Datasheet
+from emb_daemon.identify.dynamics import EPISODE, Pads, with_dynamics
+from emb_daemon.identify.steps import Step
+from emb_daemon.identify.text import with_sigma
+from emb_daemon.offline import Log
+from emb_daemon.offline.fit import jackknife
+from emb_daemon.offline.run import run_paths
+from emb_daemon.offline.score import rmse
+from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
+from emb_daemon.wire.contract import CYCLE_S
+
+#: Parameters in the order of every covariance.
+NAMES = ("torque_constant_Nm_per_A", "inertia_kg_m2", "offset_Nm", "load_m_per_rad", "presliding_angle_rad")
+_KEYS = tuple(f"{'motor' if name in NAMES[:2] else 'friction'}.{name}" for name in NAMES)
+#: Variance of the friction state up to which it counts as known.
+_KNOWN = 0.01
+#: Step of the derivative by the logarithm of the presliding angle.
+_STEP = 1e-2
+_NEED_TRAINING = "clamp and release with the reference force, at full frame rate"
+
+
+@dataclass(frozen=True)
+class TorqueFit:
+    """Parameters of the torque path.
+
+    Attributes:
+        values: by name (`NAMES`).
+        covariance: in their order.
+        residuals: unexplained current by log path: (row of the log, A).
+    """
+
+    values: dict[str, float]
+    covariance: np.ndarray
+    residuals: dict[str, tuple[np.ndarray, np.ndarray]] = field(repr=False)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def rms_A(self) -> float:
+        """Of the current that stays unexplained."""
+        return rmse(np.concatenate([residual for _, residual in self.residuals.values()]))
+
+    def friction(self) -> Friction:
+        """That section of the calibration; what noise pushed below what is physical stands at its least."""
+        least = {"load_m_per_rad": 0.0, "offset_Nm": 0.0, "presliding_angle_rad": 1e-6}
+        return Friction(**{name: max(self.values[name], low) for name, low in least.items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueStep(Step):
+    """Attributes:
+    fit: over all logs of the campaign's pads.
+    log: one of them, to be shown.
+    gears: (training log, fit) for each state of wear of the gear.
+    """
+
+    fit: TorqueFit
+    log: Log
+    gears: list[tuple[str, TorqueFit]]
+
+    def gear_wear(self) -> float:
+        """Relative error of the torque path from not knowing how worn the gear is; its spread over the states measured."""
+        worn = [fit.values["load_m_per_rad"] for _, fit in self.gears]
+        return float(np.std(worn, ddof=1)) / self.values["motor"].gear_gain_m_per_rad if len(worn) > 1 else 0.0
+
+
+def identify(campaign: Campaign, pads: list[Pads]) -> TorqueStep:
+    """Torque path from all logs with motor current, and each gear's from its training log.
+
+    Raises:
+        InputError: no log holds motor current.
+    """
+    sheet = campaign.datasheet
+    logs = [log for own in pads for log in own.logs if log.samples["has_current"].any()]
+    if not logs:
+        raise InputError(f"{campaign.path}: curves, random: no log holds motor current; needed: EMB_*_Current frames")
+    found = fit_torque(logs, sheet)
+    for name in NAMES[:2]:
+        campaign.compare_with_datasheet(f"motor.{name}", found.values[name])
+    gears = []
+    for entry in campaign.file.gear_wear:
+        log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
+        if log is not None:
+            gears.append((entry.training, fit_torque([log], sheet)))
+    return TorqueStep(
+        values=sections(found, sheet),
+        sigmas=dict(zip(_KEYS, found.sigmas.values(), strict=True)),
+        fit=found,
+        log=pads[len(pads) // 2].logs[-1],
+        gears=gears,
+    )
+
+
+def sections(found: TorqueFit, sheet: Datasheet) -> dict:
+    """Sections of the calibration that a fit fills."""
+    motor = Motor(
+        torque_constant_Nm_per_A=found.values["torque_constant_Nm_per_A"],
+        inertia_kg_m2=found.values["inertia_kg_m2"],
+        gear_gain_m_per_rad=sheet.actuator.gear_gain_m_per_rad,
+        maximum_speed_rad_per_s=sheet.actuator.max_motor_speed_rad_per_s,
+    )
+    return {"motor": motor, "friction": found.friction()}
+
+
+class _Regression:
+    """One log's part of the regression."""
+
+    def __init__(self, log: Log):
+        samples = log.samples
+        angle, speed = samples["angle"], samples["speed"]
+        rows = np.arange(2, len(samples) - 1)
+        full_rate = np.all([np.abs(samples["dt"][rows + k] - CYCLE_S) < 1e-6 for k in (-1, 0, 1)], axis=0)
+        known = np.isfinite(log.force_N[rows]) & np.isfinite(log.force_N[rows - 1]) & samples["has_current"][rows]
+        self.log = log
+        self.rows = r = rows[full_rate & known]
+        self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
+        self.current = samples["current_q"][r]
+        self.acceleration = (speed[r] - speed[r - 1]) / CYCLE_S
+        self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
+
+    def matrices(self, presliding_angle: float):
+        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model."""
+        parameters = with_dynamics({})
+        parameters["presliding_angle"] = presliding_angle
+        paths = run_paths(self.log.samples, parameters)[self.rows]
+        s = paths["friction_mean"]
+        regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
+        instruments = regressors.copy()
+        instruments[:, 1] = self.of_angle
+        return regressors, instruments, paths["friction_variance"] < _KNOWN
+
+
+def fit_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
+    """Instrumental-variable regression with the presliding angle sought in one dimension.
+
+    The datasheet's torque constant and inertia are priors; its resolver count is what no turning over is known better than.
+    """
+    parts = [_Regression(log) for log in logs]
+
+    def solve(presliding):
+        matrices = [part.matrices(presliding) for part in parts]
+        left = sum(z[use].T @ x[use] for x, z, use in matrices)
+        right = sum(z[use].T @ part.current[use] for part, (_, z, use) in zip(parts, matrices, strict=True))
+        solution = np.linalg.solve(left, right)
+        return solution, matrices, [p.current[use] - x[use] @ solution for p, (x, _, use) in zip(parts, matrices, strict=True)]
+
+    def cost(logarithm):
+        return float(np.mean(np.concatenate(solve(np.exp(logarithm))[2]) ** 2))
+
+    # The grid finds the valley; below a resolver count the angle says nothing.
+    grid = np.log(np.geomspace(1e-3, 1.0, 13))
+    best = int(np.argmin([cost(g) for g in grid]))
+    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    presliding = float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x))
+    solution, matrices, residuals = solve(presliding)
+    covariance = _covariance(parts, matrices, residuals, solution, presliding)
+    physical, covariance = _physical(solution, presliding, covariance, sheet)
+    physical, covariance = _with_priors(physical, covariance, sheet)
+    left_over = {
+        str(part.log.path): (part.rows[use], residual)
+        for part, (_, _, use), residual in zip(parts, matrices, residuals, strict=True)
+    }
+    return TorqueFit(dict(zip(NAMES, physical.tolist(), strict=True)), covariance, left_over)
+
+
+def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
+    """Of the four coefficients and the logarithm of the presliding angle, jackknife over seconds."""
+    normals, scores = [], []
+    for part, (regressors, instruments, use), residual in zip(parts, matrices, residuals, strict=True):
+        moved = part.matrices(presliding * np.exp(_STEP))[0]
+        sensitivity = (((moved - regressors) @ solution) / _STEP)[use, None]
+        x, z = np.hstack([regressors[use], sensitivity]), np.hstack([instruments[use], sensitivity])
+        for start in range(0, len(residual), EPISODE):
+            rows = slice(start, start + EPISODE)
+            normals.append(z[rows].T @ x[rows])
+            scores.append(z[rows].T @ residual[rows])
+    return jackknife(np.array(normals), np.array(scores))
+
+
+def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
+    """`NAMES` from coefficients b: K_m = gamma / b0, J = b1 K_m, eta = b2 K_m, mu = b3 K_m."""
+    constant = sheet.actuator.gear_gain_m_per_rad / solution[0]
+    change = np.diag([-constant / solution[0], constant, constant, constant, presliding])
+    change[1:4, 0] = -solution[1:] * constant / solution[0]
+    covariance = change @ covariance @ change.T
+    # The play against flicker and the reading's own step shift each reversal by about a count.
+    covariance[4, 4] += (2.0 * sheet.resolver.count_rad) ** 2
+    return np.array([constant, *(solution[1:] * constant), presliding]), covariance
+
+
+def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
+    """Values and covariance after the datasheet's torque constant and inertia, which its tolerances say how far to believe."""
+    stated = np.array([sheet.stated(f"motor.{name}") for name in NAMES[:2]])
+    sigma = stated[:, 0] * stated[:, 1] / 2.0
+    seen = np.eye(2, len(NAMES))
+    gain = covariance @ seen.T @ np.linalg.inv(covariance[:2, :2] + np.diag(sigma**2))
+    return values + gain @ (stated[:, 0] - values[:2]), covariance - gain @ seen @ covariance
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What a fit leaves on a log that it need not have seen, one entry per cycle.
+
+    Attributes:
+        rows: of the log.
+        current_A: left unexplained.
+        friction_mean: friction state, -1 to 1.
+        force_N: mean force.
+    """
+
+    found: TorqueFit
+    rows: np.ndarray
+    current_A: np.ndarray
+    friction_mean: np.ndarray
+    force_N: np.ndarray
+
+
+def unexplained_current(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
+    """Current of a log that a fit does not explain."""
+    part, values = _Regression(log), found.values
+    regressors, _, use = part.matrices(values["presliding_angle_rad"])
+    coefficients = np.array([gear_gain, *(values[name] for name in NAMES[1:4])]) / values["torque_constant_Nm_per_A"]
+    residual = part.current - regressors @ coefficients
+    return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
+
+
+_ROWS = (
+    ("torque constant K_m / mN m/A", 1e3),
+    ("lumped inertia J / 10⁻⁴ kg m²", 1e4),
+    ("Coulomb friction η / mN m", 1e3),
+    ("load friction μ / µm/rad", 1e6),
+    ("presliding angle / mrad", 1e3),
+)
+
+
+def section(page: Page, step: TorqueStep) -> None:
+    """Torque balance in the report."""
+    part = page.section(
+        "Torque balance",
+        "Current explained by force, acceleration and friction (thesis 2.4, 4.1, 4.2). The current is noisy and is what is "
+        "explained; the angle's second difference instruments the noisy speed. Friction turns over within the presliding "
+        "angle instead of jumping with the sign. The datasheet's torque constant and inertia are priors.",
+    )
+    fits = [step.fit, *(found for _, found in step.gears)]
+    rows = [
+        [title, *(with_sigma(found.values[name], found.sigmas[name], factor) for found in fits)]
+        for name, (title, factor) in zip(NAMES, _ROWS, strict=True)
+    ]
+    rows.append(["unexplained current / A", *(f"{found.rms_A:.3f}" for found in fits)])
+    gears = [name.rsplit("/", 1)[-1].split(".log")[0] for name, _ in step.gears]
+    part.table(["parameter", "all pads", *gears], rows, "Gears: each state of wear identified from its own training log.")
+    current, time = step.log.samples["current_q"], step.log.time_s
+    rows_of, residual = step.fit.residuals[str(step.log.path)]
+    explained = Trace("explained", time[rows_of], current[rows_of] - residual, MODEL)
+    part.figure(
+        time_figure(
+            [
+                Panel("Motor current", "A", [Trace("measured", time, current, REFERENCE), explained]),
+                Panel("Residual", "A", [Trace("unexplained", time[rows_of], residual, MODEL)], 200),
+            ]
+        ),
+        f"{step.log.path.name}",
+    )

@@ -1,0 +1,283 @@
+"""Least squares through the estimator: few parameters, many samples, most parameters belonging to one log.
+
+`scipy.optimize.least_squares` searches. What it is given is the problem reduced to as many rows as there are parameters and
+one more (an orthogonal reduction, block by block, which changes neither cost nor gradient nor Gauss-Newton matrix), so that
+the Jacobian of half a million samples, most of it zeros, never stands in memory.
+"""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from emb_daemon.offline.score import rmse
+
+Values = dict[Hashable, float]
+
+
+@dataclass(frozen=True)
+class Free:
+    """A parameter to be fitted.
+
+    Attributes:
+        start: where the search begins.
+        step: of the derivative's difference quotient: small, but visible in the residual.
+        low, high: bounds.
+        prior: (mean, standard deviation) of what is known beforehand; residuals then have to be in units of their own standard
+            deviation, or the two cannot be weighed against each other.
+        logarithmic: searched as a logarithm, for positive parameters of unknown size. ``step`` and the prior's deviation are
+            then relative, and the prior's mean is still a value.
+    """
+
+    start: float
+    step: float
+    low: float = -np.inf
+    high: float = np.inf
+    prior: tuple[float, float] | None = None
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Block:
+    """Residuals of one log.
+
+    Attributes:
+        residual: from values by key (those in ``keys`` at least) to residuals, shape (n,), all finite.
+        keys: parameters that these residuals depend on; only they are moved for the derivative.
+        episode: number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated; what happens in
+            one episode says little about the next, so that episodes are what the covariance counts.
+        derivative: from values to the derivatives of the residuals, shape (n, keys), where something better than difference
+            quotients is known.
+    """
+
+    residual: Callable[[Values], np.ndarray]
+    keys: tuple[Hashable, ...]
+    episode: np.ndarray
+    derivative: Callable[[Values], np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit.
+
+    Attributes:
+        values: by key.
+        sigmas: standard deviations by key, infinite where neither residuals nor prior say anything.
+        covariance: of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out;
+            Wu, Annals of Statistics 14, 1986), which stays honest with few episodes, and the priors' own part.
+        residuals: one array per block.
+        at_bound: parameters that stand at a bound; their sigmas are those of a free parameter.
+        from_prior: share of each parameter's information that is its prior's, 0 to 1.
+        converged: the search ended before its limit of evaluations.
+    """
+
+    keys: tuple[Hashable, ...]
+    values: Values
+    sigmas: Values
+    covariance: np.ndarray
+    residuals: list[np.ndarray] = field(repr=False)
+    at_bound: frozenset
+    from_prior: Values
+    converged: bool
+
+    @property
+    def rms(self) -> float:
+        """Root mean square over all residuals."""
+        return rmse(np.concatenate(self.residuals))
+
+    def block(self, keys: Sequence[Hashable]) -> np.ndarray:
+        """Covariance of some parameters."""
+        rows = [self.keys.index(key) for key in keys]
+        return self.covariance[np.ix_(rows, rows)]
+
+
+def fit(
+    blocks: Sequence[Block],
+    free: Mapping[Hashable, Free],
+    *,
+    huber: float = np.inf,
+    tolerance: float = 1e-8,
+    evaluations: int = 100,
+    workers: int = 1,
+) -> Fit:
+    """Values that make the residuals small.
+
+    Args:
+        huber: residuals beyond it count linearly (Huber 1964).
+        tolerance: relative fall of the cost that ends the search.
+        evaluations: limit of the residual's evaluations, not counting derivatives.
+        workers: threads among which blocks are shared; residuals must then not write to anything shared.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        problem = _Problem(blocks, free, huber, pool)
+        low, high = problem.bounds()
+        found = least_squares(
+            problem.reduced,
+            np.clip(problem.start, low, high),
+            problem.reduced_jacobian,
+            bounds=(low, high),
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=1e-12,
+            gtol=None,
+            max_nfev=evaluations,
+        )
+        residuals = problem.residuals(found.x)
+        covariance, from_prior = problem.covariance(found.x)
+    unit = np.where(problem.logarithmic, np.exp(np.where(problem.logarithmic, found.x, 0.0)), 1.0)
+    covariance = covariance * np.outer(unit, unit)
+    near = (found.x - low <= problem.steps) | (high - found.x <= problem.steps)
+    keys = problem.keys
+    return Fit(
+        keys=keys,
+        values=problem.values(found.x),
+        sigmas=dict(zip(keys, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        covariance=covariance,
+        residuals=residuals,
+        at_bound=frozenset(key for key, at in zip(keys, near, strict=True) if at),
+        from_prior=dict(zip(keys, from_prior.tolist(), strict=True)),
+        converged=found.status > 0,
+    )
+
+
+class _Problem:
+    """Blocks and priors as functions of the vector that is searched."""
+
+    def __init__(self, blocks, free, huber, pool):
+        self.blocks, self.free, self.huber, self.pool = blocks, free, huber, pool
+        self.keys = tuple(free)
+        row = {key: index for index, key in enumerate(self.keys)}
+        self.columns = [np.array([row[key] for key in block.keys], int) for block in blocks]
+        self.logarithmic = np.array([f.logarithmic for f in free.values()])
+        self.steps = np.array([f.step for f in free.values()])
+        self.start = self._searched([f.start for f in free.values()])
+        self.mean = self._searched([f.prior[0] if f.prior else f.start for f in free.values()])
+        self.weight = np.array([1.0 / f.prior[1] if f.prior else 0.0 for f in free.values()])
+
+    def _searched(self, values):
+        values = np.array(values, float)
+        with np.errstate(divide="ignore"):
+            return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
+
+    def bounds(self):
+        limits = ([getattr(f, name) for f in self.free.values()] for name in ("low", "high"))
+        low, high = (np.array(side, float) for side in limits)
+        return self._searched(np.where(self.logarithmic, np.maximum(low, 0.0), low)), self._searched(high)
+
+    def values(self, x):
+        values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+        return dict(zip(self.keys, values.tolist(), strict=True))
+
+    def residuals(self, x):
+        values = self.values(x)
+        return list(self.pool.map(lambda block: block.residual(values), self.blocks))
+
+    def derivatives(self, x):
+        """Residuals and their derivatives by the searched vector, for each block."""
+        return list(self.pool.map(lambda number: self._derivative(x, number), range(len(self.blocks))))
+
+    def _derivative(self, x, number):
+        block, columns = self.blocks[number], self.columns[number]
+        values = self.values(x)
+        residual = block.residual(values)
+        if block.derivative:
+            slopes = np.where(self.logarithmic[columns], [values[key] for key in block.keys], 1.0)
+            return residual, block.derivative(values) * slopes
+        _, high = self.bounds()
+        derivative = np.empty((len(residual), len(columns)))
+        for index, column in enumerate(columns):
+            moved = x.copy()
+            moved[column] += self.steps[column] if x[column] + self.steps[column] <= high[column] else -self.steps[column]
+            derivative[:, index] = (block.residual(self.values(moved)) - residual) / (moved[column] - x[column])
+        return residual, derivative
+
+    def _robust(self, residual):
+        """Residuals whose squares are Huber's cost, and by how much they rise with the residuals."""
+        size = np.abs(residual)
+        far = size > self.huber
+        if not far.any():
+            return residual, np.ones(len(residual))
+        bent = np.sqrt(self.huber * (2.0 * size[far] - self.huber))
+        robust, slope = residual.copy(), np.ones(len(residual))
+        robust[far], slope[far] = np.sign(residual[far]) * bent, self.huber / bent
+        return robust, slope
+
+    def reduced(self, x):
+        cost = sum(float(r @ r) for r in (self._robust(residual)[0] for residual in self.residuals(x)))
+        vector = np.zeros(len(x) + 1)
+        vector[0] = np.sqrt(cost + np.sum((self.weight * (x - self.mean)) ** 2))
+        return vector
+
+    def reduced_jacobian(self, x):
+        """Jacobian of `reduced`: that of all residuals, turned so that they point along the first row."""
+        count = len(x)
+        parts = [np.column_stack([np.diag(self.weight), self.weight * (x - self.mean)])]
+        for columns, (residual, derivative) in zip(self.columns, self.derivatives(x), strict=True):
+            robust, slope = self._robust(residual)
+            triangle = np.linalg.qr(np.column_stack([derivative * slope[:, None], robust]), mode="r")
+            part = np.zeros((len(triangle), count + 1))
+            part[:, columns], part[:, -1] = triangle[:, :-1], triangle[:, -1]
+            parts.append(part)
+        stacked = np.concatenate([*parts, np.zeros((count + 1, count + 1))])
+        triangle = np.linalg.qr(stacked, mode="r")
+        jacobian, residual = triangle[:, :-1], triangle[:, -1]
+        mirror = residual - np.linalg.norm(residual) * np.eye(count + 1)[0]
+        length = mirror @ mirror
+        return jacobian - (2.0 / length) * np.outer(mirror, mirror @ jacobian) if length > 0.0 else jacobian
+
+    def covariance(self, x):
+        """Of the searched vector; and the prior's share of each parameter's information."""
+        count = len(x)
+        prior = np.diag(self.weight**2)
+        normals, scores = [], []
+        for block, columns, (residual, derivative) in zip(self.blocks, self.columns, self.derivatives(x), strict=True):
+            inside = np.abs(residual) <= self.huber
+            pull = np.clip(residual, -self.huber, self.huber)
+            starts = np.flatnonzero(np.diff(block.episode, prepend=block.episode[:1] - 1))
+            for rows in map(slice, starts, [*starts[1:], len(residual)]):
+                normal, score = np.zeros((count, count)), np.zeros(count)
+                own = derivative[rows]
+                normal[np.ix_(columns, columns)] = own.T @ (own * inside[rows, None])
+                score[columns] = own.T @ pull[rows]
+                normals.append(normal)
+                scores.append(score)
+        information = sum(normals) + prior
+        known = np.maximum(np.diag(information), 1e-300)
+        return jackknife(np.array(normals), np.array(scores), prior), np.diag(prior) / known
+
+
+def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None = None) -> np.ndarray:
+    """Covariance of the solution of estimating equations that episodes add up to.
+
+    Each episode is left out in turn, and one Gauss-Newton step taken from the solution of all.
+
+    Args:
+        normals: minus the derivative of each episode's score, shape (episodes, n, n); for least squares J'J.
+        scores: of each episode at the solution, shape (episodes, n); for least squares J'r.
+        prior: inverse covariance of what is known beside the episodes, shape (n, n).
+
+    Returns:
+        Shape (n, n); infinite variance where neither episodes nor prior say anything.
+    """
+    total = normals.sum(axis=0) if prior is None else normals.sum(axis=0) + prior
+    information = np.abs(np.diag(total))
+    known = information > 0.0
+    # Scaled to unit diagonal: the parameters' units differ by orders of magnitude.
+    unit = 1.0 / np.sqrt(np.where(known, information, 1.0))
+    scale = np.outer(unit, unit)
+    moves = np.array(
+        [
+            np.linalg.lstsq((total - normal) * scale, unit * score, rcond=1e-12)[0]
+            for normal, score in zip(normals, scores, strict=True)
+        ]
+    )
+    moves -= moves.mean(axis=0)
+    covariance = (len(moves) - 1) / len(moves) * moves.T @ moves
+    if prior is not None:
+        inverse = np.linalg.pinv(total * scale, rcond=1e-12)
+        covariance += inverse @ (prior * scale) @ inverse.T
+    covariance *= scale
+    covariance[~known, ~known] = np.inf
+    return covariance

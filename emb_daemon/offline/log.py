@@ -1,0 +1,127 @@
+"""A log, read once: samples by the daemon's own pipeline, slow channels, and what reference instruments measured."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.jit import njit
+from emb_daemon.logs.columns import Decoder, References
+from emb_daemon.logs.read import read_frames
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.wire.e2e import crc
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import CORNERS
+
+#: Samples that a pipeline takes in one call; a log is collected piece by piece.
+CAPACITY = 1 << 14
+
+
+@dataclass(frozen=True)
+class SlowChannels:
+    """What is sent more rarely than the motor's frames, at its own times and signal names of dbc/emb.dbc.
+
+    Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out.
+    """
+
+    thermocouples: dict[str, np.ndarray]
+    wheel_speed: dict[str, np.ndarray]
+    status: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Log:
+    """One corner's samples of a log, and what its reference instruments measured.
+
+    Attributes:
+        samples: SAMPLE array, one row per resolver sample; ``brake_torque`` is NaN, as in a car.
+        time_ns: of each sample, on the log's clock.
+        reference: rig instruments; empty in a car.
+        force_N: reference clamp force at each sample, NaN where none was recorded.
+        frames: FRAME array of the slow messages, from which `slow` is decoded when it is asked for.
+    """
+
+    path: Path
+    corner: str
+    samples: np.ndarray
+    time_ns: np.ndarray
+    reference: References
+    force_N: np.ndarray
+    frames: np.ndarray = field(default_factory=lambda: np.zeros(0, FRAME), repr=False)
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """Seconds since the first sample."""
+        return 1e-9 * (self.time_ns - self.time_ns[0])
+
+    @cached_property
+    def slow(self) -> SlowChannels:
+        """Thermocouples, wheel speeds and vehicle status at their own rate."""
+        decoder, frames = Decoder(), self.frames[_crc_is_right(self.frames)]
+        return SlowChannels(*(decoder.columns(frames, message) for message in _slow_messages(self.corner)))
+
+
+def _slow_messages(corner: str) -> tuple[str, str, str]:
+    return f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"
+
+
+@njit
+def _crc_is_right(frames):
+    right = np.empty(len(frames), np.bool_)
+    for row in range(len(frames)):
+        right[row] = crc(frames[row].can_id, frames[row].data) == frames[row].data & np.uint64(0xFF)
+    return right
+
+
+def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
+    """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
+
+    Raises:
+        InputError: unreadable, or no resolver sample of that corner in it.
+    """
+    return log_of(read(path), corner, Path(path))
+
+
+def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:
+    """A FRAME array as samples; ``path`` is what messages call it.
+
+    Raises:
+        InputError: no resolver sample of that corner in it.
+    """
+    pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
+    pipeline.begin(int(frames["time_ns"][0]))
+    return make_log(collect(frames, pipeline), frames, corner, path)
+
+
+def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
+    """All samples that a pipeline finds in frames, going on from where it was."""
+    parts, start = [], 0
+    while start < len(frames):
+        start, count = pipeline.collect(frames, start, predictions=False)
+        parts.append(pipeline.samples[:count].copy())
+    return np.concatenate(parts)
+
+
+def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -> Log:
+    """A corner's samples with what its frames say beside them; errors as in `log_of`."""
+    if not len(samples):
+        raise InputError(f"{path}: no resolver sample of corner {corner} that passes its CRC and counter check")
+    reference = References(frames, corner)
+    times = samples["time_ns"]
+    decoder = Decoder()
+    slow = np.isin(frames["can_id"], [decoder.can_id(message) for message in _slow_messages(corner)])
+    return Log(path, corner, samples, times, reference, reference.at(times, reference.clamp_force_N), frames[slow])
+
+
+def corner_index(corner: str) -> int:
+    """0 to 3.
+
+    Raises:
+        InputError: not a corner.
+    """
+    if corner not in CORNERS:
+        raise InputError(f"corner {corner}: expected one of {', '.join(CORNERS)}")
+    return CORNERS.index(corner)

@@ -1,0 +1,132 @@
+"""The estimator over the samples of a log: the whole step, or its two force paths alone.
+
+One convention for the start, the estimator's own at power-on: at the first sample the motor stands, contact lies
+``parameters["clearance"]`` ahead of its angle, forces have settled there, friction is unknown and nothing is hot. A caller who
+knows the contact angle says so by the clearance: ``contact_angle - samples["angle"][0]``. The settled start is what makes a
+piece out of the middle of a log, which may begin clamped, like a log of its own; a released brake settles at zero force, where
+the whole step begins too, so that paths and whole step give the same forces to the last bit (`tests/test_offline.py`).
+
+What fits move are PARAMETERS; records are cheap, so that callers copy and change them freely.
+"""
+
+import numpy as np
+
+from emb_daemon.effects import paths as effects
+from emb_daemon.estimator.answer import answer
+from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
+from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
+from emb_daemon.estimator.step import step
+from emb_daemon.jit import njit
+
+#: The two force paths at each sample. ``force`` N by the stiffness path; ``torque`` N m left to the clamp force over the cycle
+#: that ends here (NaN where the current says nothing), its ``leverage`` m/rad, mean friction state over the cycle (-1 to 1)
+#: and the state's variance.
+PATHS = np.dtype(
+    [("force", "f8"), ("torque", "f8"), ("leverage", "f8"), ("friction_mean", "f8"), ("friction_variance", "f8")], align=True
+)
+
+#: The whole step at each sample: ``force`` N by the stiffness path, ``torque`` and ``leverage`` as in PATHS, the
+#: ``torque_constant`` N m/A with what effects make of it, friction ``power`` W, pads at 2, 4, 6, 8 mm (inner, then outer)
+#: and disc in degC.
+TRACE = np.dtype(
+    [
+        ("force", "f8"),
+        ("torque", "f8"),
+        ("leverage", "f8"),
+        ("torque_constant", "f8"),
+        ("power", "f8"),
+        ("temperature", "f8", (9,)),
+        ("temperature_known", "?"),
+    ],
+    align=True,
+)
+
+_COLD = np.ones(1)
+
+
+@njit
+def _run_paths(samples, factor, parameters, states, both, out):
+    p, s = parameters[0], states[0]
+    s.started = True
+    s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
+    s.friction_variance = 1.0
+    s.contact_angle = samples[0].angle + p.clearance
+    rest(s, p, position(s, p, samples[0]), factor[0])
+    for row in range(len(samples)):
+        m, o = samples[row], out[row]
+        stiffness_path(s, p, m, factor[row] if len(factor) > 1 else factor[0])
+        o.force = s.force
+        if both:
+            o.torque, o.leverage, _ = torque_path(s, p, m)
+            o.friction_mean, o.friction_variance = s.friction_mean, s.friction_variance
+            s.angle, s.speed = m.angle, m.speed
+
+
+def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
+    """Both force paths, the contact angle held; returns PATHS rows.
+
+    Args:
+        samples: SAMPLE rows, shape (n,), or any rows with their fields.
+        parameters: one PARAMETERS record, or an array of shape (1,).
+        factor: stiffness factor, shape (1,) for all rows or (n,).
+    """
+    out = np.zeros(len(samples), PATHS)
+    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), True, out)
+    return out
+
+
+def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
+    """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`; same arguments."""
+    out = np.zeros(len(samples), PATHS)
+    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), False, out)
+    return out["force"].copy()
+
+
+@njit
+def _run_step(samples, parameters, states, estimate, out):
+    p, s, e = parameters[0], states[0], estimate[0]
+    for row in range(len(samples)):
+        m, o = samples[row], out[row]
+        step(s, p, m, e)
+        factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
+        o.torque_constant = p.torque_constant * factor
+        o.force, o.torque, o.leverage, o.power = e.stiffness_force, s.balance, s.leverage, s.power
+        for side in range(2):
+            for depth in range(4):
+                o.temperature[4 * side + depth] = e.depth[side, depth]
+        o.temperature[8] = e.disc
+        o.temperature_known = s.temperature_known
+
+
+def held(parameters: np.ndarray | np.void) -> np.ndarray:
+    """PARAMETERS, shape (1,), with which the step does not learn the contact angle.
+
+    Learning spreads an error of one path over both and hides a slow effect in an angle that wanders.
+    """
+    fixed = np.atleast_1d(parameters).copy()
+    fixed["clearance_sigma"] = 0.0
+    fixed["contact_walk"] = 0.0
+    return fixed
+
+
+def run_step(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
+    """The whole step from power-on; returns TRACE rows, what `estimate` does not tell. Residuals want `held` parameters."""
+    out = np.zeros(len(samples), TRACE)
+    _run_step(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), out)
+    return out
+
+
+def estimate(
+    samples: np.ndarray, parameters: np.ndarray | np.void, state: np.ndarray | None = None, adaptation=None
+) -> np.ndarray:
+    """The whole step as the daemon runs it; returns ESTIMATE rows.
+
+    Args:
+        parameters: one PARAMETERS record, or an array of one record for each corner or one in all.
+        state: STATE, one or four, carried on if given.
+        adaptation: `adapt.adaptation.Adaptation` that learns meanwhile.
+    """
+    estimates = np.zeros(len(samples), ESTIMATE)
+    answer_all = adaptation.answer if adaptation else answer
+    answer_all(samples, len(samples), new_state() if state is None else state, np.atleast_1d(parameters), estimates)
+    return estimates

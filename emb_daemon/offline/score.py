@@ -1,0 +1,150 @@
+"""Error figures of estimates against reference instruments: the one module in which an RMSE is computed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
+_MOVING = 5.0
+#: Reference force (N) below which the pads hang in the clearance.
+_CLEARANCE_N = 100.0
+#: Wheel speed (rad/s) above which the disc turns, and surface temperature (degC) above which the pads are hot.
+_TURNING = 0.5
+_HOT_C = 100.0
+
+#: Force path: its column of ESTIMATE.
+PATHS = {"stiffness": "stiffness_force", "torque": "torque_force", "maximum_likelihood": "ml_force", "fused": "force"}
+
+
+def rmse(error: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Root of the (weighted) mean square of the finite entries; NaN without any."""
+    error = np.asarray(error)
+    known = np.isfinite(error)
+    if not known.any():
+        return float("nan")
+    return float(np.sqrt(np.average(error[known] ** 2, weights=None if weight is None else weight[known])))
+
+
+def share_inside(error: np.ndarray, sigma: np.ndarray, sigmas: float = 2.0) -> float:
+    """Share of the finite errors that are no larger than ``sigmas`` of their stated standard deviations."""
+    known = np.isfinite(error)
+    return float(np.mean(np.abs(error[known]) <= sigmas * sigma[known])) if known.any() else float("nan")
+
+
+def figures(error: np.ndarray) -> dict[str, float]:
+    """RMSE, bias, 95th percentile and maximum of ``|error|``; NaN entries do not count. Empty input gives no figures."""
+    error = error[np.isfinite(error)]
+    if not len(error):
+        return {"samples": 0}
+    size = np.abs(error)
+    return {
+        "samples": len(error),
+        "rmse": rmse(error),
+        "bias": float(np.mean(error)),
+        "p95": float(np.percentile(size, 95)),
+        "max": float(size.max()),
+    }
+
+
+def conditions(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict[str, np.ndarray]:
+    """Masks over the rows of one log: what the brake was doing. SAMPLE and ESTIMATE rows and reference force."""
+    turning = is_turning(samples)
+    in_contact = reference_N > _CLEARANCE_N
+    speed = samples["speed"]
+    return {
+        "clearance": ~in_contact,
+        "clamping": in_contact & (speed > _MOVING),
+        "releasing": in_contact & (speed < -_MOVING),
+        "holding": in_contact & (np.abs(speed) <= _MOVING),
+        "standing": ~turning,
+        "rotating": turning,
+        "hot": estimates["surface"].max(axis=1) > _HOT_C,
+    }
+
+
+def is_turning(samples: np.ndarray) -> np.ndarray:
+    """Where the disc turns."""
+    return samples["has_wheel_speed"] & (samples["wheel_speed"] > _TURNING)
+
+
+def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
+    """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference."""
+    if not np.isfinite(reference_N).any():
+        return {}
+    masks = conditions(samples, estimates, reference_N)
+    result: dict = {}
+    for path, column in PATHS.items():
+        error = estimates[column] - reference_N
+        result[path] = figures(error) | {
+            "conditions": {name: figures(error[mask]) for name, mask in masks.items() if mask.any()}
+        }
+    result["inside_two_sigma"] = share_inside(estimates["force"] - reference_N, estimates["sigma"])
+    return result
+
+
+def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference) -> dict:
+    """Figures in K for each pad and depth and for the disc, at the reference's own times; empty without a reference.
+
+    ``reference`` is a `logs.columns.References`.
+    """
+    result: dict = {}
+    errors = []
+    for side, name in enumerate(("inner", "outer")):
+        at, values = reference.pads[name]
+        row = _latest(time_ns, at)
+        for index, depth in enumerate((2, 4, 6, 8)):
+            error = np.where(row >= 0, estimates["depth"][row, side, index], np.nan) - values[index]
+            errors.append(error)
+            if np.isfinite(error).any():
+                result[f"{name}_{depth}mm"] = figures(error)
+    if errors and np.isfinite(np.concatenate(errors)).any():
+        result["pads"] = figures(np.concatenate(errors))
+        row = _latest(time_ns, reference.time_ns)
+        result["disc"] = figures(np.where(row >= 0, estimates["disc"][row], np.nan) - reference.disc_C)
+    return result
+
+
+def _latest(time_ns: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Row of the last sample at or before each time; -1 before the first."""
+    return np.searchsorted(time_ns, at, side="right") - 1
+
+
+@dataclass(frozen=True)
+class EpisodeErrors:
+    """Squared errors by path, condition and episode, from which the RMSE over any choice of episodes follows.
+
+    Attributes:
+        sums: of squared errors, shape (paths, conditions, episodes); the last condition is "total".
+        counts: samples, same shape.
+    """
+
+    paths: tuple[str, ...]
+    conditions: tuple[str, ...]
+    sums: np.ndarray
+    counts: np.ndarray
+
+    @classmethod
+    def of(cls, errors: dict[str, np.ndarray], masks: dict[str, np.ndarray], episode: np.ndarray) -> "EpisodeErrors":
+        """From errors by path and masks by condition over the rows of one log; ``episode`` counts from 0, shape (n,)."""
+        masks = masks | {"total": np.ones(len(episode), bool)}
+        shape = (len(errors), len(masks), int(episode[-1]) + 1)
+        sums, counts = np.zeros(shape), np.zeros(shape)
+        for p, error in enumerate(errors.values()):
+            for c, mask in enumerate(masks.values()):
+                valid = mask & np.isfinite(error)
+                sums[p, c] = np.bincount(episode[valid], error[valid] ** 2, minlength=shape[2])
+                counts[p, c] = np.bincount(episode[valid], minlength=shape[2])
+        return cls(tuple(errors), tuple(masks), sums, counts)
+
+    @classmethod
+    def joined(cls, parts: list["EpisodeErrors"]) -> "EpisodeErrors":
+        """Of several logs with the same paths and conditions, one after the other."""
+        sums, counts = (np.concatenate([getattr(part, name) for part in parts], axis=2) for name in ("sums", "counts"))
+        return cls(parts[0].paths, parts[0].conditions, sums, counts)
+
+    def rmse(self, path: str, condition: str = "total", weights: np.ndarray | None = None) -> float:
+        """RMSE in the errors' unit; ``weights`` says how often each episode counts. NaN without samples."""
+        p, c = self.paths.index(path), self.conditions.index(condition)
+        weights = np.ones(self.sums.shape[2]) if weights is None else weights
+        count = float(self.counts[p, c] @ weights)
+        return float(np.sqrt(self.sums[p, c] @ weights / count)) if count else float("nan")

@@ -1,0 +1,212 @@
+"""The offline toolbox: read once, run as the estimator runs, fit what was put in, score in one place."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_rig import draw, pads
+
+import emb_daemon
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.offline import estimate
+from emb_daemon.offline.fit import Block, Fit, Free, fit
+from emb_daemon.offline.run import held, run_paths, run_step, stiffness_force
+from emb_daemon.offline.score import EpisodeErrors, figures, rmse, share_inside
+from emb_daemon.resources import resource
+
+
+@pytest.fixture(scope="module")
+def random_motion():
+    """Samples of a random motor angle, and the shipped calibration's record."""
+    rng = np.random.default_rng(7)
+    samples = pads(draw(rng), rng)[0].logs[1].samples
+    return samples, np.array([to_parameters(load_calibration(resource("config/calibration.yaml")))])
+
+
+def test_paths_alone_and_the_whole_step_start_alike_and_give_the_same_forces(random_motion):
+    samples, parameters = random_motion
+    # Without thermocouples the pads count as cold, and with the contact angle held nothing else moves the stiffness path.
+    parameters = held(parameters)
+    step, paths = run_step(samples, parameters), run_paths(samples, parameters)
+    assert np.array_equal(step["force"], estimate(samples, parameters)["stiffness_force"])
+    assert np.array_equal(paths["force"], step["force"])
+    assert np.array_equal(stiffness_force(samples, parameters), step["force"])
+    assert np.array_equal(paths["torque"], step["torque"], equal_nan=True)
+    assert np.array_equal(paths["leverage"][1:], step["leverage"][1:])
+    assert step["force"].max() > 5000.0 and np.isfinite(paths["torque"]).mean() > 0.9
+
+
+def test_a_piece_out_of_a_log_begins_settled(random_motion):
+    """Cut at the top of a slow clamp, the piece gives the whole log's forces but for what hysteresis remembers."""
+    _, parameters = random_motion
+    rng = np.random.default_rng(7)
+    samples = pads(draw(rng), rng)[0].logs[0].samples
+    whole = stiffness_force(samples, parameters)
+    cut = int(np.argmax(samples["angle"]))
+    piece = parameters.copy()
+    piece["clearance"] += samples["angle"][0] - samples["angle"][cut]
+    assert np.max(np.abs(stiffness_force(samples[cut:], piece) - whole[cut:])) < 0.04 * whole[cut]
+
+
+# -- fit ------------------------------------------------------------------------------------------------------------------
+
+
+def _decay(time, amplitude, rate, offset):
+    return amplitude * np.exp(-rate * time) + offset
+
+
+def _coloured(rng, count, correlation=0.95):
+    noise, state = np.zeros(count), 0.0
+    for row, drive in enumerate(rng.normal(size=count)):
+        state = correlation * state + np.sqrt(1.0 - correlation**2) * drive
+        noise[row] = state
+    return noise
+
+
+def _two_logs(rng, noise) -> Fit:
+    """Two logs that share amplitude and rate, each with an offset of its own."""
+    time = np.linspace(0.0, 4.0, 1000)
+    blocks = []
+    for name, offset in (("offset 0", 1.0), ("offset 1", -2.0)):
+        data = _decay(time, 3.0, 0.8, offset) + noise(rng, len(time))
+
+        def residual(v, data=data, name=name):
+            return _decay(time, v["amplitude"], v["rate"], v[name]) - data
+
+        blocks.append(Block(residual, ("amplitude", "rate", name), np.arange(len(time)) // 100))
+    return fit(
+        blocks,
+        {
+            "amplitude": Free(1.0, 1e-4, 0.0, 100.0, logarithmic=True),
+            "rate": Free(0.3, 1e-5, low=0.0),
+            "offset 0": Free(0.0, 1e-5),
+            "offset 1": Free(0.0, 1e-5),
+        },
+    )
+
+
+_TRUTH = {"amplitude": 3.0, "rate": 0.8, "offset 0": 1.0, "offset 1": -2.0}
+
+
+def test_fit_recovers_what_was_put_in():
+    found = _two_logs(np.random.default_rng(1), lambda rng, n: np.zeros(n))
+    assert found.values == pytest.approx(_TRUTH, rel=1e-6)
+    assert found.converged and not found.at_bound and found.rms < 1e-6
+
+
+def test_sigmas_are_the_spread_of_many_fits_with_autocorrelated_noise():
+    rng = np.random.default_rng(2)
+    fits = [_two_logs(rng, lambda rng, n: 0.1 * _coloured(rng, n)) for _ in range(150)]
+    for key, truth in _TRUTH.items():
+        values = np.array([found.values[key] for found in fits])
+        spread = np.sqrt(np.mean((values - truth) ** 2))
+        stated = np.sqrt(np.mean([found.sigmas[key] ** 2 for found in fits]))
+        assert stated == pytest.approx(spread, rel=0.3), key
+    # Between values too: amplitude and rate of one decay go together.
+    correlation = np.corrcoef([[found.values[key] for key in ("amplitude", "rate")] for found in fits], rowvar=False)[0, 1]
+    blocks = [found.block(("amplitude", "rate")) for found in fits]
+    assert np.mean([b[0, 1] / np.sqrt(b[0, 0] * b[1, 1]) for b in blocks]) == pytest.approx(correlation, abs=0.15)
+
+
+def _line(data, sigma=1.0, **options):
+    """Offset and slope of data over 0 to 1; an episode has five samples."""
+    x = np.linspace(0.0, 1.0, len(data))
+    block = Block(lambda v: (v["offset"] + v["slope"] * x - data) / sigma, ("offset", "slope"), np.arange(len(data)) // 5)
+    free = {"offset": Free(0.0, 1e-3), "slope": Free(0.0, 1e-3)} | options.pop("free", {})
+    return fit([block], free, **options)
+
+
+def test_bounds_hold_and_are_told():
+    found = _line(1.0 + 3.0 * np.linspace(0.0, 1.0, 100), free={"slope": Free(0.0, 1e-3, -1.0, 2.0)})
+    assert found.values["slope"] == pytest.approx(2.0)
+    assert found.values["offset"] == pytest.approx(1.5)
+    assert found.at_bound == {"slope"}
+
+
+def test_a_prior_weighs_as_much_as_it_says():
+    """Data and prior of equal information meet half way; a parameter that only its prior knows keeps that prior's sigma."""
+    block = Block(lambda v: np.repeat(v["a"] - 2.0, 100), ("a",), np.arange(100))
+    found = fit([block], {"a": Free(0.0, 1e-3, prior=(0.0, 0.1)), "b": Free(5.0, 1e-3, prior=(5.0, 0.7))})
+    assert found.values == pytest.approx({"a": 1.0, "b": 5.0})
+    assert found.from_prior == pytest.approx({"a": 0.5, "b": 1.0})
+    assert found.sigmas["b"] == pytest.approx(0.7)
+
+
+def test_what_nothing_tells_has_an_infinite_sigma():
+    block = Block(lambda v: np.array([v["a"] - 1.0, v["a"] - 1.1]), ("a", "b"), np.arange(2))
+    found = fit([block], {"a": Free(0.0, 1e-3), "b": Free(5.0, 1e-3)})
+    assert found.values == pytest.approx({"a": 1.05, "b": 5.0})
+    assert found.sigmas["b"] == np.inf and np.isfinite(found.sigmas["a"])
+
+
+def test_a_given_derivative_does_what_difference_quotients_do():
+    data = 2.0 + np.random.default_rng(5).normal(size=50)
+    quotients = fit([Block(lambda v: np.exp(v["a"]) - data, ("a",), np.arange(50))], {"a": Free(0.0, 1e-6)})
+    block = Block(lambda v: np.exp(v["a"]) - data, ("a",), np.arange(50), lambda v: np.full((50, 1), np.exp(v["a"])))
+    given = fit([block], {"a": Free(0.0, 1e-6)})
+    assert given.values["a"] == pytest.approx(quotients.values["a"], abs=1e-6)
+    assert given.sigmas["a"] == pytest.approx(quotients.sigmas["a"], rel=1e-4)
+
+
+def test_huber_leaves_gross_errors_little_say():
+    rng = np.random.default_rng(3)
+    data = 1.0 + 3.0 * np.linspace(0.0, 1.0, 400) + rng.normal(0.0, 0.1, 400)
+    data[::20] += 50.0
+    plain, robust = _line(data, 0.1), _line(data, 0.1, huber=2.5)
+    assert abs(plain.values["offset"] - 1.0) > 1.0
+    assert robust.values == pytest.approx({"offset": 1.0, "slope": 3.0}, abs=0.1)
+    assert robust.sigmas["offset"] < 0.05
+
+
+# -- score ----------------------------------------------------------------------------------------------------------------
+
+
+def test_figures_of_known_errors():
+    error = np.array([3.0, -4.0, np.nan, 0.0, 0.0])
+    assert figures(error) == pytest.approx({"samples": 4, "rmse": 2.5, "bias": -0.25, "p95": 3.85, "max": 4.0})
+    assert figures(np.full(3, np.nan)) == {"samples": 0}
+    assert rmse(np.array([1.0, 3.0]), np.array([3.0, 1.0])) == pytest.approx(np.sqrt(3.0))
+    assert share_inside(error, np.full(5, 1.6)) == 0.75
+    assert share_inside(error, np.full(5, 1.6), sigmas=1.0) == 0.5
+
+
+def test_episode_errors_are_those_of_the_samples_chosen():
+    rng = np.random.default_rng(4)
+    error, episode = rng.normal(size=300), np.repeat(np.arange(3), 100)
+    mask = rng.random(300) > 0.5
+    once = EpisodeErrors.of({"fused": error}, {"holding": mask}, episode)
+    assert once.rmse("fused") == pytest.approx(rmse(error))
+    assert once.rmse("fused", "holding", np.array([0.0, 2.0, 0.0])) == pytest.approx(rmse(error[(episode == 1) & mask]))
+    twice = EpisodeErrors.joined([once, once])
+    assert twice.sums.shape == (1, 2, 6) and twice.rmse("fused") == pytest.approx(once.rmse("fused"))
+
+
+def _mean_of_squares(node: ast.AST) -> bool:
+    """``mean``, ``nanmean`` or ``average`` of something squared."""
+    if not isinstance(node, ast.Call) or ast.unparse(node.func).rpartition(".")[2] not in ("mean", "nanmean", "average"):
+        return False
+    squared = (ast.unparse(part) for argument in node.args for part in ast.walk(argument) if isinstance(part, ast.BinOp))
+    return any(text.endswith("** 2") for text in squared)
+
+
+#: Packages of the box, which cannot know the bench: what they square and average judges no estimate.
+#: `adapt/fit.py` squares and averages the difference between two fits of its own.
+_BOX = {"wire", "models", "effects", "estimator", "calibration", "adapt", "runtime"}
+
+
+def _is_root(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and ast.unparse(node.func) in ("np.sqrt", "sqrt", "math.sqrt")
+
+
+def test_an_rmse_is_computed_in_one_module():
+    package = Path(emb_daemon.__file__).parent
+    found = set()
+    for path in package.rglob("*.py"):
+        if path.relative_to(package).parts[0] not in _BOX:
+            roots = filter(_is_root, ast.walk(ast.parse(path.read_text())))
+            if any(_mean_of_squares(argument) for root in roots for argument in root.args):
+                found.add(str(path.relative_to(package)))
+    left = {name for name in found if name.startswith(("identify/", "diagnose/", "demo/", "report/"))}
+    assert found - left == {"offline/score.py"}
