@@ -142,6 +142,20 @@ def fit(
     )
 
 
+def _triangle(tall: np.ndarray) -> np.ndarray:
+    """R of a QR decomposition, by pieces small enough that no BLAS shares them among threads, which would wait for each
+    other on a busy machine."""
+    count = tall.shape[1]
+    rows = max(256, 4 * count)
+    pieces = np.zeros((-(-len(tall) // rows), rows, count))
+    pieces.reshape(-1, count)[: len(tall)] = tall
+    while len(pieces) > 1:
+        triangles = np.linalg.qr(pieces, mode="r")
+        triangles = np.concatenate([triangles, np.zeros((-len(triangles) % 4, count, count))])
+        pieces = triangles.reshape(-1, 4 * count, count)
+    return np.linalg.qr(pieces[0], mode="r")
+
+
 class _Problem:
     """Blocks and priors as functions of the vector that is searched."""
 
@@ -216,12 +230,12 @@ class _Problem:
         parts = [np.column_stack([np.diag(self.weight), self.weight * (x - self.mean)])]
         for columns, (residual, derivative) in zip(self.columns, self.derivatives(x), strict=True):
             robust, slope = self._robust(residual)
-            triangle = np.linalg.qr(np.column_stack([derivative * slope[:, None], robust]), mode="r")
+            triangle = _triangle(np.column_stack([derivative * slope[:, None], robust]))
             part = np.zeros((len(triangle), count + 1))
             part[:, columns], part[:, -1] = triangle[:, :-1], triangle[:, -1]
             parts.append(part)
         stacked = np.concatenate([*parts, np.zeros((count + 1, count + 1))])
-        triangle = np.linalg.qr(stacked, mode="r")
+        triangle = _triangle(stacked)
         jacobian, residual = triangle[:, :-1], triangle[:, -1]
         mirror = residual - np.linalg.norm(residual) * np.eye(count + 1)[0]
         length = mirror @ mirror
