@@ -25,9 +25,11 @@ LAWS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ThicknessStep(Step):
-    """Attributes:
-    curves: one per thickness.
-    laws: `thickness_laws`.
+    """Curves over pad thickness; nothing of the calibration.
+
+    Attributes:
+        curves: one per thickness.
+        laws: `thickness_laws`.
     """
 
     curves: list[CurveFit]
