@@ -27,7 +27,7 @@ _NAN = float("nan")
 
 class Answer(NamedTuple):
     """One estimate: force and its standard deviation in N, what they rest on, pad temperatures in degC (NaN before they are
-    known), and why to doubt them."""
+    known), and why not to trust them."""
 
     force_N: float
     sigma_N: float

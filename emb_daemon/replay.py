@@ -61,6 +61,10 @@ class Replay:
         state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
+
+    Attributes:
+        corners: that are estimated; of ``all`` known with the first log.
+        adaptation: what learns, if there is a state folder.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class Replay:
         self._memory = Memory(state) if state else None
         self._end_ns: int | None = None
         self._pipeline: Pipeline | None = None
+        self.adaptation: Adaptation | None = None
         self.corners: tuple[str, ...] = ()
         if corner != ALL:
             self._build((CORNERS[corner_index(corner)],))
@@ -83,8 +88,8 @@ class Replay:
         self.corners = corners
         parameters = np.full(4, to_parameters(self._calibration), PARAMETERS)
         calibrations = dict.fromkeys(corners, self._calibration)
-        adaptation = Adaptation(calibrations, self._memory, int) if self._memory else None
-        self._pipeline = Pipeline(parameters, corners, capacity=CAPACITY, adaptation=adaptation)
+        self.adaptation = Adaptation(calibrations, self._memory, int) if self._memory else None
+        self._pipeline = Pipeline(parameters, corners, capacity=CAPACITY, adaptation=self.adaptation)
 
     def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
         """Put a log's times on the drive's clock, in place; returns what was added."""
@@ -128,7 +133,7 @@ class Replay:
         if self._measured_torque:
             for corner, log in logs.items():
                 samples["brake_torque"][mine[corner]] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
-        estimates = estimate(samples, pipeline.parameters, pipeline.states, pipeline.adaptation)
+        estimates = estimate(samples, pipeline.parameters, pipeline.states, self.adaptation)
         return [
             Result(log.path, log.time_ns - shift, estimates[mine[corner]], samples[mine[corner]], log.reference, log.force_N)
             for corner, log in logs.items()

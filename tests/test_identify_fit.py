@@ -48,8 +48,8 @@ def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_t
     found = fit_torque(logs, sheet)
     assert found.values["torque_constant_Nm_per_A"] == pytest.approx(constant, rel=0.01)
     campaign = Campaign(Path("campaign.yaml"), CampaignFile(rig="X", datasheet="datasheet.yaml"), sheet)
-    campaign.compare_withdatasheet("motor.torque_constant_Nm_per_A", found.values["torque_constant_Nm_per_A"])
-    campaign.compare_withdatasheet("motor.inertia_kg_m2", inertia)
+    campaign.compare_with_datasheet("motor.torque_constant_Nm_per_A", found.values["torque_constant_Nm_per_A"])
+    campaign.compare_with_datasheet("motor.inertia_kg_m2", inertia)
     (fault,) = campaign.faults
     assert fault.startswith("motor.torque_constant_Nm_per_A: identified") and "within 15 %" in fault
 

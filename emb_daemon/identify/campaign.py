@@ -22,6 +22,9 @@ from emb_daemon.wire.layout import load_database
 
 #: Relative tolerance of a datasheet's values where it states none: two standard deviations.
 _TOLERANCE = 0.15
+#: Turning points of the motor angle per second of motion that tell a slow clamp from random motion.
+SLOW, RANDOM = (0.0, 1.0), (1.0, 100.0)
+NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.
 _SPEED_TOLERANCE = 0.2
 

@@ -7,16 +7,13 @@ from msgspec.structs import replace
 
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, Campaign
 from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.score import force_figures
 from emb_daemon.report import BAND, MODEL, PALE, REFERENCE, Page, Panel, Trace, time_figure
 
-#: Turning points per second of motion that tell random motion from a slow clamp.
-RANDOM = (1.0, 100.0)
-_NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 _NEED_INTEGRATED = "training and braking heat at full frame rate"
 _PATHS = ("stiffness", "torque", "maximum_likelihood", "fused")
@@ -76,12 +73,12 @@ def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep
             campaign.fault(f"{kind}: {log.path}: {error}; not judged")
 
     for entry in campaign.file.adaptation:
-        log = campaign.load_motion(entry.judge, "adaptation.judge", _NEED_RANDOM, reversals=RANDOM)
+        log = campaign.load_motion(entry.judge, "adaptation.judge", NEED_RANDOM, reversals=RANDOM)
         add(entry, "predicted", f"random, {campaign.thickness(entry):g} mm, curve predicted", log)
     gears = dict(torque.gears)
     for entry in campaign.file.gear_wear:
         if entry.judge is not None and entry.training in gears:
-            log = campaign.load_motion(entry.judge, "gear_wear.judge", _NEED_RANDOM, reversals=RANDOM)
+            log = campaign.load_motion(entry.judge, "gear_wear.judge", NEED_RANDOM, reversals=RANDOM)
             # Wear changes friction; motor and inertia stay.
             worn = replace(ours, friction=gears[entry.training].friction())
             add(entry, "gear", f"{_stem(entry.judge)}, curve predicted", log, worn)

@@ -7,18 +7,11 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.errors import InputError
 from emb_daemon.identify.calibration import assemble, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import Pads
-from emb_daemon.identify.judge import RANDOM, Judged, judge, judge_others
+from emb_daemon.identify.judge import Judged, judge, judge_others
 from emb_daemon.identify.steps import Step, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
-
-#: Turning points per second of motion of a slow clamp.
-_SLOW = (0.0, 1.0)
-_NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
-_NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
 
 Progress = Callable[[float, str], None]
 
@@ -56,7 +49,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     """
     begin = time.monotonic()
     progress(0.0, "reading logs")
-    pads = load_pads(campaign)
+    pads = thickness.load_pads(campaign)
     progress(0.05, "characteristic curves and dynamics")
     stiff = stiffness.identify(pads, campaign.datasheet.actuator.rated_clamp_force_N)
     progress(0.3, "torque path")
@@ -84,32 +77,3 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     progress(1.0, "done")
     seconds = time.monotonic() - begin
     return Identification(campaign, stiff, motor, zero, folds, thick, levels, heat, judged, calibration, seconds)
-
-
-def load_pads(campaign: Campaign) -> list[Pads]:
-    """Slow and random logs by pad thickness, thinnest first.
-
-    Raises:
-        InputError: none can serve, or the campaign's pads are too far from every measured thickness.
-    """
-    logs: dict[float, list] = {}
-    for entries, part, need, reversals in (
-        (campaign.file.curves, "curves", _NEED_CURVE, _SLOW),
-        (campaign.file.random, "random", _NEED_RANDOM, RANDOM),
-    ):
-        for entry in entries:
-            log = campaign.load_motion(entry.log, part, need, reversals=reversals)
-            if log is not None:
-                logs.setdefault(campaign.thickness(entry), []).append(log)
-    pads = [Pads(thickness_mm, tuple(logs[thickness_mm])) for thickness_mm in sorted(logs)]
-    try:
-        if not pads:
-            raise InputError(f"curves, random: no usable log; needed: {_NEED_CURVE}")
-        thickness.check_thickness(pads, campaign.pad_thickness_mm)
-    except InputError as error:
-        raise InputError("\n".join([*campaign.faults, f"{campaign.path}: {error}"])) from None
-    if not any(own.random for own in pads):
-        campaign.fault(
-            f"random: no usable log, so that relaxation rests on slow clamps, which hardly show it; needed: {_NEED_RANDOM}"
-        )
-    return pads

@@ -6,7 +6,6 @@ the Jacobian of half a million samples, most of it zeros, never stands in memory
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -100,7 +99,6 @@ def fit(
     huber: float = np.inf,
     tolerance: float = 1e-8,
     evaluations: int = 100,
-    workers: int = 1,
 ) -> Fit:
     """Values that make the residuals small.
 
@@ -108,24 +106,22 @@ def fit(
         huber: residuals beyond it count linearly (Huber 1964).
         tolerance: relative fall of the cost that ends the search.
         evaluations: limit of the residual's evaluations, not counting derivatives.
-        workers: threads among which blocks are shared; residuals must then not write to anything shared.
     """
-    with ThreadPoolExecutor(workers) as pool:
-        problem = _Problem(blocks, free, huber, pool)
-        low, high = problem.bounds()
-        found = least_squares(
-            problem.reduced,
-            np.clip(problem.start, low, high),
-            problem.reduced_jacobian,
-            bounds=(low, high),
-            x_scale="jac",
-            ftol=tolerance,
-            xtol=1e-12,
-            gtol=None,
-            max_nfev=evaluations,
-        )
-        residuals = problem.residuals(found.x)
-        covariance, from_prior = problem.covariance(found.x)
+    problem = _Problem(blocks, free, huber)
+    low, high = problem.bounds()
+    found = least_squares(
+        problem.reduced,
+        np.clip(problem.start, low, high),
+        problem.reduced_jacobian,
+        bounds=(low, high),
+        x_scale="jac",
+        ftol=tolerance,
+        xtol=1e-12,
+        gtol=None,
+        max_nfev=evaluations,
+    )
+    residuals = problem.residuals(found.x)
+    covariance, from_prior = problem.covariance(found.x)
     unit = np.where(problem.logarithmic, np.exp(np.where(problem.logarithmic, found.x, 0.0)), 1.0)
     covariance = covariance * np.outer(unit, unit)
     near = (found.x - low <= problem.steps) | (high - found.x <= problem.steps)
@@ -142,11 +138,25 @@ def fit(
     )
 
 
+def _triangle(tall: np.ndarray) -> np.ndarray:
+    """R of a QR decomposition, by pieces small enough that no BLAS shares them among threads, which would wait for each
+    other on a busy machine."""
+    count = tall.shape[1]
+    rows = max(256, 4 * count)
+    pieces = np.zeros((-(-len(tall) // rows), rows, count))
+    pieces.reshape(-1, count)[: len(tall)] = tall
+    while len(pieces) > 1:
+        triangles = np.linalg.qr(pieces, mode="r")
+        triangles = np.concatenate([triangles, np.zeros((-len(triangles) % 4, count, count))])
+        pieces = triangles.reshape(-1, 4 * count, count)
+    return np.linalg.qr(pieces[0], mode="r")
+
+
 class _Problem:
     """Blocks and priors as functions of the vector that is searched."""
 
-    def __init__(self, blocks, free, huber, pool):
-        self.blocks, self.free, self.huber, self.pool = blocks, free, huber, pool
+    def __init__(self, blocks, free, huber):
+        self.blocks, self.free, self.huber = blocks, free, huber
         self.keys = tuple(free)
         row = {key: index for index, key in enumerate(self.keys)}
         self.columns = [np.array([row[key] for key in block.keys], int) for block in blocks]
@@ -172,11 +182,11 @@ class _Problem:
 
     def residuals(self, x):
         values = self.values(x)
-        return list(self.pool.map(lambda block: block.residual(values), self.blocks))
+        return [block.residual(values) for block in self.blocks]
 
     def derivatives(self, x):
         """Residuals and their derivatives by the searched vector, for each block."""
-        return list(self.pool.map(lambda number: self._derivative(x, number), range(len(self.blocks))))
+        return [self._derivative(x, number) for number in range(len(self.blocks))]
 
     def _derivative(self, x, number):
         block, columns = self.blocks[number], self.columns[number]
@@ -216,12 +226,12 @@ class _Problem:
         parts = [np.column_stack([np.diag(self.weight), self.weight * (x - self.mean)])]
         for columns, (residual, derivative) in zip(self.columns, self.derivatives(x), strict=True):
             robust, slope = self._robust(residual)
-            triangle = np.linalg.qr(np.column_stack([derivative * slope[:, None], robust]), mode="r")
+            triangle = _triangle(np.column_stack([derivative * slope[:, None], robust]))
             part = np.zeros((len(triangle), count + 1))
             part[:, columns], part[:, -1] = triangle[:, :-1], triangle[:, -1]
             parts.append(part)
         stacked = np.concatenate([*parts, np.zeros((count + 1, count + 1))])
-        triangle = np.linalg.qr(stacked, mode="r")
+        triangle = _triangle(stacked)
         jacobian, residual = triangle[:, :-1], triangle[:, -1]
         mirror = residual - np.linalg.norm(residual) * np.eye(count + 1)[0]
         length = mirror @ mirror

@@ -45,7 +45,7 @@ _COLD = np.ones(1)
 
 
 @njit
-def _run_paths(samples, factor, parameters, states, both, out):
+def _run_paths(samples, factor, parameters, states, force, out):
     p, s = parameters[0], states[0]
     s.started = True
     s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
@@ -53,10 +53,11 @@ def _run_paths(samples, factor, parameters, states, both, out):
     s.contact_angle = samples[0].angle + p.clearance
     rest(s, p, position(s, p, samples[0]), factor[0])
     for row in range(len(samples)):
-        m, o = samples[row], out[row]
+        m = samples[row]
         stiffness_path(s, p, m, factor[row] if len(factor) > 1 else factor[0])
-        o.force = s.force
-        if both:
+        force[row] = s.force
+        if len(out) > 0:
+            o = out[row]
             o.torque, o.leverage, _ = torque_path(s, p, m)
             o.friction_mean, o.friction_variance = s.friction_mean, s.friction_variance
             s.angle, s.speed = m.angle, m.speed
@@ -70,16 +71,17 @@ def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.
         parameters: one PARAMETERS record, or an array of shape (1,).
         factor: stiffness factor, shape (1,) for all rows or (n,).
     """
-    out = np.zeros(len(samples), PATHS)
-    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), True, out)
+    force, out = np.empty(len(samples)), np.zeros(len(samples), PATHS)
+    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
+    out["force"] = force
     return out
 
 
 def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
     """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`; same arguments."""
-    out = np.zeros(len(samples), PATHS)
-    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), False, out)
-    return out["force"].copy()
+    force = np.empty(len(samples))
+    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, np.zeros(0, PATHS))
+    return force
 
 
 @njit

@@ -57,7 +57,7 @@ def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]
         rows.append((f"mode: {name}", estimates["mode"] == code, _STRETCH))
     rows = [row for row in rows if row[1].any()]
     traces = [_row(name, time_s, active, float(height), style) for height, (name, active, style) in enumerate(rows)]
-    return Panel("Mode, source and reasons for doubt", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
+    return Panel("Mode, source and reasons", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
 
 
 def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> list[Panel]:
@@ -205,9 +205,9 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
     time_s = 1e-9 * (estimates["time_ns"] - estimates["time_ns"][0])
     by_log = [result.figures() for result in results]
     page = Page(f"Replay, corner {corner}", f"{', '.join(result.path.name for result in results)} · emb-daemon {__version__}")
-    doubtful = float(np.mean(estimates["reasons"] != 0))
+    flagged = float(np.mean(estimates["reasons"] != 0))
     details = [
-        f"{len(estimates)} samples, {time_s[-1]:.1f} s; a reason for doubt in {100.0 * doubtful:.1f} % of them.",
+        f"{len(estimates)} samples, {time_s[-1]:.1f} s; {100.0 * flagged:.1f} % of them with a reason not to trust them.",
         f"Calibration: {described}.",
     ]
     known = np.isfinite(force_N)

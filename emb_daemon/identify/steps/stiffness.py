@@ -56,12 +56,14 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class StiffnessStep(Step):
-    """Attributes:
-    pads: the logs.
-    fit: over all pads at once.
-    candidates: structures that were compared.
-    chosen: the one that was taken.
-    separate: fits of each pair of pads alone, where it has random logs.
+    """Curves, dynamics and effects.
+
+    Attributes:
+        pads: the logs.
+        fit: over all pads at once.
+        candidates: structures that were compared.
+        chosen: the one that was taken.
+        separate: fits of each pair of pads alone, where it has random logs.
     """
 
     pads: list[Pads]

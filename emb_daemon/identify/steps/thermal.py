@@ -49,11 +49,13 @@ class Temperatures:
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalStep(Step):
-    """Attributes:
-    fitted: recordings that fitted, by name.
-    heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-    figures: RMSE on logs that fitted nothing, by name with unit.
-    residuals: the same for what was fitted.
+    """Thermal section.
+
+    Attributes:
+        fitted: recordings that fitted, by name.
+        heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
+        figures: RMSE on logs that fitted nothing, by name with unit.
+        residuals: the same for what was fitted.
     """
 
     fitted: dict[str, Recording]

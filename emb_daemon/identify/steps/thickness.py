@@ -1,4 +1,4 @@
-"""How curves vary with pad thickness, and what predicting one from others costs."""
+"""Logs by pad thickness, how curves vary with it, and what predicting one from others costs."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,14 @@ import numpy as np
 
 from emb_daemon.calibration.types import Curve, curve_at
 from emb_daemon.errors import InputError
+from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, SLOW, Campaign
 from emb_daemon.identify.dynamics import TERMS, CurveFit, Pads, powers
 from emb_daemon.identify.steps import Step
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import Page, Panel, Trace, shades, xy_figure
 from emb_daemon.report.figures import Style
 
+_NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
 #: Laws for each coefficient a over thickness: (degree of the polynomial, what is straight, and back); None is the one used.
 LAWS = {
     "1/a straight between neighbours (used)": None,
@@ -23,9 +25,11 @@ LAWS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ThicknessStep(Step):
-    """Attributes:
-    curves: one per thickness.
-    laws: `thickness_laws`.
+    """Curves over pad thickness; nothing of the calibration.
+
+    Attributes:
+        curves: one per thickness.
+        laws: `thickness_laws`.
     """
 
     curves: list[CurveFit]
@@ -47,7 +51,36 @@ class ThicknessStep(Step):
         return curvature * abs((thickness_mm - thicknesses[upper - 1]) * (thicknesses[upper] - thickness_mm))
 
 
-def check_thickness(pads: list[Pads], thickness_mm: float) -> None:
+def load_pads(campaign: Campaign) -> list[Pads]:
+    """Slow and random logs by pad thickness, thinnest first.
+
+    Raises:
+        InputError: none can serve, or the campaign's pads are too far from every measured thickness.
+    """
+    logs: dict[float, list] = {}
+    for entries, part, need, reversals in (
+        (campaign.file.curves, "curves", _NEED_CURVE, SLOW),
+        (campaign.file.random, "random", NEED_RANDOM, RANDOM),
+    ):
+        for entry in entries:
+            log = campaign.load_motion(entry.log, part, need, reversals=reversals)
+            if log is not None:
+                logs.setdefault(campaign.thickness(entry), []).append(log)
+    pads = [Pads(thickness_mm, tuple(logs[thickness_mm])) for thickness_mm in sorted(logs)]
+    try:
+        if not pads:
+            raise InputError(f"curves, random: no usable log; needed: {_NEED_CURVE}")
+        _check_thickness(pads, campaign.pad_thickness_mm)
+    except InputError as error:
+        raise InputError("\n".join([*campaign.faults, f"{campaign.path}: {error}"])) from None
+    if not any(own.random for own in pads):
+        campaign.fault(
+            f"random: no usable log, so that relaxation rests on slow clamps, which hardly show it; needed: {NEED_RANDOM}"
+        )
+    return pads
+
+
+def _check_thickness(pads: list[Pads], thickness_mm: float) -> None:
     """Raises InputError if pads of a thickness are too far from every measured one for a calibration."""
     table = tuple(Curve(pad_thickness_mm=own.thickness_mm, coefficients=(1.0,)) for own in pads)
     try:

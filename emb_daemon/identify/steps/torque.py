@@ -67,10 +67,12 @@ class TorqueFit:
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueStep(Step):
-    """Attributes:
-    fit: over all logs of the campaign's pads.
-    log: one of them, to be shown.
-    gears: (training log, fit) for each state of wear of the gear.
+    """Motor and friction.
+
+    Attributes:
+        fit: over all logs of the campaign's pads.
+        log: one of them, to be shown.
+        gears: (training log, fit) for each state of wear of the gear.
     """
 
     fit: TorqueFit
