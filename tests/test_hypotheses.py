@@ -63,3 +63,266 @@ def _end(p, rows, force, stops=4):
     error = (estimates["force"] - force)[clamped]
     off = np.abs(error) / estimates["sigma"][clamped]
     return np.sqrt(np.mean(error**2)), off.max(), np.mean(off > 3.0), np.median(estimates["sigma"][clamped]), state[0], estimates
+
+
+def _scaled(names, factor):
+    def change(true):
+        for name in names:
+            true[name] = true[name] * factor
+
+    return change
+
+
+def _shifted(amperes):
+    def change(rows):
+        rows["current_q"] += amperes
+
+    return change
+
+
+def _learned(p, state):
+    """What the first hypothesis holds for changed: contact in micrometres, the rest as shares, the offset in amperes."""
+    x = state["error"]
+    return {
+        "contact": (state["contact_angle"] - p["clearance"]) * p["gear_gain"] * 1e6,
+        "scale": state["scale"] - 1.0,
+        "offset": x[OFFSET] / p["torque_constant"],
+        "load": x[LOAD] / p["load_friction"],
+        "coulomb": x[COULOMB] / p["offset_friction"],
+    }
+
+
+#: What may be found where nothing has changed, in the units of `_learned`.
+_NOTHING = {"contact": 5.0, "scale": 0.02, "offset": 0.1, "load": 0.05, "coulomb": 0.1}
+_FRICTION = ("load_friction", "offset_friction")
+_CHANGES = {
+    "knock-back": ({"angle_m": 40e-6}, {"contact": 40.0}),
+    "growth": ({"angle_m": -40e-6}, {"contact": -40.0}),
+    "stiffer pads": ({"change": _scaled(["curve"], 1.25)}, {"scale": 0.25}),
+    "softer pads": ({"change": _scaled(["curve"], 0.75)}, {"scale": -0.25}),
+    "offset of the current": ({"current": _shifted(-1.0)}, {"offset": -1.0}),
+    "worn gear": ({"change": _scaled(_FRICTION, 1.5)}, {"load": 0.5, "coulomb": 0.5}),
+}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("name", _CHANGES)
+def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
+    """After the fourth stop the brake is another. Two stops later the force is right, its sigma small and honest, the change is
+    held for what it is and nothing else took a part of it; until then no error beyond three sigma lasts a tenth of a second
+    without being said."""
+    change, expected = _CHANGES[name]
+    rows, force = _drive(p, seed=seed, **change)
+    rmse, worst, beyond, sigma, state, estimates = _end(p, rows, force, stops=6)
+    assert rmse < 100.0 and sigma < 150.0 and worst < 4.0 and beyond < 0.01
+    learned = _learned(p, state)
+    for what, nothing in _NOTHING.items():
+        assert learned[what] == pytest.approx(expected.get(what, 0.0), abs=max(nothing, 0.15 * abs(expected.get(what, 0.0)))), what
+    silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
+    assert _longest(silent) <= 25
+    assert not estimates["reasons"][-6 * _STOP :].any()
+
+
+def _longest(mask):
+    """Length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+@pytest.mark.xfail(strict=True, reason="the contact angle takes 6 um of a positive offset that comes at standstill, and keeps them")
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_offset_that_closes_is_the_currents_too(p, seed):
+    rows, force = _drive(p, seed=seed, stops=14, current=_shifted(1.0))
+    rmse, worst, _, _, state, _ = _end(p, rows, force)
+    assert worst < 4.0 and _learned(p, state)["offset"] == pytest.approx(1.0, abs=0.1)
+    assert rmse < 100.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_motor_that_fades_with_heat_takes_no_stiffness_with_it(p, seed):
+    """The torque constant loses a fifth over four minutes of stops: the torque path's gain follows."""
+    rows, force = _drive(p, seed=seed, stops=80)
+    rows["current_q"] /= 1.0 - 0.2 * np.linspace(0.0, 1.0, len(rows))
+    rmse, worst, beyond, sigma, state, estimates = _end(p, rows, force, stops=10)
+    assert rmse < 100.0 and sigma < 150.0 and beyond < 0.01
+    assert state["scale"] == pytest.approx(1.0, abs=0.02)
+    silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
+    assert _longest(silent) <= 25
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_is_proven_where_nothing_has_changed(p, seed):
+    """A minute of stops each: no hypothesis becomes the first, next to nothing is said, and the force is as good as if nothing
+    could have changed."""
+    rows, force = _drive(p, seed=seed, stops=20)
+    rmse, worst, _, _, state, estimates = _end(p, rows, force, stops=18)
+    assert np.mean(estimates["reasons"] != 0) < 0.01
+    assert np.abs(np.diff(estimates["contact_angle"])).max() < 1e-6 / p["gear_gain"]
+    assert np.abs(np.diff(estimates["stiffness_factor"])).max() < 1e-3
+    assert state["scale"] == pytest.approx(1.0, abs=0.005) and worst < 4.0
+    known = p.copy()
+    known["clearance_sigma"] = 0.0
+    assert rmse < 1.1 * _end(known, rows, force, stops=18)[0] + 5.0
+
+
+@pytest.fixture
+def clamped(p):
+    """State of a brake that holds under load, what it stands on, and the next row."""
+    rows, force = _drive(p, stops=2)
+    now = _STOP + _STILL + 150
+    state = new_state()
+    estimates = estimate(rows[:now], p, state)
+    assert force[now] > 3500.0 and not estimates["reasons"][1:].any()
+    return state, rows[now : now + 1], float(estimates["sigma"][-1])
+
+
+def test_mixture_is_the_law_of_total_variance(p, clamped):
+    """Mean and variance of four hypotheses by their probabilities, forces and own variances; the first's own is what is left."""
+    state, _, _ = clamped
+    s, rng = state[0], np.random.default_rng(3)
+    h, spread = np.zeros(STATES), 40.0
+    forces, variances, odds = [s["force"] + spread * s["error"][0]], [], [1.0]
+    to_force(h, spread, s["slope"], s["force"], 0.0)
+    variances.append(force_variance(s["covariance"], h))
+    for kind in range(ALTERNATIVES):
+        a = s["alternatives"][kind]
+        a["log_odds"], a["shift"] = rng.uniform(-2.0, 2.0), rng.normal(0.0, 500.0)
+        to_force(h, spread, a["slope"], s["force"] + a["shift"], 0.0)
+        forces.append(s["force"] + a["shift"] + spread * a["error"][0])
+        variances.append(force_variance(a["covariance"], h))
+        odds.append(np.exp(a["log_odds"]))
+    weights = np.array(odds) / np.sum(odds)
+    mean = weights @ forces
+    variance = weights @ variances + weights @ (np.array(forces) - mean) ** 2
+    assert [share(s, kind) for kind in range(ALTERNATIVES)] == pytest.approx(weights[1:])
+    assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
+
+
+def test_an_unproven_jump_counts_in_sigma_and_is_said(p, clamped):
+    """Even odds on a fifth more: sigma of half of that, nearly, and the reason."""
+    state, row, before = clamped
+    a = state["alternatives"][0, STIFFNESS_JUMP]
+    a["log_odds"] = 0.0
+    a["error"][SCALE] += 0.2
+    out = estimate(row, p, state)[0]
+    assert out["sigma"] > 0.4 * 0.2 * 3500.0 > before and out["reasons"] & PATHS_DISAGREE
+
+
+def test_model_error_counts_in_sigma_and_is_said(p, clamped):
+    """What consistency cannot explain as noise: 500 N left at every horizon."""
+    state, row, before = clamped
+    c = state["consistency"]
+    c["seen_s"], c["square"], c["expected"] = 1000.0, 500.0**2, 1.0
+    out = estimate(row, p, state)[0]
+    assert out["sigma"] == pytest.approx(np.hypot(before, 500.0), rel=0.1) and out["reasons"] & PATHS_DISAGREE
+
+
+@pytest.mark.parametrize("name", ["temperature_sigma", "history_sigma", "sigma"])
+def test_unknown_temperature_counts_in_sigma(p, clamped, name):
+    """40 K move the force by what the calibration's softening says: a start with hot pads, the pads' history, and what the
+    thermal model itself may be off by."""
+    state, row, before = clamped
+    warm = p.copy()
+    if name == "sigma":
+        warm["thermal"]["sigma"] = 40.0
+    else:
+        state[name] = 40.0
+    cold = state.copy()
+    for key in ("temperature_sigma", "history_sigma"):
+        cold[key] = 0.0
+    coefficient = p["thermal"]["softening_history" if name == "history_sigma" else "softening"]
+    sigma, without = estimate(row, warm, state)[0]["sigma"], estimate(row, p, cold)[0]["sigma"]
+    assert coefficient > 0.0 and sigma > without + 0.3 * coefficient * 40.0 * 3500.0 * 0.5
+
+
+def test_contradicting_paths_count_in_sigma(p, clamped):
+    """While nothing tells which path is wrong, sigma reaches from one to the other."""
+    state, row, before = clamped
+    state["plausibility"]["contradiction"] = 2000.0
+    state["plausibility"]["verdict"] = 4
+    row["current_q"] += 4.0
+    out = estimate(row, p, state)[0]
+    assert out["sigma"] > 0.9 * abs(out["innovation"]) > 10.0 * before
+
+
+def _weighed(log_odds, first, second, times=1):
+    a = new_state()["alternatives"][0, 0]
+    a["log_odds"] = log_odds
+    for _ in range(times):
+        weigh(a, PRIOR_ODDS, first, 1.0, second, 1.0)
+    return float(a["log_odds"])
+
+
+def test_odds_are_likelihood_ratios_of_the_same_torque():
+    assert _weighed(0.0, 2.0, 1.0) == pytest.approx(1.5)
+    a = new_state()["alternatives"][0, 0]
+    weigh(a, PRIOR_ODDS, 1.0, 4.0, 1.0, 1.0)
+    assert a["log_odds"] == pytest.approx(0.125 - 0.5 + 0.5 * np.log(4.0))
+
+
+def test_a_sample_far_off_counts_as_the_gates_edge():
+    assert _weighed(0.0, 100.0, 0.0) == pytest.approx(12.5)
+    assert _weighed(0.0, 100.0, 90.0) == pytest.approx(0.0)
+
+
+def test_odds_never_fall_below_their_start():
+    """Or a later jump would have to make up for a long past without any."""
+    assert _weighed(0.0, 0.0, 1.0, times=1000) == PRIOR_ODDS
+    assert _weighed(0.0, 5.0, 0.0, times=1000) == 100.0
+
+
+@pytest.fixture
+def opened(p):
+    state = new_state()
+    set_priors(state["covariance"][0], p)
+    state["scale"] = 1.0
+    open_all(state[0], p)
+    return state
+
+
+def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
+    """The stiffness path's only stiffness and contact, the torque path's only motor and friction."""
+    s = opened[0]
+    wider = [np.diag(a["covariance"]) > 1.01 * np.diag(s["covariance"]) for a in s["alternatives"]]
+    assert not np.any(wider[STIFFNESS_JUMP] & wider[TORQUE_JUMP]) and not np.any(wider[DISC_GROWTH] & wider[STIFFNESS_JUMP])
+    assert wider[STIFFNESS_JUMP][SCALE] and wider[TORQUE_JUMP][GAIN] and wider[TORQUE_JUMP][OFFSET]
+
+
+def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):
+    s = opened[0]
+    s["alternatives"]["log_odds"][TORQUE_JUMP] = 50.0
+    assert not settle(s, p, False, 0.004)
+    assert settle(s, p, True, 0.004)
+    assert np.array_equal(s["covariance"], s["alternatives"][TORQUE_JUMP]["covariance"])
+
+
+def test_two_that_are_alike_wait_for_more_strokes(p, opened):
+    """The stronger is taken after twenty seconds, even if the other explains almost as much."""
+    s = opened[0]
+    s["alternatives"]["log_odds"][:2] = 12.0, 10.0
+    assert not settle(s, p, True, 0.004)
+    s["open_s"] = 20.1
+    assert settle(s, p, True, 0.004)
+
+
+def test_what_is_not_suspected_is_looked_for_anew(p, opened):
+    """After a second, and at each release; what is suspected is not forgotten by then."""
+    s = opened[0]
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP] = -3.0
+    assert not settle(s, p, False, 0.5) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == -3.0
+    settle(s, p, False, 0.6)
+    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS and s["open_s"] == 0.0
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 1.0
+    settle(s, p, False, 2.0)
+    assert suspected(s) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == 1.0
+    open_again(s, p)
+    assert not suspected(s)
+
+
+def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):
+    s = opened[0]
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP], s["open_s"] = 1.0, 20.1
+    settle(s, p, False, 0.004)
+    assert suspected(s)
+    settle(s, p, True, 0.004)
+    assert not suspected(s)
