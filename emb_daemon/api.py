@@ -83,7 +83,7 @@ class Estimator:
     def __init__(self, calibration: Calibration | str | Path | None = None):
         """``calibration`` as in `run`."""
         self._parameters = np.atleast_1d(to_parameters(_calibration(calibration)))
-        self._state = new_state()
+        self.reset()
         self._sample = np.zeros(1, SAMPLE)
         self._estimate = np.zeros(1, ESTIMATE)
         self._sample["brake_torque"] = np.nan

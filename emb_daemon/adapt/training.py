@@ -257,7 +257,7 @@ def _follow(a, s, p, limits, m, estimate):
     # Temperature is read off the same thermal model now and then; what it may be wrong by, the curve inherits.
     t = p.thermal
     a.factor_sigma = (
-        t.softening * hypot(s.temperature_doubt, t.sigma) + t.softening_history * hypot(s.history_doubt, t.sigma)
+        t.softening * hypot(s.temperature_sigma, t.sigma) + t.softening_history * hypot(s.history_sigma, t.sigma)
     ) / s.factor
     a.time_ns = estimate.time_ns
     parked = m.has_status and m.park_brake == e.PARK_APPLIED

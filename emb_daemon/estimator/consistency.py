@@ -16,9 +16,11 @@ from emb_daemon.jit import njit
 HORIZONS_S = (0.05, 0.2, 1.0)
 HORIZONS = len(HORIZONS_S)
 _AVERAGED_S = (30.0, 60.0, 60.0)
-#: Mean square over the expected one that is no noise: the mean of n squares spreads by sqrt(2 / n), overlapping horizons by half
-#: as much again, and six of those are taken.
-_RATIO = tuple(1.0 + 6.0 * 1.5 * (2.0 * horizon / averaged) ** 0.5 for horizon, averaged in zip(HORIZONS_S, _AVERAGED_S, strict=True))
+#: Mean square over the expected one that is no noise: the mean of n squares spreads by sqrt(2 / n), overlapping horizons by
+#: half as much again, and six of those are taken.
+_RATIO = tuple(
+    1.0 + 6.0 * 1.5 * (2.0 * horizon / averaged) ** 0.5 for horizon, averaged in zip(HORIZONS_S, _AVERAGED_S, strict=True)
+)
 #: What a test says.
 UNKNOWN, CONSISTENT, INCONSISTENT = range(3)
 

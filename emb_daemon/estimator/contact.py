@@ -1,6 +1,6 @@
 """The contact angle of one corner: a resolver that lost its zero, and what torque says against what is believed."""
 
-from math import sqrt
+from math import hypot, sqrt
 
 import numpy as np
 
@@ -82,7 +82,8 @@ def seek_release(s, p, m):
 def place_contact(s, p, angle, sigma):
     """Believe the contact angle ``angle`` rad with standard deviation ``sigma``, whatever was believed before."""
     s.contact_angle = s.contact_anchor = angle
-    rest(s, p, s.angle - angle, s.factor * s.scale)
+    # Pads that have just opened still relax: the lag goes on from what it has.
+    s.past_contact = s.angle - angle
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
     s.covariance[CONTACT, CONTACT] = sigma * sigma
@@ -111,7 +112,8 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
-    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, sqrt(offset_sigma * offset_sigma + learned_sigma * learned_sigma))
+    unsure = hypot(offset_sigma, learned_sigma)
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, unsure)
     offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
     seen = predicted + c.excess
     if found != NOTHING:

@@ -11,8 +11,8 @@ from emb_daemon.estimator.hypotheses import (
     learn,
     least_odds,
     mix,
-    open_all,
     open_again,
+    open_all,
     place,
     settle,
     to_force,
@@ -34,8 +34,8 @@ from emb_daemon.estimator.status import (
     RESOLVER_IMPLAUSIBLE,
     TORQUE_OLD,
 )
-from emb_daemon.jit import njit
 from emb_daemon.estimator.unknown import HOUSING_S, SLOW_RAD_PER_S, WINDING_S, set_walks, torque_offset
+from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -103,7 +103,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     factor = s.factor * s.scale
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
-    softening = p.thermal.softening * hypot(s.temperature_sigma, p.thermal.sigma) + p.thermal.softening_history * s.history_sigma
+    softening = p.thermal.softening * hypot(s.temperature_sigma, p.thermal.sigma)
+    softening += p.thermal.softening_history * s.history_sigma
     relative = (p.stiffness_relative_sigma + softening) * s.force
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
@@ -157,7 +158,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             a = s.alternatives[kind]
             to_force(h, spread, a.slope, s.force + a.shift, warmth)
             taken = needed + leverage * a.shift
-            to_torque(h, leverage, s_mean, mean_force + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
+            force = mean_force + a.shift
+            to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
             second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
             if trusted:
                 weigh(a, least_odds(kind), first, variance, second, variance_a)

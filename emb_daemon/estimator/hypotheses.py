@@ -12,7 +12,14 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_growth, add_stiffness_jumps, add_torque_jumps, stay_possible
+from emb_daemon.estimator.unknown import (
+    LEAST_SCALE,
+    MOST_SCALE,
+    add_growth,
+    add_stiffness_jumps,
+    add_torque_jumps,
+    stay_possible,
+)
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -36,8 +43,8 @@ from emb_daemon.models.fusion import (
 )
 from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 
-#: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall lower,
-#: or a later jump would have to make up for the past.
+#: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall
+#: lower, or a later jump would have to make up for the past.
 PRIOR_ODDS = -6.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
@@ -61,8 +68,8 @@ STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH = range(ALTERNATIVES)
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
-#: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over
-#: the first one's.
+#: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force
+#: over the first one's.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),

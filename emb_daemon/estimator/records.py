@@ -142,7 +142,8 @@ STATE = np.dtype(
         # Whether the contact angle is unknown since the start, and what the release that ends it is known by.
         ("unknown", "?"),
         ("seen", "?"),
-        # Whether it goes on from a snapshot, whose heat is ``rested_s`` s old; clearance that counts from the released position.
+        # Whether it goes on from a snapshot, whose heat is ``rested_s`` s old; clearance that counts from the released
+        # position.
         ("resumed", "?"),
         ("rested_s", "f8"),
         ("clearance", "f8"),

@@ -1,4 +1,4 @@
-"""What the estimator says of itself: one table of named facts, from which reasons, source, and with them mode and Status follow.
+"""What the estimator says of itself: one table of named facts, from which reasons, source, mode and Status follow.
 
 The order counts: the torque alone goes on without stiffness, whatever was said of the torque while both were compared.
 
@@ -35,12 +35,12 @@ class Fact(NamedTuple):
 TABLE = {
     "zero_moved": Fact("the motor angle jumped as no motor can", OUT_OF_RANGE, FUSED),
     "current_implausible": Fact("the current is frozen while the motor must turn", PATHS_DISAGREE | STUCK, STIFFNESS_ONLY),
-    "paths_contradict": Fact("the paths contradict each other and nothing tells which is wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
+    "paths_contradict": Fact("the paths contradict each other, and nothing tells which is wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
     "torque_old": Fact("the torque path has said nothing for a while", 0, STIFFNESS_ONLY),
     "jump_suspected": Fact("contact, stiffness, friction or current may have changed at once", PATHS_DISAGREE, FUSED),
     "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
-    "resolver_implausible": Fact("the resolver is frozen, or angle and speed contradict each other", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
+    "resolver_implausible": Fact("the resolver is frozen, or its angle contradicts its speed", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
     "contact_sought": Fact("meanwhile the torque knows the force better", CONTACT_UNCERTAIN, TORQUE_ONLY),
@@ -69,7 +69,7 @@ _SOURCES = np.array([fact.source for fact in TABLE.values()])
 
 @njit
 def tell_status(facts, out):
-    """Reasons and source of an ESTIMATE from its facts: the last fact in the table that leaves less than both paths decides."""
+    """Reasons and source of an ESTIMATE from its facts: the last in the table that leaves less than both paths decides."""
     out.reasons = 0
     out.source = FUSED
     for bit in range(len(_REASONS)):

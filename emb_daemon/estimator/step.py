@@ -12,8 +12,8 @@ from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
-from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
 from emb_daemon.estimator.monitor import bound, contradicts
+from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
 from emb_daemon.estimator.records import INIT, INVALID, PREDICTED, RUNNING
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -22,8 +22,8 @@ from emb_daemon.estimator.status import (
     CURRENT_IMPLAUSIBLE,
     FORCE_UNCERTAIN,
     NOT_A_NUMBER,
-    TEMPERATURE_VAGUE,
     TEMPERATURE_UNKNOWN,
+    TEMPERATURE_VAGUE,
     THERMOCOUPLE_STUCK,
     WHEEL_CONTRADICTED,
     ZERO_MOVED,

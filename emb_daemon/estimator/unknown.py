@@ -5,7 +5,7 @@ how far it may have changed at once, between two stops or in a workshop. `estima
 was against the brake in which something has jumped.
 """
 
-from math import exp, sqrt
+from math import exp
 
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
@@ -48,13 +48,14 @@ _INERTIA = 0.02
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
 _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
 #: Rise of friction at low speed that a calibration without it leaves, and that wear or another lubricant bring (breakaway over
-#: Coulomb friction 1.3 to 2: Armstrong-Helouvry et al., Automatica 30(7), 1994), shares; speed at which it has fallen to 1/e, rad/s.
+#: Coulomb friction 1.3 to 2: Armstrong-Helouvry et al., Automatica 30(7), 1994), shares; speed at which it has fallen to 1/e,
+#: rad/s.
 _SLOW, _SLOW_JUMP, SLOW_RAD_PER_S = 0.05, 0.5, 5.0
 #: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
 #: 20 degC: it doubles in ten), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
 _THICKENS_K, _WARM_C, _VISCOUS = 15.0, 15.0, 0.3
-#: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1 %/K
-#: (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
+#: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1
+#: %/K (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
 #: several hundred kelvin.
 _FADE, _HOUSING = 0.4, 0.4
 #: Heat paths of winding and housing, s; and share by which two lags miss what the motor's heat really does, over a time, s.
@@ -130,8 +131,8 @@ def set_walks(walked, p, x, winding, housing, dt):
 
 @njit
 def add_rest(P, p, elapsed_s):
-    """What a brake may have changed by while it was not watched for ``elapsed_s`` s: an hour's walk at least, and a settling of
-    the pads."""
+    """What a brake may have changed by while it was not watched for ``elapsed_s`` s: an hour's walk at least, and settling
+    pads."""
     hour = max(elapsed_s, 3600.0)
     P[CONTACT, CONTACT] += (_SETTLED_M / p.gear_gain) ** 2
     P[GAIN, GAIN] += _GAIN_WALK_PER_SQRT_S**2 * hour

@@ -18,11 +18,10 @@ import numpy as np
 
 from emb_daemon.jit import njit
 
-#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which angle
-#: and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
-#: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the
-#: current changed.
-#: ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
+#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
+#: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
+#: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one.
 PLAUSIBILITY = np.dtype(
     [
@@ -72,7 +71,7 @@ _AVERAGED_S = 0.04
 
 @njit
 def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
-    """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is that of the samples before.
+    """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is of those before.
 
     Args:
         c: PLAUSIBILITY record.
@@ -147,7 +146,8 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 def count_contradiction(c, ratio):
     """Add one contradiction, in standard deviations, to the sum; NaN says nothing."""
     if np.isfinite(ratio):
-        c.contradiction = min(max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0), 1.5 * _UNCONFIRMED * _RAISE)
+        total = max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0)
+        c.contradiction = min(total, 1.5 * _UNCONFIRMED * _RAISE)
 
 
 @njit

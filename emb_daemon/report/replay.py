@@ -1,6 +1,5 @@
 """The page of a replay: estimates, errors and events of a drive on one time axis."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
