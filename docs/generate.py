@@ -1,4 +1,4 @@
-"""Writes the reference pages that restate code: calibration.md, configuration.md and catalogue.md.
+"""Writes the reference pages that restate code: calibration.md, configuration.md, catalogue.md, and safety.md's table of facts.
 
 python docs/generate.py            writes them
 python docs/generate.py --check    exit status 1 if one is not current
@@ -14,6 +14,8 @@ import msgspec
 
 from emb_daemon.calibration import configuration, types
 from emb_daemon.effects import REGISTRY
+from emb_daemon.estimator import status
+from emb_daemon.wire import contract
 
 _HERE = Path(__file__).parent
 _PATHS = {"stiffness": "the stiffness path", "torque": "the torque path", "thermal": "heat"}
@@ -127,6 +129,21 @@ def _catalogue() -> str:
     return "\n".join(out).rstrip() + "\n"
 
 
+#: Between these lines of safety.md stands the table of facts.
+_BEGIN, _END = "<!-- facts: begin -->", "<!-- facts: end -->"
+
+
+def _safety() -> str:
+    """The page as it is, with the table of facts written anew."""
+    before, rest = (_HERE / "safety.md").read_text(encoding="utf-8").split(_BEGIN)
+    _, after = rest.split(_END)
+    rows = ["| fact | reasons | source |", "| --- | --- | --- |"]
+    for fact in status.TABLE.values():
+        source = "" if fact.source == contract.FUSED else contract.SOURCES[fact.source]
+        rows.append(f"| {fact.sentence} | {', '.join(contract.reason_words(fact.reasons))} | {source} |")
+    return "\n".join([before + _BEGIN, *rows, _END + after])
+
+
 def pages() -> dict[str, str]:
     """The text of every generated page, by file name."""
     return {
@@ -145,6 +162,7 @@ def pages() -> dict[str, str]:
             configuration.Configuration, configuration,
         ),
         "catalogue.md": _catalogue(),
+        "safety.md": _safety(),
     }  # fmt: skip
 
 

@@ -56,7 +56,7 @@ def drive(
     speed=(0.0,),
     current=(0.0,),
     wheel_speed: float = 0.0,
-    backplate: float = 25.0,
+    backplate: float = 20.0,
     ambient: float = 20.0,
     first: int = 0,
 ) -> list[np.ndarray]:
