@@ -7,6 +7,7 @@ estimates = emb_daemon.run(log)
 estimates["force"], estimates["sigma"]          # N, one value per resolver sample
 """
 
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,6 +74,16 @@ def _calibration(given: Calibration | str | Path | None) -> Calibration:
     return given if isinstance(given, Calibration) else load_calibration(Path(given))
 
 
+def _require_finite(**arguments: float) -> None:
+    for name, value in arguments.items():
+        if not isfinite(value):
+            raise ValueError(f"{name} = {value}: expected a finite number")
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not isfinite(value) else value
+
+
 class Estimator:
     """One corner's estimator, for a program that has its own bus, clock or simulation.
 
@@ -87,6 +98,10 @@ class Estimator:
         self._sample = np.zeros(1, SAMPLE)
         self._estimate = np.zeros(1, ESTIMATE)
         self._sample["brake_torque"] = np.nan
+
+    def reset(self) -> None:
+        """Forget everything: the next call is the first."""
+        self._state = new_state()
 
     def step(
         self,
@@ -108,11 +123,29 @@ class Estimator:
             angle_rad: motor angle, multi-turn, any zero; the pads are released at the first call.
             speed_rad_per_s: motor speed, both at the sample.
             current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
-            dt_s: time since the last sample.
+            dt_s: time since the last sample; without meaning at the first call.
             backplates_C: inner and outer backing plate; None if unknown, and the pads' temperatures then stay unknown.
             caliper_C: taken for the mean of the backing plates if None.
             wheel_speed_rad_per_s, wheel_pulse: speed of the disc, and 96 counts per turn modulo 4096; None if unknown.
+
+        What may be None may also be NaN or infinite: it is then missing.
+
+        Raises:
+            ValueError: another argument is no finite number, or ``dt_s`` is not above zero. Nothing has changed then.
         """
+        _require_finite(
+            angle_rad=angle_rad,
+            speed_rad_per_s=speed_rad_per_s,
+            dt_s=dt_s,
+            ambient_C=ambient_C,
+            vehicle_speed_m_per_s=vehicle_speed_m_per_s,
+        )
+        if dt_s <= 0.0:
+            raise ValueError(f"dt_s = {dt_s}: expected a time above zero")
+        current_A, caliper_C = _finite(current_A), _finite(caliper_C)
+        wheel_speed_rad_per_s, wheel_pulse = _finite(wheel_speed_rad_per_s), _finite(wheel_pulse)
+        if backplates_C is not None and not all(map(isfinite, backplates_C)):
+            backplates_C = None
         row = self._sample[0]
         row["dt"] = dt_s if self._state["started"][0] else 0.0
         row["angle"], row["speed"] = angle_rad, speed_rad_per_s

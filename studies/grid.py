@@ -13,7 +13,6 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.adapt.records import RESULT_ACCEPTED
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
@@ -23,7 +22,7 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import LATCH
 from emb_daemon.resources import resource
-from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED
+from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
 from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 

@@ -103,51 +103,58 @@ def test_a_clearance_that_was_said_to_be_uncertain_is_found_in_one_application(l
     # From the start on sigma covers the error, reference noise of 25 N included.
     inside = np.abs(estimates["force"] - force) < 2.0 * np.hypot(estimates["sigma"], 25.0)
     assert np.mean(inside) > 0.9
-    assert np.mean(np.abs(error) < 2.0 * estimates["contact_sigma"]) > 0.9
+    # 4 um, a hundredth of a pad's compression, may be taken for stiffness.
+    assert np.mean(np.abs(error) < np.maximum(2.0 * estimates["contact_sigma"], 0.1)) > 0.9
 
 
 @pytest.mark.parametrize("wrong_rad", [-2.0, 2.0])
 def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
-    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that."""
+    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that. It is said before 2 kN are reached,
+    until then sigma covers or status says it, and from 5 kN on the right one is believed."""
     log = logs["curve_9p5mm"]
     p = rig_parameters(9.5)
     p["clearance"] += wrong_rad
     estimates = estimate(log.samples, p)
     error = estimates["contact_angle"] - log.samples["angle"][0] - RIG_CONTACT
-    lost = np.flatnonzero(estimates["reasons"] & CONTACT_UNCERTAIN)
-    assert len(lost) and lost[0] > 100
-    clamped = np.flatnonzero(log.force_N > 2000.0)[0]
+    said = np.flatnonzero(estimates["reasons"])
+    assert 100 < said[said > 0][0] < np.flatnonzero(log.force_N > 2000.0)[0]
+    clamped = np.flatnonzero(log.force_N > 5000.0)[0]
     assert np.all(np.abs(error[clamped:]) < 0.6)
-    assert np.mean(np.abs(error[clamped:]) < 2.0 * estimates["contact_sigma"][clamped:]) > 0.9
-    assert estimates["source"][-1] == FUSED
+    off = np.abs(estimates["force"] - log.force_N) / np.hypot(estimates["sigma"], 25.0)
+    silent = (off > 3.0) & (estimates["reasons"] == 0)
+    assert np.mean(silent) < 0.01
+    assert estimates["source"][-1] == FUSED and not estimates["reasons"][-1]
 
 
 @pytest.mark.parametrize("from_N", [3000.0, 8000.0, 15000.0])
 def test_power_that_comes_while_clamped_is_noticed(logs, from_N):
-    """On the simulated rig: the first sample stands at 3 to 15 kN, the angle tells nothing of it."""
+    """On the simulated rig: the first sample stands at 3 to 15 kN, status says released, the angle tells nothing of it. The torque
+    does within a tenth of a second; it alone counts, with a sigma that covers, until the brake was seen released."""
     log = logs["training_5mm"]
     first = np.flatnonzero(log.force_N > from_N)[0]
     rows, force = log.samples[first:].copy(), log.force_N[first:]
-    rows["dt"][0] = 0.0
+    rows["dt"][0] = rows["park_brake"][:50] = rows["brake_request"][:50] = 0.0
     estimates = estimate(rows, rig_parameters(5.0))
-    assert np.any(estimates["reasons"][:10] & CONTACT_UNCERTAIN)
-    assert np.any(estimates["source"][:25] == TORQUE_ONLY)
+    unknown = (estimates["reasons"] & CONTACT_UNCERTAIN) != 0
+    assert np.all(unknown[26:100]) and np.all(estimates["source"][26:100] == TORQUE_ONLY)
+    off = np.abs(estimates["force"] - force) / np.hypot(estimates["sigma"], 25.0)
+    assert np.mean(off[26:] < 2.0) > 0.95 and off[26:].max() < 4.0
+    fused = np.flatnonzero(estimates["source"][26:] == FUSED) + 26
     error = estimates["contact_angle"] - log.samples["angle"][0] - RIG_CONTACT
-    assert np.all(np.abs(error[250:]) < 0.6)
-    assert np.mean(np.abs(error) < 2.0 * estimates["contact_sigma"]) > 0.9
-    assert np.abs(estimates["force"] - force)[250:].max() < 1500.0
-    inside = np.abs(estimates["force"] - force) < 2.0 * np.hypot(estimates["sigma"], 25.0)
-    assert np.mean(inside[5:]) > 0.95
+    assert np.all(np.abs(error[fused]) < 0.3)
 
 
 def test_the_contact_angle_that_fits_is_left_alone(logs):
-    """No alarm on the simulated rig's logs with the right calibration, random motion at full speed included."""
+    """On the simulated rig's logs with the right calibration, random motion at full speed included: never off by more than ten
+    micrometres, and called uncertain in less than one sample of a hundred."""
     for name, thickness in LOGS.items():
         p = rig_parameters(thickness)
         if "worn_in" in name:
             p["load_friction"], p["offset_friction"] = 5.7e-6, 0.0294
         estimates = estimate(logs[name].samples, p)
-        assert not np.any(estimates["reasons"] & CONTACT_UNCERTAIN), name
+        assert np.mean((estimates["reasons"] & CONTACT_UNCERTAIN) != 0) < 0.01, name
+        error = estimates["contact_angle"] - logs[name].samples["angle"][0] - RIG_CONTACT
+        assert np.abs(error).max() < 0.25, name
 
 
 def test_contact_follows_slow_growth_between_applications(parameters):

@@ -47,13 +47,15 @@ def test_running_a_log_is_replaying_it(rig):
 def test_stepping_is_running(rig):
     """The object for control loops, given a log's samples one by one, answers as the whole log does."""
     log = emb_daemon.load_log(rig / "static" / "sine_5Hz.log.gz")
+    # The object takes its brake for released from the first call on; the log's first sample has heard no status yet.
+    log.samples[["has_status", "ambient", "park_brake", "brake_request"]][0] = (True, 20.0, 0.0, 0.0)
     whole, estimator = emb_daemon.run(log), emb_daemon.Estimator()
     for row, expected in zip(log.samples[:1500], whole, strict=False):
         answer = estimator.step(
             row["angle"],
             row["speed"],
             row["current_q"] if row["has_current"] else None,
-            dt_s=row["dt"],
+            dt_s=row["dt"] or 0.004,
             backplates_C=(row["inner_backplate"], row["outer_backplate"]) if row["has_thermocouple"] else None,
             caliper_C=row["caliper"],
             ambient_C=row["ambient"] if row["has_status"] else 20.0,
@@ -67,6 +69,60 @@ def test_stepping_is_running(rig):
 def test_a_missing_input_is_named():
     answer = emb_daemon.Estimator().step(0.0, 0.0)
     assert set(answer.reasons) >= {"current lost", "thermocouple lost"} and answer.sigma_N > 0.0
+
+
+_REST = {"backplates_C": (20.0, 20.0), "wheel_speed_rad_per_s": 0.0, "wheel_pulse": 0.0}
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("name", ["angle_rad", "speed_rad_per_s", "dt_s", "ambient_C", "vehicle_speed_m_per_s"])
+def test_what_is_no_number_is_refused_by_name_and_changes_nothing(name, value):
+    refused, other = emb_daemon.Estimator(), emb_daemon.Estimator()
+    good = {"angle_rad": 1.0, "speed_rad_per_s": 5.0, "current_A": 0.3, **_REST}
+    for estimator in (refused, other):
+        estimator.step(**good)
+    with pytest.raises(ValueError, match=name):
+        refused.step(**(good | {"angle_rad": 1.02} | {name: value}))
+    good["angle_rad"] = 1.02
+    assert refused.step(**good) == other.step(**good)
+
+
+@pytest.mark.parametrize("dt_s", [0.0, -0.004])
+def test_time_goes_on(dt_s):
+    estimator = emb_daemon.Estimator()
+    estimator.step(0.0, 0.0, 0.0, **_REST)
+    with pytest.raises(ValueError, match="dt_s"):
+        estimator.step(0.0, 0.0, 0.0, dt_s=dt_s, **_REST)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("current_A", "current lost"), ("wheel_speed_rad_per_s", "wheel speed lost"), ("wheel_pulse", "wheel pulse lost")],
+)
+def test_an_optional_input_that_is_no_number_is_missing(name, reason, value):
+    """And is forgotten: what comes after is as good as ever."""
+    estimator = emb_daemon.Estimator()
+    estimator.step(0.0, 0.0, 0.0, **_REST)
+    arguments = {"angle_rad": 0.0, "speed_rad_per_s": 0.0, "current_A": 0.0, **_REST}
+    assert reason in estimator.step(**(arguments | {name: value})).reasons
+    again = estimator.step(**arguments)
+    assert again.reasons == () and again.sigma_N < 500.0
+
+
+def test_backing_plates_that_are_no_numbers_are_missing():
+    answer = emb_daemon.Estimator().step(0.0, 0.0, 0.0, **(_REST | {"backplates_C": (20.0, float("nan"))}))
+    assert "thermocouple lost" in answer.reasons
+
+
+def test_reset_forgets_everything():
+    estimator, fresh = emb_daemon.Estimator(), emb_daemon.Estimator()
+    for step in range(20):
+        estimator.step(0.3 * step, 75.0, 2.0, **_REST)
+    estimator.reset()
+    for step in range(20):
+        arguments = {"angle_rad": 50.0 + 0.1 * step, "speed_rad_per_s": 25.0, "current_A": 1.0, **_REST}
+        assert repr(estimator.step(**arguments)) == repr(fresh.step(**arguments))
 
 
 def test_importing_the_package_imports_nothing_heavy():

@@ -142,13 +142,22 @@ def _progress(a, limits):
 
 
 @njit
-def apply_learned(s, scratch, rows, learned, a):
-    """Go over to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the path models to
-    the last of ``rows``."""
+def apply_learned(s, p, scratch, rows, learned, a):
+    """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the path
+    models to the last of ``rows``.
+
+    Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the
+    contact angle is weighed against that."""
+    kept, known = True, s.covariance[CONTACT, CONTACT]
+    for i in range(len(p.curve)):
+        kept = kept and learned.curve[i] == p.curve[i]
+    weight = known / (known + a.contact_sigma**2) if kept else 1.0
+    contact, scale, gain = s.contact_angle, s.scale if kept else 1.0, s.error[GAIN]
+    gain_variance = s.covariance[GAIN, GAIN]
     first = max(0, len(rows) - _RUN_UP)
     scratch[0] = s
     t = scratch[0]
-    t.contact_angle = a.contact_angle
+    t.contact_angle = contact + weight * (a.contact_angle - contact)
     settle(t, learned, rows[first])
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])
@@ -167,12 +176,16 @@ def apply_learned(s, scratch, rows, learned, a):
             if i != j and (i not in motor or j not in motor):
                 s.covariance[i, j] = 0.0
     s.covariance[FAST, FAST] = 1.0
-    s.covariance[CONTACT, CONTACT] = a.contact_sigma**2
-    s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
-    s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
-    s.scale = 1.0
+    s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
+    if kept:
+        s.error[GAIN], s.covariance[GAIN, GAIN] = gain, gain_variance
+    else:
+        s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
+        s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
+    s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
-    s.contact_anchor = s.contact_angle
+    if not kept:
+        s.contact_anchor = s.contact_angle
     open_all(s, learned)
 
 
@@ -182,7 +195,7 @@ def _conclude(a, s, parameters, learned, scratch, rows):
     if not a.evaluation_ready:
         end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
     elif a.evaluation == r.ACCEPTED:
-        apply_learned(s, scratch, rows[: a.rows], learned, a)
+        apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
         parameters[0] = learned
         end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
@@ -230,8 +243,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
         estimate.adapt_progress = _progress(a, limits)
-        # Reasons say what is degraded meanwhile, and Status with them.
-        if estimate.mode == e.RUNNING or estimate.mode == e.DEGRADED:
+        if estimate.mode == e.RUNNING:
             estimate.mode = e.ADAPTING
     estimate.adapt_result = a.result if a.phase == r.IDLE else e.NO_RESULT
 

@@ -28,8 +28,9 @@ _ANGLE_MARGIN = 0.5
 #: Standard deviations of the contact angle, rad: known again below, and unknown.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Torque that a released brake may seem to need, share of what the largest force needs: the offset of an ordinary current
-#: sensor; time over which a start is looked at, and for which a released motor stands, s.
-_LOOSE, _SEEN_S, _STILL_S = 0.03, 0.1, 0.1
+#: sensor; time over which a start is looked at, for which a released motor stands, and after which
+#: it is off, s.
+_LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
 #: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
 _CLAMPED = 0.1
 
@@ -69,10 +70,13 @@ def seek_release(s, p, m):
         s.since_start_s += m.dt
         s.unknown = not released
         return
-    if s.unknown and released and loose and s.still_s >= _STILL_S:
+    if s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
         place_contact(s, p, m.angle + s.clearance, s.clearance_sigma)
         s.contact_anchor = m.angle + p.clearance
         s.unknown = False
+        if not loose:
+            # Nobody holds a released brake for so long: what is measured flows in no motor.
+            s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen and not loose and not s.contact.confirmed:
         s.unknown = True
     s.seen = True

@@ -162,6 +162,7 @@ def stay_possible(x, P, gain, p, contact_distance, scale, growth, faded):
     _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
     _draw_near(x, P, gain, GROWTH, growth + x[GROWTH], 2.0 * _GROWTH_JUMP_M_PER_K / p.gear_gain)
     _draw_near(x, P, gain, GAIN, x[GAIN], _GAIN_REACH + faded)
+    _draw_near(x, P, gain, OFFSET, x[OFFSET], torque_offset(p))
     _draw_near(x, P, gain, LOAD, x[LOAD], p.load_friction)
     _draw_near(x, P, gain, COULOMB, x[COULOMB], 2.0 * p.offset_friction)
 
