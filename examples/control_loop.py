@@ -43,7 +43,8 @@ def main(seconds: float = 3.0, wanted_N: float = 8000.0) -> float:
         )
         if answer.source == "invalid":
             raise SystemExit("no force to control by: open the brake")
-        error = wanted_N - answer.force_N
+        # For its first tenth of a second the estimator makes sure that the brake is released.
+        error = (wanted_N if cycle * DT_S > 0.2 else 0.0) - answer.force_N
         current = brake.move(math.copysign(min(abs(SPEED_PER_ERROR * error), FASTEST), error))
         if cycle % 125 == 0:
             print(f"{cycle * DT_S:4.1f} s  {answer.force_N:7.0f} ± {answer.sigma_N:3.0f} N  ({answer.source}, {answer.mode})")

@@ -103,14 +103,13 @@ def test_a_clearance_that_was_said_to_be_uncertain_is_found_in_one_application(l
     # From the start on sigma covers the error, reference noise of 25 N included.
     inside = np.abs(estimates["force"] - force) < 2.0 * np.hypot(estimates["sigma"], 25.0)
     assert np.mean(inside) > 0.9
-    # 4 um, a hundredth of a pad's compression, may be taken for stiffness.
-    assert np.mean(np.abs(error) < np.maximum(2.0 * estimates["contact_sigma"], 0.1)) > 0.9
+    assert np.mean(np.abs(error) < 3.0 * estimates["contact_sigma"]) > 0.95
 
 
 @pytest.mark.parametrize("wrong_rad", [-2.0, 2.0])
 def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
-    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that. It is said before 2 kN are reached,
-    until then sigma covers or status says it, and from 5 kN on the right one is believed."""
+    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that. It is said before 2 kN are reached;
+    what is beyond sigma and unsaid stays below 500 N, and after the first application the right one is believed."""
     log = logs["curve_9p5mm"]
     p = rig_parameters(9.5)
     p["clearance"] += wrong_rad
@@ -118,11 +117,11 @@ def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
     error = estimates["contact_angle"] - log.samples["angle"][0] - RIG_CONTACT
     said = np.flatnonzero(estimates["reasons"])
     assert 100 < said[said > 0][0] < np.flatnonzero(log.force_N > 2000.0)[0]
-    clamped = np.flatnonzero(log.force_N > 5000.0)[0]
-    assert np.all(np.abs(error[clamped:]) < 0.6)
-    off = np.abs(estimates["force"] - log.force_N) / np.hypot(estimates["sigma"], 25.0)
-    silent = (off > 3.0) & (estimates["reasons"] == 0)
-    assert np.mean(silent) < 0.01
+    clamped = np.flatnonzero(log.force_N > 2000.0)[0]
+    assert np.all(np.abs(error[clamped:]) < 1.2) and np.all(np.abs(error[np.argmax(log.force_N) :]) < 0.3)
+    off = np.abs(estimates["force"] - log.force_N)
+    silent = (off > 3.0 * np.hypot(estimates["sigma"], 25.0)) & (estimates["reasons"] == 0)
+    assert off[silent].max() < 500.0 and np.mean(silent) < 0.02
     assert estimates["source"][-1] == FUSED and not estimates["reasons"][-1]
 
 

@@ -285,7 +285,7 @@ def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
     s = opened[0]
     wider = [np.diag(a["covariance"]) > 1.01 * np.diag(s["covariance"]) for a in s["alternatives"]]
     assert not np.any(wider[STIFFNESS_JUMP] & wider[TORQUE_JUMP]) and not np.any(wider[DISC_GROWTH] & wider[STIFFNESS_JUMP])
-    assert wider[STIFFNESS_JUMP][SCALE] and wider[TORQUE_JUMP][GAIN] and wider[TORQUE_JUMP][OFFSET]
+    assert wider[STIFFNESS_JUMP][SCALE] and wider[TORQUE_JUMP][GAIN] and wider[TORQUE_JUMP][LOAD] and wider[TORQUE_JUMP][COULOMB]
 
 
 def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):

@@ -68,8 +68,10 @@ def test_a_latched_brake_needs_no_current_and_sigma_covers_that(p, name, value, 
 
 
 def test_a_clamped_brake_that_says_it_is_released_gives_itself_away(p):
-    """Status says released, yet the motor holds 8 kN: noticed within a tenth of a second, by the torque that it takes."""
-    rows, force = _clamped(p, 15.0)
+    """Status says released, yet the motor holds 8 kN: noticed within a tenth of a second, by the torque that it takes, for the
+    second that a motor may need to open."""
+    rows, force = _clamped(p, 15.0, seconds=1.3)
+    assert 0.8 < 0.004 * len(rows) < 1.0
     estimates = estimate(rows, p)
     assert np.all(_unknown(estimates)[26:])
     assert np.all(estimates["source"][26:] == r.TORQUE_ONLY) and _covered(estimates[26:], force[26:])
@@ -113,9 +115,20 @@ def test_a_motor_that_moves_or_holds_is_not_released(p):
     rows, _, _ = _latched_then(p)
     moving = rows[: 100 + 240].copy()
     assert np.all(_unknown(estimate(moving, p)))
-    holding, _ = _clamped(p, 15.0)
-    holding["park_brake"][:100] = 1.0
-    assert np.all(_unknown(estimate(holding, p)))
+    holding, _ = _clamped(p, 15.0, seconds=2.5)
+    holding["park_brake"][: len(holding) - 240] = 1.0
+    assert np.all(_unknown(estimate(holding, p))), "the second counts from the status on"
+
+
+def test_a_current_that_flows_in_no_motor_is_an_offset(p):
+    """A brake that stands released for a second holds nothing, whatever its current reads: known again, and the first stroke is
+    right."""
+    rows, force = brake.samples(p, np.concatenate([np.zeros(400), brake.clamp(p, 15.0, 0.5), np.full(100, p["clearance"] + 15.0)]))
+    rows["current_q"] += 3.0
+    estimates = estimate(brake.noisy(rows, p), p)
+    unknown = np.flatnonzero(_unknown(estimates[:400]))
+    assert 240 < unknown[-1] < 300
+    assert _covered(estimates, force) and np.abs(estimates["force"] - force)[300:].max() < 300.0
 
 
 def test_status_that_comes_late_ends_it(p):

@@ -62,7 +62,7 @@ def seek_release(s, p, m):
     """Contact is unknown until the brake was seen released: nobody brakes, the park brake is off, the motor stands and needs
     no torque. From there the clearance counts. A brake that is latched needs no current either."""
     released = m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
-    s.still_s = s.still_s + m.dt if m.angle == s.angle else 0.0
+    s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
     if not s.seen and s.since_start_s < _SEEN_S:

@@ -203,7 +203,7 @@ def take_sides(s, p, m, out):
         facts |= TORQUE_OLD
     if unproven(s) > _NOTED * p.maximum_force:
         facts |= JUMP_SUSPECTED
-    if abs(x[OFFSET]) > torque_offset(p):
+    if abs(x[OFFSET]) > 2.0 * torque_offset(p):
         facts |= OFFSET_LARGE
     if s.unknown:
         # A latched brake needs no current: the torque then says that nothing is known.
