@@ -1,6 +1,6 @@
 """The estimator inside somebody else's control loop: a force controller that has no force sensor.
 
-The brake is a toy (a spring, no friction) so that the loop fits on a screen; put your plant, HIL or drive in its place.
+The brake is a toy (a spring with friction) so that the loop fits on a screen; put your plant, HIL or drive in its place.
 
 python examples/control_loop.py
 """
@@ -20,16 +20,19 @@ class ToyBrake:
 
     def __init__(self, calibration):
         self.curve = curve_at(calibration.stiffness.curves, calibration.pad_thickness_mm)
-        self.motor, self.clearance = calibration.motor, calibration.contact.clearance_rad
+        self.motor, self.friction, self.clearance = calibration.motor, calibration.friction, calibration.contact.clearance_rad
         self.angle = self.speed = self.force = 0.0
 
     def move(self, speed: float) -> float:
         """Returns the mean motor current over the cycle."""
-        torque = self.motor.inertia_kg_m2 * (speed - self.speed) / DT_S + self.motor.gear_gain_m_per_rad * self.force
-        self.speed = speed
-        self.angle += speed * DT_S
+        before, self.angle = self.force, self.angle + speed * DT_S
         x = max(self.angle - self.clearance, 0.0)
         self.force = sum(a * x ** (n + 1) for n, a in enumerate(self.curve))
+        mean = 0.5 * (before + self.force)
+        torque = self.motor.inertia_kg_m2 * (speed - self.speed) / DT_S + self.motor.gear_gain_m_per_rad * mean
+        if speed != 0.0:
+            torque += math.copysign(self.friction.load_m_per_rad * mean + self.friction.offset_Nm, speed)
+        self.speed = speed
         return torque / self.motor.torque_constant_Nm_per_A
 
 

@@ -85,9 +85,12 @@ def seek_release(s, p, m):
 @njit
 def place_contact(s, p, angle, sigma):
     """Believe the contact angle ``angle`` rad with standard deviation ``sigma``, whatever was believed before."""
+    # Pads that have just opened still relax; but what was believed of a contact elsewhere is no force to relax from.
+    if abs(angle - s.contact_angle) < _KNOWN_RAD:
+        s.past_contact = s.angle - angle
+    else:
+        rest(s, p, s.angle - angle, s.factor * s.scale)
     s.contact_angle = s.contact_anchor = angle
-    # Pads that have just opened still relax: the lag goes on from what it has.
-    s.past_contact = s.angle - angle
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
     s.covariance[CONTACT, CONTACT] = sigma * sigma
