@@ -135,7 +135,7 @@ def test_status_that_comes_late_ends_it(p):
     rows, _ = _standing(p)
     rows["has_status"][:100] = False
     estimates = estimate(rows, p)
-    assert np.all(_unknown(estimates)[:100]) and not np.any(_unknown(estimates)[102:])
+    assert np.all(_unknown(estimates)[:100]) and not np.any(_unknown(estimates)[128:])
 
 
 def test_unknown_and_no_current_leaves_nothing(p):
