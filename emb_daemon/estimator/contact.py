@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, open_again, to_torque
-from emb_daemon.estimator.paths import CYCLE_S, rest
+from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
     NOTHING,
@@ -31,6 +31,10 @@ _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: sensor; time over which a start is looked at, for which a released motor stands, and after which
 #: it is off, s.
 _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
+#: Friction state from which the motor slides; share of the clearance that must be passed; and share of the largest force's
+#: torque that counts as none: a clamped brake would have gained more over that way; share of the Coulomb friction that an open
+#: brake may seem to need.
+_SLIDING, _PASSED, _FREE, _OPEN = 0.9, 0.3, 0.02, 0.5
 #: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
 _CLAMPED = 0.1
 
@@ -51,6 +55,7 @@ def follow_zero(s, p, m):
     s.slid_angle += jump
     s.contact_angle += jump
     s.contact_anchor += jump
+    s.start_angle += jump
     s.covariance[1, 1] += reach * reach
     open_again(s, p)
     s.contact.confirmed = False
@@ -65,21 +70,42 @@ def seek_release(s, p, m):
     s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
-    if not s.seen and s.since_start_s < _SEEN_S:
+    if not s.seen and s.since_start_s < _SEEN_S and m.dt <= ONE_CYCLE_S:
         # Until some samples have been averaged the torque of the first ones says little.
         s.since_start_s += m.dt
         s.unknown = not released
         return
-    if s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
+    if s.unknown and _passed_clearance(s, p, m):
+        place_contact(s, p, s.start_angle + s.clearance, s.clearance_sigma)
+        s.contact_anchor = s.start_angle + p.clearance
+        s.unknown = False
+    elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
         place_contact(s, p, m.angle + s.clearance, s.clearance_sigma)
         s.contact_anchor = m.angle + p.clearance
         s.unknown = False
         if not loose:
             # Nobody holds a released brake for so long: what is measured flows in no motor.
             s.error[OFFSET] += s.plausibility.torque_mean
-    elif not s.seen and not loose and not s.contact.confirmed:
-        s.unknown = True
+    elif not s.seen:
+        # A request may find the brake still open: a clamped one needs torque against which friction is small.
+        open_yet = m.has_status and m.park_brake == 0.0 and torque < _OPEN * p.offset_friction
+        s.unknown = not (loose and released) and not open_yet
     s.seen = True
+
+
+@njit
+def _passed_clearance(s, p, m):
+    """Whether the motor has closed from where it started by a good part of the clearance and no force opposed it: then it
+    started released, whatever was asked of it."""
+    if s.friction_mean > _SLIDING and np.isfinite(s.balance):
+        s.passed += 1.0
+        s.opposing += (s.balance - s.opposing) / s.passed
+    elif m.angle <= s.start_angle:
+        s.passed = s.opposing = 0.0
+    closed = s.clearance > 0.0 and m.angle - s.start_angle > _PASSED * s.clearance
+    sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
+    free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force
+    return closed and s.passed > 0.0 and sigma / sqrt(s.passed) < 0.3 * _FREE * p.gear_gain * p.maximum_force and free
 
 
 @njit

@@ -58,6 +58,7 @@ def _start(s, p, m):
         set_priors(s.covariance, p)
         if p.clearance_sigma == 0.0:
             s.covariance[SCALE, SCALE] = 0.0
+    s.start_angle = m.angle
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
