@@ -1,4 +1,5 @@
-"""Writes the reference pages that restate code: calibration.md, configuration.md, catalogue.md, and safety.md's table of facts.
+"""Writes the reference pages that restate code: calibration.md, configuration.md, catalogue.md, and safety.md's table of
+facts.
 
 python docs/generate.py            writes them
 python docs/generate.py --check    exit status 1 if one is not current

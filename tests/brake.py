@@ -65,7 +65,8 @@ def noisy(rows: np.ndarray, p, seed: int = 1) -> np.ndarray:
 
 
 def stops(p, count: int, seed: int = 1, dt: float = 0.004) -> np.ndarray:
-    """Angles of ``count`` stops of ordinary driving, three seconds each: a standstill in the clearance, an application of 0.3 s to
+    """Angles of ``count`` stops of ordinary driving, three seconds each: a standstill in the clearance, an application of
+    0.3 s to
     10 to 20 rad past contact, half a second of holding with reversals, the release."""
     rng = np.random.default_rng(seed)
     parts, time = [], np.arange(round(0.3 / dt)) * dt / 0.3

@@ -32,7 +32,8 @@ class Judged:
         self.c, self._noise = np.zeros(1, CONSISTENCY), np.random.default_rng(seed)
 
     def pass_by(self, seconds, bias=0.0, sigma=_SIGMA):
-        """White noise of the stated standard deviation over ``bias`` of them. Returns verdicts (n, horizons) and model errors."""
+        """White noise of the stated standard deviation over ``bias`` of them. Returns verdicts (n, horizons) and model
+        errors."""
         count = round(seconds / _DT)
         verdicts, errors = np.zeros((count, HORIZONS), np.int64), np.zeros(count)
         _pass_by(self.c[0], sigma * (self._noise.standard_normal(count) + bias), sigma, _DT, verdicts, errors)

@@ -108,7 +108,8 @@ def test_a_clearance_that_was_said_to_be_uncertain_is_found_in_one_application(l
 
 @pytest.mark.parametrize("wrong_rad", [-2.0, 2.0])
 def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
-    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that. It is said before 2 kN are reached;
+    """On the simulated rig: the prior claims 0.02 rad and is wrong by a hundred times that. It is said before 2 kN are
+    reached;
     what is beyond sigma and unsaid stays below 1 kN, and after the first application the right one is believed."""
     log = logs["curve_9p5mm"]
     p = rig_parameters(9.5)
@@ -127,7 +128,8 @@ def test_a_contact_angle_that_cannot_be_true_is_given_up(logs, wrong_rad):
 
 @pytest.mark.parametrize("from_N", [3000.0, 8000.0, 15000.0])
 def test_power_that_comes_while_clamped_is_noticed(logs, from_N):
-    """On the simulated rig: the first sample stands at 3 to 15 kN, status says released, the angle tells nothing of it. The torque
+    """On the simulated rig: the first sample stands at 3 to 15 kN, status says released, the angle tells nothing of it. The
+    torque
     does within a tenth of a second; it alone counts, with a sigma that covers, until the brake was seen released."""
     log = logs["training_5mm"]
     first = np.flatnonzero(log.force_N > from_N)[0]

@@ -66,7 +66,9 @@ def test_covariance_stays_symmetric_and_positive_over_long_random_input(paramete
         predict_errors(x, P, rng.uniform(0.9, 1.0), rng.uniform(0.3, 1.0), 3e-4, walked)
         force = rng.uniform(0.0, 3e4)
         heats = rng.uniform(0.0, 1.0, 2)
-        _, h = _sensitivities(p, force, rng.uniform(0, 2e3), rng.uniform(-2e2, 2e2), rng.normal(), 4e-5 * force, rng.uniform(-1, 1), 0.0, heats)
+        _, h = _sensitivities(
+            p, force, rng.uniform(0, 2e3), rng.uniform(-2e2, 2e2), rng.normal(), 4e-5 * force, rng.uniform(-1, 1), 0.0, heats
+        )
         s = update_errors(x, P, gain, rng.normal(0.0, 0.1), h, 10.0 ** rng.uniform(-6, -2))
         assert s > 0.0
         if number % 100 == 0:
@@ -95,7 +97,16 @@ def test_filter_is_consistent_on_data_of_its_own_model(parameters):
             phase = 0.05 * step
             force, speed = 8000.0 * (1.0 + np.sin(phase)), 100.0 * np.cos(phase)
             inertia = -5.0 / 0.004 * np.sin(phase) * p["inertia"]
-            arguments = force, 250.0 + 0.1 * force, speed, inertia, 5e-5 * force + inertia, np.tanh(speed / 5.0), 0.2 * step, (step / 1e3, step / 4e3)
+            arguments = (
+                force,
+                250.0 + 0.1 * force,
+                speed,
+                inertia,
+                5e-5 * force + inertia,
+                np.tanh(speed / 5.0),
+                0.2 * step,
+                (step / 1e3, step / 4e3),
+            )
             to_f, h = _sensitivities(p, *arguments)
             set_walks(walked, p, np.zeros(STATES), step / 1e3, step / 4e3, 0.004)
             truth[FAST], truth[NOISE] = decay * truth[FAST], noise_decay * truth[NOISE]

@@ -1,11 +1,11 @@
-"""What has jumped: each change of an ideal brake is attributed to its path, ends in a small error with a sigma that covers it, and
+"""What has jumped: each change of an ideal brake is attributed to its path, ends in a small error with a sigma that covers
+it, and
 nothing is proven where nothing has changed."""
 
 import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import hypotheses
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     DISC_GROWTH,
@@ -13,8 +13,8 @@ from emb_daemon.estimator.hypotheses import (
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     mix,
-    open_all,
     open_again,
+    open_all,
     settle,
     share,
     suspected,
@@ -37,7 +37,8 @@ def p(parameters):
 
 
 def _drive(p, change=None, stops=12, seed=1, current=None, angle_m=0.0):
-    """Samples and true force of stops on a brake that becomes ``change(p)`` after `_BEFORE` of them; ``angle_m``: metres by which
+    """Samples and true force of stops on a brake that becomes ``change(p)`` after `_BEFORE` of them; ``angle_m``: metres by
+    which
     its contact angle then moves; ``current`` changes the later rows' current."""
     path = brake.stops(p, stops, seed)
     rows, force = brake.samples(p, path)
@@ -55,14 +56,22 @@ def _drive(p, change=None, stops=12, seed=1, current=None, angle_m=0.0):
 
 
 def _end(p, rows, force, stops=4):
-    """RMSE, largest error in sigma, share beyond three sigma and median sigma while clamped in the last ``stops``, and the state."""
+    """RMSE, largest error in sigma, share beyond three sigma and median sigma while clamped in the last ``stops``, and the
+    state."""
     state = new_state()
     estimates = estimate(rows, p, state)
     last = np.arange(len(rows)) >= len(rows) - stops * _STOP
     clamped = last & (force > 2000.0)
     error = (estimates["force"] - force)[clamped]
     off = np.abs(error) / estimates["sigma"][clamped]
-    return np.sqrt(np.mean(error**2)), off.max(), np.mean(off > 3.0), np.median(estimates["sigma"][clamped]), state[0], estimates
+    return (
+        np.sqrt(np.mean(error**2)),
+        off.max(),
+        np.mean(off > 3.0),
+        np.median(estimates["sigma"][clamped]),
+        state[0],
+        estimates,
+    )
 
 
 def _scaled(names, factor):
@@ -108,7 +117,8 @@ _CHANGES = {
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("name", _CHANGES)
 def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
-    """After the fourth stop the brake is another. Two stops later the force is right, its sigma small and honest, the change is
+    """After the fourth stop the brake is another. Two stops later the force is right, its sigma small and honest, the
+    change is
     held for what it is and nothing else took a part of it; until then no error beyond three sigma lasts a tenth of a second
     without being said."""
     change, expected = _CHANGES[name]
@@ -117,7 +127,9 @@ def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
     assert rmse < 100.0 and sigma < 150.0 and worst < 4.0 and beyond < 0.01
     learned = _learned(p, state)
     for what, nothing in _NOTHING.items():
-        assert learned[what] == pytest.approx(expected.get(what, 0.0), abs=max(nothing, 0.15 * abs(expected.get(what, 0.0)))), what
+        assert learned[what] == pytest.approx(
+            expected.get(what, 0.0), abs=max(nothing, 0.15 * abs(expected.get(what, 0.0)))
+        ), what
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
     assert _longest(silent) <= 25
     assert not estimates["reasons"][-6 * _STOP :].any()
@@ -129,7 +141,9 @@ def _longest(mask):
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-@pytest.mark.xfail(strict=True, reason="the contact angle takes 6 um of a positive offset that comes at standstill, and keeps them")
+@pytest.mark.xfail(
+    strict=True, reason="the contact angle takes 6 um of a positive offset that comes at standstill, and keeps them"
+)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_offset_that_closes_is_the_currents_too(p, seed):
     rows, force = _drive(p, seed=seed, stops=14, current=_shifted(1.0))
@@ -143,7 +157,7 @@ def test_a_motor_that_fades_with_heat_takes_no_stiffness_with_it(p, seed):
     """The torque constant loses a fifth over four minutes of stops: the torque path's gain follows."""
     rows, force = _drive(p, seed=seed, stops=80)
     rows["current_q"] /= 1.0 - 0.2 * np.linspace(0.0, 1.0, len(rows))
-    rmse, worst, beyond, sigma, state, estimates = _end(p, rows, force, stops=10)
+    rmse, _, beyond, sigma, state, estimates = _end(p, rows, force, stops=10)
     assert rmse < 100.0 and sigma < 150.0 and beyond < 0.01
     assert state["scale"] == pytest.approx(1.0, abs=0.02)
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
@@ -177,7 +191,8 @@ def clamped(p):
 
 
 def test_mixture_is_the_law_of_total_variance(p, clamped):
-    """Mean and variance of four hypotheses by their probabilities, forces and own variances; the first's own is what is left."""
+    """Mean and variance of four hypotheses by their probabilities, forces and own variances; the first's own is what is
+    left."""
     state, _, _ = clamped
     s, rng = state[0], np.random.default_rng(3)
     h, spread = np.zeros(STATES), 40.0
@@ -221,7 +236,7 @@ def test_model_error_counts_in_sigma_and_is_said(p, clamped):
 def test_unknown_temperature_counts_in_sigma(p, clamped, name):
     """40 K move the force by what the calibration's softening says: a start with hot pads, the pads' history, and what the
     thermal model itself may be off by."""
-    state, row, before = clamped
+    state, row, _ = clamped
     warm = p.copy()
     if name == "sigma":
         warm["thermal"]["sigma"] = 40.0
@@ -285,7 +300,9 @@ def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
     s = opened[0]
     wider = [np.diag(a["covariance"]) > 1.01 * np.diag(s["covariance"]) for a in s["alternatives"]]
     assert not np.any(wider[STIFFNESS_JUMP] & wider[TORQUE_JUMP]) and not np.any(wider[DISC_GROWTH] & wider[STIFFNESS_JUMP])
-    assert wider[STIFFNESS_JUMP][SCALE] and wider[TORQUE_JUMP][GAIN] and wider[TORQUE_JUMP][LOAD] and wider[TORQUE_JUMP][COULOMB]
+    assert (
+        wider[STIFFNESS_JUMP][SCALE] and wider[TORQUE_JUMP][GAIN] and wider[TORQUE_JUMP][LOAD] and wider[TORQUE_JUMP][COULOMB]
+    )
 
 
 def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):

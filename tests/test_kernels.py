@@ -71,7 +71,9 @@ def test_force_variance_is_that_of_the_states_the_force_rests_on():
     h[of_the_torque] = 0.0
     assert force_variance(P, h) == pytest.approx(h @ P @ h)
     h[of_the_torque] = 7.0
-    assert force_variance(P, h) == pytest.approx(h[list(OF_THE_FORCE)] @ P[np.ix_(OF_THE_FORCE, OF_THE_FORCE)] @ h[list(OF_THE_FORCE)])
+    assert force_variance(P, h) == pytest.approx(
+        h[list(OF_THE_FORCE)] @ P[np.ix_(OF_THE_FORCE, OF_THE_FORCE)] @ h[list(OF_THE_FORCE)]
+    )
 
 
 def test_filter_measurement_update():

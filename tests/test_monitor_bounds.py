@@ -57,8 +57,11 @@ def p():
     direction=st.floats(-1.0, 1.0),
     speed=st.sampled_from([CLOSING, OPENING, HOLDING]),
 )
-def test_the_true_force_of_any_brake_of_the_datasheet_is_within_the_bounds(p, force, gain, load, dry, offset, direction, speed):
-    """Share of the largest force; torque constant, friction and offset anywhere in their ranges; friction against the motion, or
+def test_the_true_force_of_any_brake_of_the_datasheet_is_within_the_bounds(
+    p, force, gain, load, dry, offset, direction, speed
+):
+    """Share of the largest force; torque constant, friction and offset anywhere in their ranges; friction against the
+    motion, or
     either way if the motor stands."""
     true = force * p["maximum_force"]
     against = np.sign(speed) if speed else direction
@@ -68,10 +71,13 @@ def test_the_true_force_of_any_brake_of_the_datasheet_is_within_the_bounds(p, fo
     assert low - 1.0 <= true <= high + 1.0
 
 
-@pytest.mark.parametrize(("gain", "friction", "offset"), [(1.0, 1.0, 0.0), (0.65, 0.1, 0.04), (1.09, 1.9, -0.04), (0.65, 1.9, 0.04)])
+@pytest.mark.parametrize(
+    ("gain", "friction", "offset"), [(1.0, 1.0, 0.0), (0.65, 0.1, 0.04), (1.09, 1.9, -0.04), (0.65, 1.9, 0.04)]
+)
 @pytest.mark.parametrize("seconds", [0.15, 1.0, 8.0])
 def test_strokes_at_any_speed_never_contradict_the_true_force(p, gain, friction, offset, seconds):
-    """From slow to as fast as the motor turns, with the noise of its sensors: the true force, known to 50 N, is never ruled out."""
+    """From slow to as fast as the motor turns, with the noise of its sensors: the true force, known to 50 N, is never ruled
+    out."""
     true = p.copy()
     for name in ("load_friction", "offset_friction"):
         true[name] *= friction
@@ -89,7 +95,8 @@ def test_strokes_at_any_speed_never_contradict_the_true_force(p, gain, friction,
 
 
 def test_bounds_of_a_holding_motor_by_hand(p):
-    """1 N m shown: at least 0.6 of it less offset and doubled friction, at most 1.1 of it and both over what the gear leaves."""
+    """1 N m shown: at least 0.6 of it less offset and doubled friction, at most 1.1 of it and both over what the gear
+    leaves."""
     low, high = Watched(p).hold(1.0)
     offset = OFFSET_SHARE * p["gear_gain"] * p["maximum_force"]
     dry, load = 2.0 * p["offset_friction"], 2.0 * p["load_friction"]
@@ -98,7 +105,8 @@ def test_bounds_of_a_holding_motor_by_hand(p):
 
 
 def test_a_closing_motor_pays_friction_and_an_opening_one_is_held_by_it(p):
-    """Closing, friction cannot hold the force up: a lower upper bound. Opening, it cannot have taken torque: a higher lower one."""
+    """Closing, friction cannot hold the force up: a lower upper bound. Opening, it cannot have taken torque: a higher lower
+    one."""
     standing, closing, opening = (Watched(p).hold(0.4, speed) for speed in (HOLDING, CLOSING, OPENING))
     assert closing[0] == pytest.approx(standing[0]) and closing[1] < 0.8 * standing[1]
     assert opening[1] == pytest.approx(standing[1]) and opening[0] > 1.2 * standing[0]

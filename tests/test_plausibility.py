@@ -86,7 +86,8 @@ def test_no_alarm_on_a_good_brake(seed):
 
 @pytest.mark.parametrize("begin", [_CLAMPING, _HOLDING, _BEFORE_RELEASE])
 def test_dead_current_is_named_and_stiffness_goes_on(begin):
-    """A current that repeats while the motor is clamped: Stuck within a twentieth of a second, StiffnessOnly, and the force is as
+    """A current that repeats while the motor is clamped: Stuck within a twentieth of a second, StiffnessOnly, and the force
+    is as
     good as ever."""
     estimates, force = _with(begin, _no_current)
     alarm, stuck = _alarm(estimates), np.flatnonzero(estimates["reasons"] & r.STUCK)
@@ -99,7 +100,8 @@ def test_dead_current_is_named_and_stiffness_goes_on(begin):
 
 @pytest.mark.parametrize("offset_A", [-4.0, 4.0])
 def test_current_with_an_offset_is_detected(offset_A):
-    """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second, covered
+    """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second,
+    covered
     by sigma as long as nothing tells which path is wrong, and over once the clearance has told."""
     begin = _HOLDING
     estimates, force = _with(begin, _current(offset_A))
@@ -150,7 +152,9 @@ def test_a_large_offset_at_power_on_may_be_a_clamped_brake(offset_A):
     samples["current_q"] += offset_A
     estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
     unknown = slice(30, 240)
-    assert np.all(estimates["reasons"][unknown] & r.CONTACT_UNCERTAIN) and np.all(estimates["source"][unknown] == r.TORQUE_ONLY)
+    assert np.all(estimates["reasons"][unknown] & r.CONTACT_UNCERTAIN) and np.all(
+        estimates["source"][unknown] == r.TORQUE_ONLY
+    )
     assert _honest(estimates, force, slice(30, None), 4.0)
     clamped = force > 2000.0
     if abs(offset_A) < 3.0:

@@ -12,10 +12,10 @@ import pytest
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE
 
 #: Bounds of the error on static/random_*mm, RMSE in N: dynamic stiffness, torque balance, maximum likelihood, Kalman filter.
 _RANDOM_RMSE_N = {"stiffness_force": 120.0, "torque_force": 610.0, "ml_force": 120.0, "force": 120.0}

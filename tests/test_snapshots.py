@@ -106,7 +106,7 @@ class Restart(types.SimpleNamespace):
 def restarted(loop, folder, real_ns):
     """A new process on the same folder, at another time of the real-time clock."""
     restart = Restart()
-    loop.adaptation = Adaptation({"FL": loop.calibration}, Memory(folder), real_ns, restart=restart)
+    loop.adaptation = Adaptation({"FL": loop.calibration}, Memory(folder), real_ns)
     loop.pipeline = type(loop.pipeline)(loop.parameters, ("FL",), capacity=64, adaptation=loop.adaptation)
     loop.pipeline.begin(0)
     return restart

@@ -4,8 +4,8 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.wire import contract as r
 from emb_daemon.offline import estimate
+from emb_daemon.wire import contract as r
 
 
 @pytest.fixture
@@ -38,7 +38,8 @@ def _covered(estimates, force, sigmas=3.0):
 
 
 def test_a_released_brake_is_known_from_the_first_sample_on(p):
-    """Nobody brakes, the park brake is off: the clearance counts from where the motor stands, and the first stroke is answered by
+    """Nobody brakes, the park brake is off: the clearance counts from where the motor stands, and the first stroke is
+    answered by
     both paths."""
     rows, force = brake.samples(p, np.concatenate([np.zeros(50), brake.clamp(p, 15.0, 0.3)]))
     estimates = estimate(rows, p)
@@ -49,7 +50,8 @@ def test_a_released_brake_is_known_from_the_first_sample_on(p):
 @pytest.mark.parametrize("past_contact", [4.0, 12.0, 22.0])
 @pytest.mark.parametrize(("name", "value"), [("park_brake", 1.0), ("brake_request", 4000.0), ("has_status", False)])
 def test_a_brake_that_may_be_clamped_says_so(p, name, value, past_contact):
-    """Park brake applied, brake requested or nothing heard of either: the torque alone, Degraded, for as long as that lasts."""
+    """Park brake applied, brake requested or nothing heard of either: the torque alone, Degraded, for as long as that
+    lasts."""
     rows, force = _clamped(p, past_contact)
     rows[name] = value
     estimates = estimate(rows, p)
@@ -92,7 +94,8 @@ def _latched_then(p):
 
 
 def test_what_was_latched_is_known_once_it_was_seen_released(p):
-    """Park brake off, nobody brakes, no torque, and the motor stands: from there the clearance counts, within a quarter second."""
+    """Park brake off, nobody brakes, no torque, and the motor stands: from there the clearance counts, within a quarter
+    second."""
     rows, force, stands = _latched_then(p)
     estimates = estimate(rows, p)
     unknown = np.flatnonzero(_unknown(estimates))
@@ -105,7 +108,7 @@ def test_what_was_latched_is_known_once_it_was_seen_released(p):
 
 @pytest.mark.parametrize(("name", "value"), [("park_brake", 1.0), ("brake_request", 2000.0), ("has_status", False)])
 def test_while_somebody_may_brake_standing_still_is_no_release(p, name, value):
-    rows, _, stands = _latched_then(p)
+    rows, _, _ = _latched_then(p)
     rows[name] = value
     assert np.all(_unknown(estimate(rows, p)))
 
@@ -121,9 +124,12 @@ def test_a_motor_that_moves_or_holds_is_not_released(p):
 
 
 def test_a_current_that_flows_in_no_motor_is_an_offset(p):
-    """A brake that stands released for a second holds nothing, whatever its current reads: known again, and the first stroke is
+    """A brake that stands released for a second holds nothing, whatever its current reads: known again, and the first
+    stroke is
     right."""
-    rows, force = brake.samples(p, np.concatenate([np.zeros(400), brake.clamp(p, 15.0, 0.5), np.full(100, p["clearance"] + 15.0)]))
+    rows, force = brake.samples(
+        p, np.concatenate([np.zeros(400), brake.clamp(p, 15.0, 0.5), np.full(100, p["clearance"] + 15.0)])
+    )
     rows["current_q"] += 3.0
     estimates = estimate(brake.noisy(rows, p), p)
     unknown = np.flatnonzero(_unknown(estimates[:400]))

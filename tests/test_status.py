@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.wire import contract as r
 from emb_daemon.estimator import status
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import TABLE, names, tell_status
 from emb_daemon.estimator.step import _look
+from emb_daemon.wire import contract as r
 
 #: Reasons that frames, bus and clock give, outside the estimator; test_faults.py, test_faults_loop.py and test_hostile.py raise
 #: each of them.
@@ -46,7 +46,8 @@ def test_each_fact_gives_its_reasons_and_source(name):
 
 @given(st.sets(st.sampled_from(list(TABLE))))
 def test_what_leaves_less_decides(chosen):
-    """Nothing leaves nothing, whatever else is true; without stiffness the torque goes on, whatever was said of the torque while
+    """Nothing leaves nothing, whatever else is true; without stiffness the torque goes on, whatever was said of the torque
+    while
     the paths were compared; else stiffness; else both."""
     reasons, source = _told(sum(_BITS[name] for name in chosen))
     left = {TABLE[name].source for name in chosen}
@@ -147,7 +148,8 @@ def test_what_no_brake_can_do_is_neither_told_nor_used(seen, field, value):
 
 
 def test_a_force_that_the_monitor_rules_out_is_replaced_by_its_bounds(seen):
-    """Not at once: a stroke may leave the smoothed torque behind. Then: the middle of the interval, with a sigma that reaches its
+    """Not at once: a stroke may leave the smoothed torque behind. Then: the middle of the interval, with a sigma that
+    reaches its
     ends and the force that was ruled out."""
     seen.facts(200)
     seen.state["monitor"]["low"], seen.state["monitor"]["high"] = 1000.0, 3000.0

@@ -19,7 +19,8 @@ class Car:
         self._counted, self._samples, self._heard = float(pulses_from), 0, False
 
     def drive(self, seconds, turning=0.0, wheel_speed=None, pulses=True, vehicle=True, rolling=None):
-        """``turning`` rad/s of the disc; ``wheel_speed`` what its sensor says, None if it is lost; ``rolling`` m/s of the vehicle.
+        """``turning`` rad/s of the disc; ``wheel_speed`` what its sensor says, None if it is lost; ``rolling`` m/s of the
+        vehicle.
 
         Returns what is told, shape (samples, 2)."""
         m, told = self.m, []
@@ -69,6 +70,13 @@ def test_pulses_that_were_not_heard_for_a_while_are_no_speed():
     late.drive(0.1, wheel_speed=0.0, pulses=False)
     late.drive(0.4, wheel_speed=0.0)
     assert not late.contradicted and late.drive(0.1)[-1, 0] < 0.5
+
+
+def test_a_speed_from_before_the_pulses_were_lost_is_forgotten():
+    car = Car()
+    car.drive(1.0, turning=20.0, vehicle=False)
+    car.drive(3.0, turning=0.0, pulses=False, vehicle=False)
+    assert np.all(car.drive(0.2, turning=0.0, vehicle=False)[:, 0] < 0.5)
 
 
 def test_vehicle_speed_alone_knows_the_tyre_to_a_tenth():
@@ -137,11 +145,12 @@ def test_when_all_is_lost_nothing_is_known():
 
 
 def test_what_is_not_seen_to_heat_may_have_heated(parameters):
-    """A stop at 7 kN of a turning disc: without any speed sigma of the temperature grows by what the stop heats, and it is said."""
+    """A stop at 7 kN of a turning disc: without any speed sigma of the temperature grows by what the stop heats, and it is
+    said."""
     import brake
 
-    from emb_daemon.wire.contract import TEMPERATURE_UNCERTAIN
     from emb_daemon.offline import estimate
+    from emb_daemon.wire.contract import TEMPERATURE_UNCERTAIN
 
     p = brake.ideal(parameters)
     up = brake.clamp(p, 14.0, 0.4)

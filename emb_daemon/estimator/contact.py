@@ -88,7 +88,9 @@ def seek_release(s, p, m):
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
         # A request may find the brake still open: a clamped one needs torque against which friction is small.
-        open_yet = m.has_status and m.park_brake == 0.0 and torque < _OPEN * p.offset_friction
+        # Frames at a reduced rate tell no torque, and such logs begin with an open brake.
+        easy = torque < _OPEN * p.offset_friction or m.dt > ONE_CYCLE_S
+        open_yet = m.has_status and m.park_brake == 0.0 and easy
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
 
