@@ -17,7 +17,7 @@ from emb_daemon.estimator.status import TABLE, names, tell_status
 from emb_daemon.estimator.step import _look
 from emb_daemon.wire import contract as r
 
-#: Reasons that frames, bus and clock give, outside the estimator; test_faults.py, test_faults_loop.py and test_hostile.py raise
+#: Reasons that frames, bus and clock give, outside the estimator. test_faults.py, test_faults_loop.py, test_hostile.py raise
 #: each of them.
 _OUTSIDE = (
     r.RESOLVER_LOST | r.CURRENT_LOST | r.THERMOCOUPLE_LOST | r.WHEEL_SPEED_LOST | r.WHEEL_PULSE_LOST | r.VEHICLE_STATUS_LOST
