@@ -115,7 +115,8 @@ def test_interface_down_and_up(driven):
     driven.bus.down = False
     up = driven.run(_SHOWN_CYCLES + 30)
     assert up["is_sample"][0] and up["source"][0] != r.INVALID and up["reasons"][0] & r.BUS_DISTURBED
-    assert up["reasons"][-1] == 0 and up["source"][-1] == r.FUSED
+    # What the brake did meanwhile nobody saw: paths may disagree until the next release.
+    assert up["reasons"][-1] & ~r.PATHS_DISAGREE == 0 and up["source"][-1] == r.FUSED
     assert driven.bus.unsent > 0
 
 

@@ -13,7 +13,7 @@ from emb_daemon.adapt.fit import settle, unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.jit import njit
-from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -143,11 +143,11 @@ def _progress(a, limits):
 
 @njit
 def apply_learned(s, p, scratch, rows, learned, a):
-    """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the path
-    models to the last of ``rows``.
+    """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
+    path models to the last of ``rows``.
 
-    Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the
-    contact angle is weighed against that."""
+    Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
+    angle is weighed against that."""
     kept, known = True, s.covariance[CONTACT, CONTACT]
     for i in range(len(p.curve)):
         kept = kept and learned.curve[i] == p.curve[i]
@@ -182,6 +182,8 @@ def apply_learned(s, p, scratch, rows, learned, a):
     else:
         s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
         s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
+        # What the stroke left open of the new curve, driving may still find.
+        s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
     s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
     if not kept:

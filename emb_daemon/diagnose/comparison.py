@@ -5,7 +5,7 @@ import numpy as np
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.residuals import Bench, Trial
 from emb_daemon.offline.run import estimate
-from emb_daemon.offline.score import PATHS, EpisodeErrors, conditions, is_turning
+from emb_daemon.offline.score import PATHS, EpisodeErrors, conditions, first_known, is_turning
 
 _RESAMPLES = 1000
 
@@ -16,6 +16,7 @@ def errors_of(bench: Bench, trial: Trial, estimates: np.ndarray) -> EpisodeError
     log = trial.log
     if bench.has_reference:
         errors = {path: estimates[column] - log.force_N for path, column in PATHS.items()}
+        errors["fused"][: first_known(estimates)] = np.nan
         return EpisodeErrors.of(errors, conditions(log.samples, estimates, log.force_N), trial.episode)
     turning = is_turning(log.samples)
     errors = {"innovation": estimates["torque_force"] - estimates["stiffness_force"]}

@@ -199,6 +199,7 @@ def take_sides(s, p, m, out):
         spread = p.gear_gain * hypot(out.stiffness_sigma, out.torque_sigma)
         beyond = beyond_friction(torque, s.force, spread, p.gear_gain, load, coulomb)
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
     if s.torque_age >= _OLD_S:
         facts |= TORQUE_OLD
     if unproven(s) > _NOTED * p.maximum_force:
@@ -209,8 +210,12 @@ def take_sides(s, p, m, out):
         # A latched brake needs no current: the torque then says that nothing is known.
         latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
         c.contradiction = 0.0
-        out.force, out.sigma = force, hypot(sigma, latched)
-        return facts | CONTACT_UNKNOWN | (0 if m.has_current else NO_SOURCE)
+        if s.seen:
+            out.force, out.sigma = force, hypot(sigma, latched)
+        else:
+            # The first samples' torque is noise and nothing else.
+            out.sigma = hypot(sigma, max(latched, force))
+        return facts | CONTACT_UNKNOWN | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if s.contact.lost:
         # The contact angle was found wrong and explains what came before.
         c.contradiction = 0.0
@@ -221,7 +226,7 @@ def take_sides(s, p, m, out):
         facts |= MODEL_ERROR
     if c.verdict == STIFFNESS_WRONG:
         out.force, out.sigma = force, sigma
-        return facts | RESOLVER_IMPLAUSIBLE | (0 if m.has_current else NO_SOURCE)
+        return facts | RESOLVER_IMPLAUSIBLE | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = hypot(out.sigma, out.innovation)
     if c.verdict == TORQUE_FROZEN:

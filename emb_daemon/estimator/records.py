@@ -185,6 +185,7 @@ STATE = np.dtype(
         ("gain", "f8", (STATES,)),
         ("current_before", "f8"),
         ("had_current", "?"),
+        ("no_current_s", "f8"),
         ("trusted", "?"),
         ("contact_anchor", "f8"),
         ("scale", "f8"),

@@ -40,7 +40,7 @@ TABLE = {
     "jump_suspected": Fact("contact, stiffness, friction or current may have changed at once", PATHS_DISAGREE, FUSED),
     "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
-    "resolver_implausible": Fact("the resolver is frozen, or its angle contradicts its speed", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
+    "resolver_implausible": Fact("the resolver is frozen, or contradicts itself", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
     "contact_sought": Fact("meanwhile the torque knows the force better", CONTACT_UNCERTAIN, TORQUE_ONLY),
@@ -58,8 +58,8 @@ TABLE = {
 
 #: Bit of each fact.
 (
-    ZERO_MOVED, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE, RESOLVER_IMPLAUSIBLE,
-    CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK,
+    ZERO_MOVED, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
+    RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK,
     WHEEL_CONTRADICTED, BOUNDS_CONTRADICT, BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
 ) = (1 << bit for bit in range(len(TABLE)))  # fmt: skip
 

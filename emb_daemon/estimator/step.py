@@ -62,7 +62,7 @@ def _start(s, p, m):
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
-    s.torque_age = 1e9
+    s.torque_age = s.no_current_s = 1e9
     open_all(s, p)
     s.balance = np.nan
 
@@ -145,7 +145,8 @@ def _look(s, p, m, facts, out):
         middle = 0.5 * (low + high)
         out.sigma = max(0.5 * (high - low), out.sigma, abs(out.force - middle))
         out.force = middle
-    if not (np.isfinite(out.force) and np.isfinite(out.sigma)) or out.force > _POSSIBLE * p.maximum_force:
+    number = np.isfinite(s.force) and np.isfinite(out.force) and np.isfinite(out.sigma)
+    if not number or out.force > _POSSIBLE * p.maximum_force:
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force
     out.sigma = min(out.sigma, p.maximum_force)

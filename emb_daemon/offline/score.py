@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
+
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
 _MOVING = 5.0
 #: Reference force (N) below which the pads hang in the clearance.
@@ -67,18 +69,28 @@ def is_turning(samples: np.ndarray) -> np.ndarray:
     return samples["has_wheel_speed"] & (samples["wheel_speed"] > _TURNING)
 
 
+def first_known(estimates: np.ndarray) -> int:
+    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing."""
+    return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
+
+
 def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
-    """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference."""
+    """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference.
+
+    The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before."""
     if not np.isfinite(reference_N).any():
         return {}
     masks = conditions(samples, estimates, reference_N)
     result: dict = {}
     for path, column in PATHS.items():
         error = estimates[column] - reference_N
+        if path == "fused":
+            error[: first_known(estimates)] = np.nan
         result[path] = figures(error) | {
             "conditions": {name: figures(error[mask]) for name, mask in masks.items() if mask.any()}
         }
     result["inside_two_sigma"] = share_inside(estimates["force"] - reference_N, estimates["sigma"])
+    result["unknown_samples"] = first_known(estimates)
     return result
 
 
