@@ -21,6 +21,10 @@ _AVERAGED_S = (30.0, 60.0, 60.0)
 _RATIO = tuple(
     1.0 + 6.0 * 1.5 * (2.0 * horizon / averaged) ** 0.5 for horizon, averaged in zip(HORIZONS_S, _AVERAGED_S, strict=True)
 )
+#: Mean square over the expected one that counts at most: a jump is the hypotheses' to find and must not be remembered for
+#: minutes after they have.
+_COUNTED = 16.0
+
 #: What a test says.
 UNKNOWN, CONSISTENT, INCONSISTENT = range(3)
 
@@ -45,8 +49,16 @@ def remember(c, innovation, sigma, dt):
         c.mean[i] += share * (innovation - c.mean[i])
         c.variance[i] = (1.0 - share) ** 2 * c.variance[i] + share * share * sigma * sigma
         slow = 1.0 - exp(-dt / min(_AVERAGED_S[i], max(c.seen_s, dt)))
-        c.square[i] += slow * (c.mean[i] * c.mean[i] - c.square[i])
+        c.square[i] += slow * (min(c.mean[i] * c.mean[i], _COUNTED * c.variance[i]) - c.square[i])
         c.expected[i] += slow * (c.variance[i] - c.expected[i])
+
+
+@njit
+def forget(c):
+    """Begin anew: what was left unexplained has been explained."""
+    c.seen_s = 0.0
+    c.square[:] = 0.0
+    c.expected[:] = 0.0
 
 
 @njit

@@ -4,7 +4,7 @@ from math import exp, hypot, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.consistency import model_error, remember
+from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     fold,
@@ -165,13 +165,15 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
                 weigh(a, least_odds(kind), first, variance, second, variance_a)
             if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
                 out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
-        if trusted and out.innovation_sigma < _TELLING * p.maximum_force:
+        # At rest friction's error stays what it is: no noise, and no news.
+        if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
         s.torque_age = 0.0 if trusted else s.torque_age + m.dt
         fold(s, warmth, True)
         if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
             fold(s, warmth, False)
             open_all(s, p)
+            forget(s.consistency)
     else:
         out.torque_sigma = np.inf
         s.torque_age += m.dt
