@@ -13,9 +13,9 @@ import pytest
 from bus_tools import CHANNEL
 
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.adapt.records import RESULT_ACCEPTED
 from emb_daemon.resources import resource
 from emb_daemon.runtime.bus import open_bus
+from emb_daemon.wire.contract import RESULT_ACCEPTED
 
 pytestmark = pytest.mark.target("can")
 
