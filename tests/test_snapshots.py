@@ -1,7 +1,5 @@
 """What survives a restart: stored whole, given back to the same brake alone, and never believed when damaged."""
 
-import types
-
 import adaptkit
 import msgspec
 import numpy as np
@@ -88,54 +86,38 @@ def test_a_file_of_another_format_is_set_aside(tmp_path):
     assert "format 9" in snapshots.load("FL", SHIPPED)[2] and not path.exists()
 
 
-class Restart(types.SimpleNamespace):
-    """An estimator that keeps its contact angle, and notes with what it was resumed."""
-
-    SNAPSHOT = np.dtype([("contact_angle", "f8"), ("force", "f8")])
-
-    def __init__(self):
-        super().__init__(resumed=[])
-
-    def take_snapshot(self, state, p, snapshot):
-        snapshot["contact_angle"], snapshot["force"] = state["contact_angle"], state["fused"]
-
-    def resume(self, state, p, sample, snapshot, elapsed_s):
-        self.resumed.append((snapshot["contact_angle"], elapsed_s, bool(state["started"])))
-
-
 def restarted(loop, folder, real_ns):
     """A new process on the same folder, at another time of the real-time clock."""
-    restart = Restart()
     loop.adaptation = Adaptation({"FL": loop.calibration}, Memory(folder), real_ns)
     loop.pipeline = type(loop.pipeline)(loop.parameters, ("FL",), capacity=64, adaptation=loop.adaptation)
     loop.pipeline.begin(0)
-    return restart
 
 
 @pytest.fixture
 def driven(tmp_path):
     """A closed loop that was stopped after three seconds with the park brake on."""
     loop = ClosedLoop(tmp_path)
-    restart = restarted(loop, tmp_path, lambda time_ns: time_ns + 10**18)
+    restarted(loop, tmp_path, lambda time_ns: time_ns + 10**18)
     loop.run(parked(2.0, 8000.0))
-    assert restart.resumed == []
+    assert not loop.pipeline.states[0]["resumed"]
     loop.adaptation.close(loop.pipeline.states, loop.parameters)
     return loop, float(loop.pipeline.states[0]["contact_angle"]), int(loop.adaptation.adapters[0]["time_ns"])
 
 
 def test_a_restart_goes_on_with_the_first_sample(driven, tmp_path):
     loop, contact_angle, stopped_ns = driven
-    restart = restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
+    restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
     loop.run(parked(0.5))
-    assert restart.resumed == [(contact_angle, pytest.approx(60.0), False)]
+    state = loop.pipeline.states[0]
+    assert state["resumed"] and state["clearance"] == pytest.approx(contact_angle, abs=0.05)
 
 
 def test_a_snapshot_from_the_future_is_not_used(driven, tmp_path, caplog):
     """The real-time clock was set back, or there is none."""
     loop, _, _ = driven
-    restart = restarted(loop, tmp_path, lambda time_ns: 10**18)
+    restarted(loop, tmp_path, lambda time_ns: 10**18)
     loop.run(parked(0.5))
-    assert restart.resumed == [] and "future" in caplog.text
+    assert not loop.pipeline.states[0]["resumed"] and "future" in caplog.text
 
 
 def test_what_is_kept_is_as_old_as_promised(tmp_path):

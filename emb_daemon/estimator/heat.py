@@ -16,6 +16,8 @@ TOUCHING_N = 200.0
 #: Rise of pads over that of their backing plates while heat is on its way: the pad's own resistance over that to the plate's
 #: surroundings.
 _BEHIND_PLATES = 4.0
+#: By which thermocouples of a brake at rest differ: their tolerance (IEC 60584, class 1: 1.5 K each) and noise, K.
+_PLATES_SPREAD_K = 3.0
 #: Disc speed that is assumed where nothing tells of it, for what it may have heated, rad/s: 110 km/h.
 _UNSEEN_RAD_PER_S = 100.0
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
@@ -46,7 +48,8 @@ def _start_heat(s, t, m):
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
     # Plates that are not as warm as all around them tell of heat on its way, and nothing of how long it has been.
     around = m.ambient if m.has_status else m.caliper
-    s.temperature_sigma = s.history_sigma = _BEHIND_PLATES * max(abs(s.disc - m.caliper), abs(s.disc - around))
+    apart = max(abs(s.disc - m.caliper), abs(s.disc - around))
+    s.temperature_sigma = s.history_sigma = _BEHIND_PLATES * max(apart - _PLATES_SPREAD_K, 0.0)
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
