@@ -16,7 +16,6 @@ from emb_daemon.estimator.hypotheses import (
     open_again,
     open_all,
     settle,
-    share,
     suspected,
     to_force,
     weigh,
@@ -209,8 +208,8 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
     weights = np.array(odds) / np.sum(odds)
     mean = weights @ forces
     variance = weights @ variances + weights @ (np.array(forces) - mean) ** 2
-    assert [share(s, kind) for kind in range(ALTERNATIVES)] == pytest.approx(weights[1:])
     assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
+    assert s["alternatives"]["share"] == pytest.approx(weights[1:])
 
 
 def test_an_unproven_jump_counts_in_sigma_and_is_said(p, clamped):

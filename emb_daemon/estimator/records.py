@@ -151,6 +151,10 @@ STATE = np.dtype(
         ("since_start_s", "f8"),
         ("still_s", "f8"),
         ("start_angle", "f8"),
+        # Angle (rad) gone without speed since the motor stands, and for how long; time for which that still counts.
+        ("drifted", "f8"),
+        ("stood_s", "f8"),
+        ("drifting_s", "f8"),
         ("passed", "f8"),
         ("opposing", "f8"),
         ("angle", "f8"),
@@ -214,6 +218,8 @@ STATE = np.dtype(
         # Standard deviations, K, left from a start with hot pads.
         ("temperature_sigma", "f8"),
         ("history_sigma", "f8"),
+        # What of the stiffness they left open at the last sample, share.
+        ("softening", "f8"),
         ("temperature_known", "?"),
         # Backing plates: last readings, degC, the pads' mean temperatures when they last moved, what these have gained
         # since over time, K s, and whether a reading is stuck.

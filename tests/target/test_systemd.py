@@ -26,6 +26,7 @@ pytestmark = pytest.mark.target("systemd")
 UNIT = "emb-daemon.service"
 CONFIG = Path("/etc/emb_daemon/emb.yaml")
 CACHE = Path("/var/cache/emb_daemon")
+STATE = Path("/var/lib/emb_daemon")
 LOG = RIG / "static" / "random_6p5mm.log.gz"
 RESOLVER, CURRENT, CLAMP_FORCE = 0x100, 0x110, 0x200
 PREDICTED = 3
@@ -311,7 +312,11 @@ def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., 
     and, with whatever delays the machine added, of the bus as it was recorded."""
     played = tmp_path / "random_6p5mm.log"
     played.write_bytes(gzip.decompress(LOG.read_bytes()))
-    systemctl("restart", UNIT)
+    # What the daemon knew from before is not in the log.
+    systemctl("stop", UNIT)
+    for snapshot in STATE.glob("restart-*.json"):
+        snapshot.unlink()
+    systemctl("start", UNIT)
     with record(",200:7FF,100:700") as recording:
         time.sleep(1)
         with playing(played) as player:
