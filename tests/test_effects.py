@@ -88,8 +88,8 @@ def test_catalogue_is_that_of_the_contract():
     assert sorted(effect.name for effect in REGISTRY) == sorted(CONTRACT)
 
 
-#: `identify` names what it fits of a campaign; `plant` is a brake of its own, with effects of its own.
-_MAY_NAME = ("effects", "plant", "identify")
+#: `plant` is a brake of its own, with effects of its own.
+_MAY_NAME = ("effects", "plant")
 
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
