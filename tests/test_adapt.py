@@ -20,13 +20,14 @@ from emb_daemon.adapt.pairs import FORCE, pairs_of_passes
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.estimator.records import ADAPTING, DEGRADED, INVALID, PARAMETERS, new_state
+from emb_daemon.estimator.records import PARAMETERS, new_state
 from emb_daemon.logs.read import read_frames
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.scenarios import park, random_angle, rest, training
 from emb_daemon.replay import Replay
 from emb_daemon.wire import contract
+from emb_daemon.wire.contract import ADAPTING, DEGRADED, INVALID
 from emb_daemon.wire.layout import load_database
 from studies.adaptation import kills, specimen, wear
 
