@@ -1,6 +1,5 @@
 """emb-daemon identify on logs of the simulated rig: figures, faults, provenance, report."""
 
-import collections
 import contextlib
 import hashlib
 import io
@@ -26,7 +25,7 @@ def _campaign(folder, rig, text):
 
 
 @pytest.fixture(scope="module")
-def identified(rig, tmp_path_factory):
+def identified(rig, tmp_path_factory, counted_reads):
     """A campaign on three pad thicknesses with an empty and a wrong log, run once by the command; reads by file name."""
     folder = tmp_path_factory.mktemp("identify")
     (folder / "empty.log").write_text("")
@@ -50,14 +49,7 @@ frequency_response:
 """,
     )
     out, err = io.StringIO(), io.StringIO()
-    reads = collections.Counter()
-
-    def counted(path):
-        reads[path.name] += 1
-        return path.read_bytes()
-
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(read, "read_file", counted)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), counted_reads() as reads:
         status = main(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "report")])
     outputs = {"out": out.getvalue(), "err": err.getvalue(), "reads": reads}
     assert status == 0, outputs["err"]
