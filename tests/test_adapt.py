@@ -1,6 +1,7 @@
 """Park brake adaptation: what is learned, when it is not, and what is remembered."""
 
 import itertools
+import shutil
 import time
 
 import adaptkit
@@ -637,12 +638,20 @@ def test_pads_softer_than_any_that_were_calibrated_are_rejected(ideal):
 # --- Memory ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def learned(tmp_path):
-    """A closed loop that has learned, and its folder."""
-    loop = ClosedLoop(tmp_path, pads_mm=6.0)
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taught")
+    loop = ClosedLoop(folder, pads_mm=6.0)
     loop.run(parked(60.0), until=lambda e: e["adapt_result"] != contract.NO_RESULT)
-    return loop, tmp_path
+    return loop, folder
+
+
+@pytest.fixture
+def learned(taught, tmp_path):
+    """A closed loop that has learned, to look at, and a copy of its folder."""
+    loop, folder = taught
+    shutil.copytree(folder, tmp_path / "state")
+    return loop, tmp_path / "state"
 
 
 def test_learned_values_come_back_after_a_restart(learned):
