@@ -44,11 +44,13 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
-_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(7)
-TORQUE_CONSTANT = "motor.torque_constant_Nm_per_A"
+_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
+TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
+#: The same of the inertia, where pads are asked whether they are the old ones: rotors and screws of one drawing differ by a tenth.
+_INERTIA_SIGMA = 0.1
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
@@ -91,8 +93,8 @@ def _run(states, parameters, rows, residual, force):
 
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithm of the presliding
-    angle, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
+    angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
@@ -119,8 +121,10 @@ class _Training:
         The first is the torque's mean over `_BLOCK` samples in standard deviations of what noise makes of it *with the trial's
         torque constant*: current and acceleration are both measured (Deming's regression), and in other units a small torque
         constant would seem to explain more because it makes the current's noise small."""
-        torque_constant = self._calibration.motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
-        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant})
+        motor = self._calibration.motor
+        torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
+        inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
+        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
         self._states[0] = self._state
         self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
@@ -233,7 +237,7 @@ def _fit(training, x, steps, free):
     """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
     against that; outliers are left out of the second round."""
     prior = np.zeros(len(x))
-    prior[_GAIN] = _GAIN_SIGMA**-2
+    prior[_GAIN], prior[_INERTIA] = _GAIN_SIGMA**-2, _INERTIA_SIGMA**-2
     first = _improve(training, x, steps, prior, free)
     far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
     if np.mean(far) <= _FEW:
@@ -325,13 +329,15 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     top = highest - contact
     scale = max(start @ top**powers, 1.0) / top**powers
     friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
-    x = np.array([contact, 0.0, 0.0, *friction, *start / scale])
+    x = np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale])
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(now["offset_friction"], 1e-4)
 
     training = _Training(rows, calibration, state, scale)
-    fit = _fit(training, x, steps, np.arange(len(x)))
-    # Pads that did not change keep the curve of a whole campaign, however much better one with more freedom fits the noise.
+    fit = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
+    # Pads that did not change keep the curve of a whole campaign, however much better one with more freedom fits the noise. An
+    # inertia that the calibration does not know makes motor and pads look stronger by the same share; that both became so by
+    # chance is no explanation.
     held = fit.x.copy()
     held[_CURVE:] = now["curve"][:terms] / scale
     held = _fit(training, held, steps, np.arange(_CURVE))
