@@ -140,9 +140,6 @@ def _longest(mask):
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the contact angle takes 6 um of a positive offset that comes at standstill, and keeps them"
-)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_offset_that_closes_is_the_currents_too(p, seed):
     rows, force = _drive(p, seed=seed, stops=14, current=_shifted(1.0))
