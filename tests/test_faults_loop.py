@@ -19,6 +19,7 @@ from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.runtime import rawcan
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
 from emb_daemon.wire import contract as r
@@ -35,7 +36,7 @@ class Bus:
     def __init__(self):
         self.waiting: list[np.ndarray] = []
         self.dropped = self.unsent = 0
-        self.down = False
+        self.down = self.full = False
 
     def drain(self):
         frames = np.concatenate(self.waiting) if self.waiting and not self.down else np.zeros(0, FRAME)
@@ -144,6 +145,33 @@ def test_process_stall(driven, stall_ms):
     assert after["reasons"][5] == r.DEADLINE_MISSED and after["reasons"][-1] == 0 and np.all(after["source"] == r.FUSED)
 
 
+def test_a_current_that_is_queued_late_still_belongs_to_its_sample(driven):
+    """Stamped in time, and in the queue only after the loop has looked: replay of the bus's log pairs them, and so does the
+    loop."""
+    late = [frame for frame in driven._drive[driven.cycle] if frame["can_id"][0] == 0x110]
+    assert len(late) == 1
+    driven._drive[driven.cycle] = [frame for frame in driven._drive[driven.cycle] if frame["can_id"][0] != 0x110]
+    before = len(driven.estimates)
+    driven.run(1)
+    driven.bus.waiting += late
+    driven.daemon.tick(driven.cycle * CYCLE_NS - CYCLE_NS // 4, driven.pacer)
+    assert len(driven.estimates) == before + 1 and np.isfinite(driven.estimates[-1]["torque_force"])
+
+
+def test_what_a_full_batch_leaves_in_the_queue_is_not_missed(driven):
+    """After half a second's stall more is waiting than one look takes: what is still to come was not lost."""
+    stalled, smooth = driven, Driven()
+    smooth.run(150)
+    expected = smooth.run(60)
+    frames = np.concatenate([frame for cycle in range(150, 210) for frame in stalled._drive[cycle]])
+    before = len(stalled.estimates)
+    for batch in (frames[:51], frames[51:]):
+        stalled.bus.waiting, stalled.bus.full = [batch], len(batch) == 51
+        stalled.daemon.tick(210 * CYCLE_NS, stalled.pacer)
+    answered = np.array(stalled.estimates[before:])
+    assert np.all(answered["is_sample"]) and answered["force"].tobytes() == expected["force"].tobytes()
+
+
 def test_step_of_the_real_time_clock(monkeypatch):
     """Kernel stamps are of CLOCK_REALTIME. Stepped by an hour either way while frames wait, none comes from the past or the
     future, and order is kept."""
@@ -181,20 +209,40 @@ def test_a_hold_up_between_reading_two_clocks_moves_no_stamp(monkeypatch):
         assert abs(bus._offset_ns - before) < 2_000_000
 
 
-def test_a_stamp_before_the_last_drain_or_after_now_is_held_between_them():
+def test_a_stamp_that_cannot_be_is_held_between_what_was_heard_before_and_now():
     near, far = socket_pair()
-    far.drain()
-    earliest = far._last_drain_ns
     for wrong in (-(10**12), 10**12):
         batch = far._received
-        batch.raw["time_ns"][:1] = earliest + wrong
-        batch.headers["length"][:1] = 24
-        batch.headers["control_length"][:1] = 0
+        batch.raw["time_ns"][:1] = far._latest_ns + wrong
+        batch.headers["length"][:1], batch.headers["control_length"][:1] = 24, 0
         now = time.monotonic_ns()
         assert far._take(1, now)[0] == 1
-        assert earliest <= far._frames["time_ns"][0] <= now
+        assert far._latest_ns <= far._frames["time_ns"][0] <= now
     near.close()
     far.close()
+
+
+def test_a_frame_that_comes_while_the_loop_is_held_up_keeps_its_stamp(monkeypatch):
+    """Held up between looking into the queue and at the clock: what comes meanwhile is stamped before that. A log of the bus
+    has the stamp, and the estimate is to be made with it too."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs:
+        ours.bind(("127.0.0.1", 0))
+        ours.setsockopt(socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, 1)
+        theirs.connect(ours.getsockname())
+        bus, clock, sent = RawCanSocket(ours), time.monotonic_ns, []
+
+        def take(*arguments):
+            theirs.send(bytes(16))
+            sent.append(clock())
+            time.sleep(0.005)
+            return real_take(arguments[0], clock())
+
+        theirs.send(bytes(16))
+        real_take = bus._take
+        monkeypatch.setattr(bus, "_take", take)
+        assert len(bus.drain()) == 1
+        monkeypatch.undo()
+        assert bus.drain()["time_ns"][0] <= sent[0]
 
 
 def test_a_peer_that_is_gone_sends_nothing():

@@ -31,6 +31,9 @@ from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 
 #: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
 _MARGIN_NS = 200_000
+#: How long a frame may take from its stamp to the queue without the loop answering as if it did not come: a replay of the
+#: bus's log knows only the stamp.
+_QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are answered in one tick.
 _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
@@ -173,7 +176,7 @@ class Daemon:
             if remaining > 0:
                 time.sleep(1e-9 * remaining)
             else:
-                self._bus.wait(1e-9 * (CYCLE_NS // 2))
+                self._bus.wait(1e-9 * _QUEUED_NS)
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
@@ -193,10 +196,11 @@ class Daemon:
     def tick(self, now_ns: int, pacer: Pacer) -> None:
         """Everything that has arrived, answered."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
+        heard_ns = int(frames["time_ns"][-1]) if self._bus.full else now_ns - _QUEUED_NS
         while True:
             start, count = pipeline.collect(frames, start, predictions=False)
             if start >= len(frames):
-                count = pipeline.overdue(now_ns, count)
+                count = pipeline.overdue(heard_ns, count)
             pipeline.answer(count)
             self._bus.send(pipeline.broadcast(count))
             self._follow(count, pacer)
