@@ -19,6 +19,7 @@ from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.errors import Unavailable
 from emb_daemon.runtime import rawcan
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
@@ -55,6 +56,7 @@ class Driven:
         self.bus = Bus()
         self.daemon = Daemon(Setup(CONFIG), self.bus)
         self.daemon.pipeline.corners["active"] = [True, False, False, False]
+        self.daemon._active = 1
         self.daemon.pipeline.begin(0)
         self.pacer = Pacer(0)
         self.cycle = 0
@@ -148,14 +150,14 @@ def test_process_stall(driven, stall_ms):
 def test_a_current_that_is_queued_late_still_belongs_to_its_sample(driven):
     """Stamped in time, and in the queue only after the loop has looked: replay of the bus's log pairs them, and so does the
     loop."""
-    late = [frame for frame in driven._drive[driven.cycle] if frame["can_id"][0] == 0x110]
-    assert len(late) == 1
-    driven._drive[driven.cycle] = [frame for frame in driven._drive[driven.cycle] if frame["can_id"][0] != 0x110]
-    before = len(driven.estimates)
-    driven.run(1)
+    frames = driven._drive[driven.cycle]
+    late = [frame for frame in frames if frame["can_id"][0] == 0x110]
+    driven.bus.waiting += [frame for frame in frames if frame["can_id"][0] != 0x110]
+    looked, before = int(late[0]["time_ns"][0]) + 2_500_000, len(driven.estimates)
+    driven.daemon.tick(looked, driven.pacer)
     driven.bus.waiting += late
-    driven.daemon.tick(driven.cycle * CYCLE_NS - CYCLE_NS // 4, driven.pacer)
-    assert len(driven.estimates) == before + 1 and np.isfinite(driven.estimates[-1]["torque_force"])
+    driven.daemon.tick(looked + 500_000, driven.pacer)
+    assert len(late) == 1 and len(driven.estimates) == before + 1 and np.isfinite(driven.estimates[-1]["torque_force"])
 
 
 def test_what_a_full_batch_leaves_in_the_queue_is_not_missed(driven):
@@ -281,6 +283,70 @@ def test_full_disk_under_the_state_directory(tmp_path, monkeypatch, caplog, code
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation-FL.json"], "nothing half written is left"
     assert isinstance(memory_.read("FL"), Store)
     assert loop.adaptation.current("FL") is not None, "what was learned is in use all the same"
+
+
+def _pinged(daemon):
+    said = []
+    daemon._manager.notify = lambda *assignments: said.extend(assignments)
+    assert daemon._ping() == ("WATCHDOG=1" in said)
+    return "WATCHDOG=1" in said
+
+
+def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(driven):
+    """Resolver stuck, no current: Invalid, and a restart would mend nothing. A state that is no number is another matter."""
+    estimate = driven.daemon.pipeline.estimates[0]
+    for name, value in (("is_sample", True), ("source", r.INVALID), ("corner", 0)):
+        estimate[name] = value
+    driven.daemon._follow(1, driven.pacer)
+    assert _pinged(driven.daemon)
+    driven.daemon.pipeline.states[0]["alternatives"][1]["error"][2] = np.nan
+    driven.daemon._follow(1, driven.pacer)
+    assert not _pinged(driven.daemon)
+
+
+def test_a_loop_that_misses_most_of_its_ticks_is_not_well(driven, caplog):
+    driven.run(20)
+    assert _pinged(driven.daemon)
+    driven.run(100, ticks=20)
+    assert not _pinged(driven.daemon) and "80 of 100 periods missed" in caplog.text
+    driven.run(20)
+    assert _pinged(driven.daemon), "it recovered"
+
+
+def test_a_loop_that_answers_for_no_corner_is_not_well(driven, caplog):
+    assert _pinged(driven.daemon)
+    driven.daemon.ticks += 100
+    assert not _pinged(driven.daemon) and "corner FL: no estimate" in caplog.text
+
+
+def test_an_interface_that_is_down_is_no_reason_to_restart(driven):
+    driven.bus.down = True
+    driven.run(60)
+    assert _pinged(driven.daemon)
+
+
+def test_an_interface_that_was_deleted_and_added_again_is_bound_again():
+    """The old socket says once that its interface is gone, and nothing any more; another is tried for until it is there."""
+    (old, _), (new, theirs) = socket_pair(), socket_pair()
+    found = [Unavailable("no such interface"), new._socket]
+
+    def reopen():
+        result = found.pop(0)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    bus = RawCanSocket(old._socket, stamped=True, reopen=reopen)
+    bus._failed(errno.ENODEV)
+    assert len(bus.drain()) == 0 and bus.down and len(found) == 1
+    frames = np.zeros(1, FRAME)
+    frames["can_id"], frames["length"] = 0x100, 8
+    theirs.send(frames)
+    assert len(bus.drain()) == 0 and len(found) == 1, "not at every tick"
+    bus._reopen_ns -= rawcan._REOPEN_NS
+    assert bus.drain()["can_id"].tolist() == [0x100] and not bus.down and bus._reopen_ns is None
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        bus._failed(errno.EBADF)
 
 
 def test_calibration_replaced_while_clamped(driven):
