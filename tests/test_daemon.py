@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_daemon.adapt import files
+from emb_daemon.adapt.snapshots import Snapshot
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.pipeline import Pipeline
@@ -49,9 +51,9 @@ def drive() -> list[np.ndarray]:
 class Running:
     """A daemon in a thread, and the other end of its bus."""
 
-    def __init__(self, setup: Setup, manager: ServiceManager | None = None):
+    def __init__(self, setup: Setup, manager: ServiceManager | None = None, state: Path | None = None):
         self.bus, theirs = socket_pair()
-        self.daemon = Daemon(setup, theirs, manager)
+        self.daemon = Daemon(setup, theirs, manager, state)
         self.daemon.warm_up()
         self.heard: list[np.ndarray] = []
         self._thread = threading.Thread(target=self.daemon.run)
@@ -171,6 +173,19 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
             except BlockingIOError:
                 break
         assert messages[-1] == b"STOPPING=1"
+
+
+def test_a_stop_keeps_what_is_known_at_that_moment(setup: Setup, drive, tmp_path: Path):
+    with Running(setup, state=tmp_path) as running:
+        for frames in drive[:200]:
+            running.send(frames)
+            time.sleep(0.004)
+        answered = running.wait_for(lambda frames: len(answers(frames)) >= 200)
+        stopped_ns = time.time_ns()
+    kept = files.decode((tmp_path / "restart-FL.json").read_bytes(), Snapshot)
+    assert len(answered) and abs(kept.time_ns - stopped_ns) < 2_000_000_000
+    pipeline = running.daemon.pipeline
+    assert kept.state["covariance"] == pipeline.states[0]["covariance"].tolist(), "of the last sample"
 
 
 def test_an_estimate_that_is_no_number_is_a_fault_and_not_pinged(setup: Setup, drive):

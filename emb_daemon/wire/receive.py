@@ -22,7 +22,8 @@ _NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
 _LONG = np.iinfo(np.int64).max
 
-#: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame; ``sequence_ns`` and ``sequence`` of the last
+#: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame, and whether its sender says that they are
+#: ``degraded``; ``sequence_ns`` and ``sequence`` of the last
 #: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``later_ns`` the least lateness among the
 #: ``seen`` frames of the present ``window``; ``candidate`` the counter of the last frame
 #: that did not stand in sequence, or -1, and ``candidate_ns`` when it came; ``refused_ns`` when a frame was last refused for
@@ -32,6 +33,7 @@ RECEPTION = np.dtype(
         ("values", "f8", (SIGNALS,)),
         ("time_ns", "i8"),
         ("counter", "i8"),
+        ("degraded", "?"),
         ("sequence_ns", "i8"),
         ("sequence", "i8"),
         ("due_ns", "i8"),
@@ -161,6 +163,7 @@ def receive(frame, receptions, layout):
         return slot, verdict
     reception.time_ns = frame.time_ns
     reception.counter = reception.sequence
+    reception.degraded = status_of(frame.data) == STATUS_DEGRADED
     for column in range(layout.received_count[slot]):
         reception.values[column] = unpack(frame.data, layout.received[slot, column])
     return slot, verdict
