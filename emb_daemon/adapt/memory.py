@@ -115,7 +115,7 @@ class Memory:
             OSError: not readable.
         """
         try:
-            content = self.path(corner).read_bytes()
+            content = files.read(self.path(corner))
         except FileNotFoundError:
             return None
         return decode(content)
@@ -134,7 +134,7 @@ class Memory:
         try:
             store = self.read(corner)
         except ValueError as error:
-            return empty, f"{self.path(corner)}: damaged ({error}), set aside as {files.set_aside(self.path(corner))}"
+            return empty, f"{self.path(corner)}: damaged ({error}), {files.set_aside(self.path(corner))}"
         except OSError as error:
             return empty, f"{self.path(corner)}: not readable: {error.strerror}"
         if store is None:
@@ -144,7 +144,7 @@ class Memory:
                 theirs, ours = getattr(store, name), getattr(empty, name)
                 return empty, f"{self.path(corner)}: belongs to {name} {theirs}, not {ours}; not used"
         if store.current and (fault := why_out_of_bounds(calibration, store.current.values)):
-            return empty, f"{self.path(corner)}: refused ({fault}), set aside as {files.set_aside(self.path(corner))}"
+            return empty, f"{self.path(corner)}: refused ({fault}), {files.set_aside(self.path(corner))}"
         return store, None
 
     def _sweep(self) -> None:
