@@ -346,6 +346,9 @@ def _head(b, row, index, age):
             reasons |= contract.E2E_ERROR
         if now - b.receptions[slot].range_ns < _SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE
+    for slot in (base + wire.RESOLVER, base + wire.CURRENT):
+        if now - b.receptions[slot].contested_ns < _SHOWN_NS:
+            reasons |= contract.CONTESTED
     if now - corner.second_sender_ns < _SHOWN_NS:
         reasons |= contract.SECOND_SENDER
     row.reasons = reasons
@@ -363,7 +366,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             period = wires.sent_cycle_ns[kind] // CYCLE_NS
             if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
                 continue
-            usable = e.source != contract.INVALID and e.mode != contract.INIT
+            usable = e.mode != contract.INIT and e.mode != contract.FAULT
             if e.mode == contract.INIT:
                 status = contract.STATUS_NOT_AVAILABLE
             elif not usable:
@@ -385,7 +388,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
                 values[0] = e.mode
                 values[1] = e.stiffness_factor
                 values[2] = e.contact_angle
-                values[3] = e.reasons
+                values[3] = e.reasons & 0xFFFF
             else:
                 asked = limits[e.corner]
                 values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result

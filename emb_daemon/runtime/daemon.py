@@ -92,7 +92,7 @@ def _scan(estimates, count, states, receptions, arrivals, reported):
         if estimate.source == contract.INVALID and not _is_number(states[corner]):
             lost |= 1 << corner
         # What disturbs the loop is logged once, not for each corner.
-        state = estimate.mode << 16 | estimate.reasons & ~_OF_THE_LOOP
+        state = estimate.mode << 16 | estimate.reasons & 0xFFFF & ~_OF_THE_LOOP
         if state != reported[corner]:
             reported[corner] = state
             changed |= 1 << corner
