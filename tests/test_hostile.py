@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import wirekit
+from fuzz import promises
 from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
@@ -126,6 +127,13 @@ def test_flood_with_valid_protection(car, undisturbed):  # noqa: F811
     counters = itertools.count()
     strangers = [_spoof(c, delay, next(counters)) for c in _KNOWN for delay in (300_000, 700_000, 1_100_000, 1_500_000)]
     _undisturbed_by(car, strangers, undisturbed)
+
+
+@pytest.mark.parametrize("promise", [promises.noise, promises.hostile])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_promises_among_thousands_of_random_frames(promise, seed):
+    """A short form of tests/fuzz/promises.py."""
+    assert promise(np.random.default_rng(seed), 20.0, 5000) > 15_000
 
 
 def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811
