@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from emb_daemon.adapt import files
 from emb_daemon.adapt.adaptation import Adaptation
-from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.memory import Memory, hold
 from emb_daemon.adapt.snapshots import Snapshots, from_fields, to_fields
+from emb_daemon.errors import Unavailable
 
 INNER = np.dtype([("phase", "f8"), ("seen", "?")])
 RECORD = np.dtype([("angle", "f8"), ("count", "i8"), ("known", "?"), ("pads", "f8", (2, 3)), ("wheel", INNER)], align=True)
@@ -99,6 +100,14 @@ def test_what_is_no_file_holds_nobody_up(tmp_path):
     memory.path("FL").write_bytes(bytes(files._MOST_BYTES + 1))
     assert "not a regular file" in snapshots.load("FL", SHIPPED)[2]
     assert "larger than" in memory.load("FL", SHIPPED)[1]
+
+
+def test_a_state_directory_is_one_daemons(tmp_path):
+    held = hold(tmp_path / "state")
+    with pytest.raises(Unavailable, match="another process"):
+        hold(tmp_path / "state")
+    os.close(held)
+    os.close(hold(tmp_path / "state"))
 
 
 def test_a_file_that_cannot_be_set_aside_stops_nothing(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ corner starts from its calibration.
 """
 
 import contextlib
+import fcntl
 import os
 import time
 from pathlib import Path
@@ -18,7 +19,7 @@ from emb_daemon.adapt.learned import Evaluation, why_out_of_bounds
 from emb_daemon.adapt.records import ACCEPTED, OUTCOMES
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, Unavailable
 
 _FORMAT = 2
 #: Trainings that a file remembers, and the age from which an unfinished file is nobody's, s.
@@ -91,6 +92,22 @@ def state_directory(configured: str | None, relative_to: Path, environment=os.en
     if given := environment.get("STATE_DIRECTORY"):
         return Path(given.split(":")[0])
     return relative_to / configured if configured else None
+
+
+def hold(folder: Path) -> int:
+    """Keep a state directory, which may be read-only, to this process until it ends or the descriptor returned is closed.
+
+    Raises:
+        InputError: it cannot be made.
+        Unavailable: another process keeps it.
+    """
+    descriptor = os.open(Memory(folder).folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise Unavailable(f"{folder}: state directory of another process that runs") from None
+    return descriptor
 
 
 class Memory:
