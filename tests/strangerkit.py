@@ -1,0 +1,116 @@
+"""A rig that nobody here built: its brake, its bus and its logs, at any sampling rate, with the true force known.
+
+The brake obeys the thesis's models with the shipped calibration's parameters; bus, ids, units and signs are its own: 29-bit
+ids, CAN FD frames of up to 64 bytes, big-endian signals, degrees and rpm, a current of the other sign, one thermocouple in
+kelvin.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import brake
+import can
+import cantools
+import msgspec
+import numpy as np
+
+import emb_daemon
+from emb_daemon.calibration.files import save_calibration
+from emb_daemon.calibration.types import Calibration, to_parameters
+
+#: Step of the truth, s; every sampling rate is a whole part of it.
+FINE_S = 0.0005
+START_S = 1_790_000_000.0
+
+DBC = """VERSION ""
+BU_: RIG
+BO_ 2566844161 Drive: 64 RIG
+ SG_ Position : 263|32@0- (0.01,0) [0|0] "deg" RIG
+ SG_ Speed : 311|32@0- (0.01,0) [0|0] "rpm" RIG
+ SG_ Iq : 399|16@0- (5,0) [0|0] "mA" RIG
+
+BO_ 2566844162 Bench: 24 RIG
+ SG_ Load : 128|32@1- (0.0001,0) [0|0] "kN" RIG
+ SG_ Plate : 96|16@1+ (0.05,0) [0|0] "K" RIG
+
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "VFrameFormat" BO_ 2566844161 5;
+BA_ "VFrameFormat" BO_ 2566844162 5;
+"""
+
+MAPPING = """format: 1
+dbc: their.dbc
+signals:
+  EMB_FL_Resolver.MotorAngle: {signal: Drive.Position}
+  EMB_FL_Resolver.MotorSpeed: {signal: Drive.Speed}
+  EMB_FL_Current.CurrentQ: {signal: Drive.Iq, scale: -1.0}
+  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: Bench.Plate}
+  RIG_FL_Force.ClampForceRef: {signal: Bench.Load}
+"""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the brake did, every `FINE_S`: angle rad, speed rad/s, current A (mean over the step), force N."""
+
+    angle: np.ndarray
+    speed: np.ndarray
+    current: np.ndarray
+    force: np.ndarray
+
+    @property
+    def time_s(self) -> np.ndarray:
+        return FINE_S * np.arange(len(self.angle))
+
+
+def calibration() -> Calibration:
+    """The shipped calibration without effects: the stranger's brake has none."""
+    return msgspec.structs.replace(emb_daemon.shipped_calibration(), effects={})
+
+
+def truth(angle: np.ndarray | None = None) -> Truth:
+    """Stops of ordinary driving, or any motion given every `FINE_S`."""
+    p = brake.ideal(np.atleast_1d(to_parameters(calibration())))
+    rows, force = brake.samples(p, brake.stops(p, 4, dt=FINE_S) if angle is None else angle, dt=FINE_S)
+    return Truth(rows["angle"], rows["speed"], rows["current_q"], force)
+
+
+def sampled(of: Truth, rate_Hz: float, means: bool = True, seed: int = 1) -> dict[str, np.ndarray]:
+    """Columns as the rig's instruments give them: current a mean over the sampling period, or instantaneous."""
+    rng = np.random.default_rng(seed)
+    step = round(1.0 / rate_Hz / FINE_S)
+    rows = np.arange(step, len(of.angle), step)
+    total = np.concatenate([[0.0], np.cumsum(of.current)])
+    current = (total[rows + 1] - total[rows + 1 - step]) / step if means else of.current[rows]
+    count = 2.0 * np.pi / 4096
+    return {
+        "time_s": of.time_s[rows],
+        "angle_rad": np.round(of.angle[rows] / count) * count,
+        "speed_rad_per_s": of.speed[rows] + rng.normal(0.0, 0.3, len(rows)),
+        "current_A": current + rng.normal(0.0, 0.2, len(rows)),
+        "force_N": of.force[rows] + rng.normal(0.0, 20.0, len(rows)),
+    }
+
+
+def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
+    """DBC, mapping and calibration of the rig in ``folder``; returns the mapping's path."""
+    (folder / "their.dbc").write_text(DBC)
+    (folder / "mapping.yaml").write_text(mapping)
+    save_calibration(calibration(), folder / "calibration.yaml")
+    return folder / "mapping.yaml"
+
+
+def write_log(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """The columns on the rig's CAN FD bus."""
+    database = cantools.database.load_string(DBC, "dbc")
+    drive, bench = database.get_message_by_name("Drive"), database.get_message_by_name("Bench")
+    with can.Logger(path) as writer:
+        for time_s, angle, speed, current, force in zip(*columns.values(), strict=True):
+            values = {"Position": np.degrees(angle), "Speed": speed * 30.0 / np.pi, "Iq": -1e3 * current}
+            for message, data in (
+                (drive, drive.encode(values, strict=False)),
+                (bench, bench.encode({"Load": 1e-3 * force, "Plate": 295.15}, strict=False)),
+            ):
+                writer(can.Message(START_S + time_s, message.frame_id, True, data=data, is_fd=True, channel=1))
+    return path
