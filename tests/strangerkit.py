@@ -5,6 +5,8 @@ ids, CAN FD frames of up to 64 bytes, big-endian signals, degrees and rpm, a cur
 kelvin.
 """
 
+import datetime
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +15,9 @@ import can
 import cantools
 import msgspec
 import numpy as np
+import pyarrow
+import pyarrow.csv
+import pyarrow.parquet
 
 import emb_daemon
 from emb_daemon.calibration.files import save_calibration
@@ -46,8 +51,24 @@ signals:
   EMB_FL_Resolver.MotorSpeed: {signal: Drive.Speed}
   EMB_FL_Current.CurrentQ: {signal: Drive.Iq, scale: -1.0}
   EMB_FL_Thermocouple.InnerBackplateTemp: {signal: Bench.Plate}
+  VEH_WheelSpeed.WheelSpeedFL: {value: 0}
+  VEH_WheelPulse.WheelPulseFL: {value: 0}
+  VEH_Status.ParkBrake: {value: 0}
+  VEH_Status.BrakeRequest: {value: 0}
+  VEH_Status.VehicleSpeed: {value: 0}
+  VEH_Status.AmbientTemp: {value: 22}
   RIG_FL_Force.ClampForceRef: {signal: Bench.Load}
 """
+#: The same of a table of the rig's columns, see `sampled`.
+COLUMNS = re.sub(r"dbc: .*", "time: {signal: time_s}", MAPPING)
+for _signal, _column in (
+    ("Drive.Position", "angle_rad, unit: rad"),
+    ("Drive.Speed", "speed_rad_per_s, unit: rad/s"),
+    ("Drive.Iq, scale: -1.0", "current_A, unit: A"),
+    ("Bench.Plate", "plate_C, unit: degC"),
+    ("Bench.Load", "force_N, unit: N"),
+):
+    COLUMNS = COLUMNS.replace(_signal, _column)
 
 
 @dataclass(frozen=True)
@@ -89,6 +110,7 @@ def sampled(of: Truth, rate_Hz: float, means: bool = True, seed: int = 1) -> dic
         "angle_rad": np.round(of.angle[rows] / count) * count,
         "speed_rad_per_s": of.speed[rows] + rng.normal(0.0, 0.3, len(rows)),
         "current_A": current + rng.normal(0.0, 0.2, len(rows)),
+        "plate_C": np.full(len(rows), 22.0),
         "force_N": of.force[rows] + rng.normal(0.0, 20.0, len(rows)),
     }
 
@@ -101,16 +123,30 @@ def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
     return folder / "mapping.yaml"
 
 
+def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """The columns as .csv, .parquet or the channels of a measurement (.mf4), by ending."""
+    if path.suffix == ".mf4":
+        from asammdf import MDF, Signal
+
+        with MDF() as file:
+            file.header.start_time = datetime.datetime.fromtimestamp(START_S, datetime.UTC)
+            file.append([Signal(v, columns["time_s"], name=name) for name, v in columns.items() if name != "time_s"])
+            return Path(file.save(path))
+    table = pyarrow.table(columns)
+    (pyarrow.csv.write_csv if path.suffix == ".csv" else pyarrow.parquet.write_table)(table, path)
+    return path
+
+
 def write_log(path: Path, columns: dict[str, np.ndarray]) -> Path:
     """The columns on the rig's CAN FD bus."""
     database = cantools.database.load_string(DBC, "dbc")
     drive, bench = database.get_message_by_name("Drive"), database.get_message_by_name("Bench")
     with can.Logger(path) as writer:
-        for time_s, angle, speed, current, force in zip(*columns.values(), strict=True):
+        for time_s, angle, speed, current, plate, force in zip(*columns.values(), strict=True):
             values = {"Position": np.degrees(angle), "Speed": speed * 30.0 / np.pi, "Iq": -1e3 * current}
             for message, data in (
                 (drive, drive.encode(values, strict=False)),
-                (bench, bench.encode({"Load": 1e-3 * force, "Plate": 295.15}, strict=False)),
+                (bench, bench.encode({"Load": 1e-3 * force, "Plate": plate + 273.15}, strict=False)),
             ):
                 writer(can.Message(START_S + time_s, message.frame_id, True, data=data, is_fd=True, channel=1))
     return path

@@ -3,6 +3,7 @@
 Logs are read once, checked for what their part needs, and left out with a word when they cannot serve.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -229,6 +230,8 @@ class Campaign:
     path: Path
     file: CampaignFile
     datasheet: Datasheet
+    #: What reads a log's FRAME array and digest: `logs.read.read_with_digest`, or a mapping's for another rig's logs.
+    read: Callable[[Path], tuple[np.ndarray, str]] = read_with_digest
     faults: list[str] = field(default_factory=list)
     #: Logs used, by name in the campaign: SHA-256 of the file.
     sources: dict[str, str] = field(default_factory=dict)
@@ -258,7 +261,7 @@ class Campaign:
 
     def _read(self, name: str) -> Log:
         def read(path):
-            frames, self.sources[name] = read_with_digest(path)
+            frames, self.sources[name] = self.read(path)
             return frames
 
         if name not in self._logs:
@@ -363,8 +366,8 @@ def _missing(value, folder: Path, key: str = "") -> list[str]:
     return [f"{key}: {folder / value}: no such file"] if is_log and not (folder / value).is_file() else []
 
 
-def load_campaign(path: str | Path) -> Campaign:
-    """Read a campaign and its datasheet; no log is read yet.
+def load_campaign(path: str | Path, read=read_with_digest) -> Campaign:
+    """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`.
 
     Raises:
         InputErrors: every fault of either file with line and key; every log that is not there.
@@ -378,4 +381,4 @@ def load_campaign(path: str | Path) -> Campaign:
         raise InputErrors([f"{path}: {line}" for line in missing])
     if file.dbc is not None:
         _check_dbc(path.parent / file.dbc, file.corner)
-    return Campaign(path, file, datasheet)
+    return Campaign(path, file, datasheet, read)

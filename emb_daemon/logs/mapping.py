@@ -4,7 +4,6 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
 """
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +15,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
-from emb_daemon.logs.resample import Series, frames_of, our_messages
+from emb_daemon.logs.resample import SUBSTITUTES, Series, completed, frames_of, our_messages
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, load_database
@@ -24,6 +23,7 @@ from emb_daemon.wire.units import UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
+_PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 _HEADER = ("CRC", "Counter", "Status")
 
 
@@ -173,7 +173,7 @@ class Mapping:
                 f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner"
             )
         for name, signals in self._messages.items():
-            substitutes = _SUBSTITUTES.get(name.rpartition("_")[2], {})
+            substitutes = SUBSTITUTES.get(name.rpartition("_")[2], {})
             for signal in self._ours[name][0].signals:
                 optional = signal.name in (*_UNUSED, *_HEADER) or name.startswith("RIG_")
                 other = name in ("VEH_WheelSpeed", "VEH_WheelPulse") and signal.name[-2:] not in corners
@@ -183,8 +183,15 @@ class Mapping:
                     self.notes.append(f"{self.path}: {name}.{signal.name} is not measured: {substitutes[signal.name]}")
                 else:
                     self._fault(f"{name}.{signal.name}", "missing: map it too, or give it a constant `value`")
+            if name.endswith("_Thermocouple") and not any(plate in signals for plate in _PLATES):
+                self._fault(name, f"expected {' or '.join(_PLATES)}")
             if name.endswith("_Resolver") and not self._sources(name):
                 self._fault(name, "only constants: expected at least one signal of the rig")
+
+        for corner in corners:
+            for message, text in _LOST.items():
+                if (name := message.format(corner)) not in self._messages:
+                    self.notes.append(f"{self.path}: {name} is not mapped: {text}")
 
     def _sources(self, message: str) -> dict[str, _Source]:
         return {key: source for key, source in self._messages.get(message, {}).items() if isinstance(source, _Source)}
@@ -212,7 +219,7 @@ class Mapping:
             }
             for name, signals in self._messages.items()
         }
-        frames = frames_of({name: _substituted(name, signals) for name, signals in messages.items()})
+        frames = frames_of({name: completed(name, signals) for name, signals in messages.items()})
         if not len(frames):
             raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
         return frames, digest
@@ -245,52 +252,15 @@ class Mapping:
         return found
 
 
-def open_mapping(path: Path) -> Mapping:
-    """A mapping file whose notes stand on stderr."""
-    mapping = Mapping(path)
-    for note in mapping.notes:
-        print(note, file=sys.stderr)
-    return mapping
-
-
 def _is_received(message: str) -> bool:
     return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
 
 
-#: By the last word of a message's name: which of its signals may be missing, and what stands in for them.
-_SUBSTITUTES = {
-    "Resolver": {
-        "MotorSpeed": "it is the change of MotorAngle",
-        "MotorAngle": "it is MotorSpeed added up, which drifts; force by the angle is not to be trusted for long",
-    },
-    "Thermocouple": {
-        "InnerBackplateTemp": "it is taken to be the outer one's, and a difference between the pads goes unseen",
-        "OuterBackplateTemp": "it is taken to be the inner one's, and a difference between the pads goes unseen",
-        "CaliperTemp": "it is taken to be the mean of the backing plates",
-    },
+#: What a corner loses with a message that is not mapped.
+_LOST = {
+    "EMB_{}_Current": "the force rests on the motor angle alone",
+    "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
+    "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
+    "VEH_Status": "that the brake begins released has to be shown by motor and current; of a bench say so by `value: 0` of "
+    "ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp",
 }
-
-
-def _substituted(name: str, signals: dict) -> dict:
-    """A message's signals with those that are missing from those that are there."""
-    if name.endswith("_Resolver"):
-        angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
-        angle = speed.integral() if angle is None else angle
-        return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
-    if name.endswith("_Thermocouple"):
-        inner, outer = (signals.get(f"{side}BackplateTemp") for side in ("Inner", "Outer"))
-        plates = [plate for plate in (inner, outer) if plate is not None]
-        if plates:
-            caliper = signals.get("CaliperTemp", _mean(plates[0], plates[-1]))
-            return {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": caliper}
-    return signals
-
-
-def _mean(first: Series | float, second: Series | float) -> Series | float:
-    """Of two temperatures, at the times of one that is measured."""
-    if not isinstance(first, Series):
-        first, second = second, first
-    if isinstance(first, Series):
-        other = second.sampled(first.time_ns) if isinstance(second, Series) else second
-        return Series(first.time_ns, 0.5 * (first.values + other))
-    return 0.5 * (first + second)

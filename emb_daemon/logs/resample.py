@@ -120,6 +120,43 @@ class Series:
 Signals = Mapping[str, Series | float | None]
 
 
+#: By the last word of a message's name: which of its signals may be missing, and what stands in for them.
+SUBSTITUTES = {
+    "Resolver": {
+        "MotorSpeed": "it is the change of MotorAngle",
+        "MotorAngle": "it is MotorSpeed added up, which drifts; force by the angle is not to be trusted for long",
+    },
+    "Thermocouple": {
+        "InnerBackplateTemp": "it is taken to be the outer one's, and a difference between the pads goes unseen",
+        "OuterBackplateTemp": "it is taken to be the inner one's, and a difference between the pads goes unseen",
+        "CaliperTemp": "it is taken to be the mean of the backing plates",
+    },
+}
+
+
+def completed(name: str, signals: Signals) -> Signals:
+    """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
+    if name.endswith("_Resolver"):
+        angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
+        angle = speed.integral() if angle is None else angle
+        return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
+    if name.endswith("_Thermocouple"):
+        plates = [signals[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in signals]
+        caliper = signals.get("CaliperTemp", _mean(plates[0], plates[-1]))
+        return {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": caliper}
+    return signals
+
+
+def _mean(first: Series | float, second: Series | float) -> Series | float:
+    """Of two temperatures, at the times of one that is measured."""
+    if not isinstance(first, Series):
+        first, second = second, first
+    if isinstance(first, Series):
+        other = second.sampled(first.time_ns) if isinstance(second, Series) else second
+        return Series(first.time_ns, 0.5 * (first.values + other))
+    return 0.5 * (first + second)
+
+
 def our_messages() -> dict[str, tuple]:
     """cantools message and its database by name, of what the daemon receives and sends and what rigs add."""
     databases = (load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc")))

@@ -76,7 +76,7 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
             start_ns = round(1e9 * file.header.start_time.timestamp())
             found = {}
             for name in names:
-                signal = file.get(name, ignore_value2text_conversions=True)
+                signal = file.get(name)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
                 found[name] = (stamps, np.asarray(signal.samples).astype(float))
             return found
