@@ -74,7 +74,7 @@ def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, 
     """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate."""
     figures = []
     for rate, as_means in ((250, True), (rate_Hz, means)):
-        text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, delay_ms: 0")
+        text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
         strangerkit.write_rig(tmp_path, text)
         table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, rate, as_means))
         figures.append(_replay(tmp_path, table, capsys)[0]["force_N"])

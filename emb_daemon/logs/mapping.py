@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import Struct
+from emb_daemon.calibration.types import NonNegative, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import SUBSTITUTES, Series, completed, frames_of, our_messages
@@ -37,16 +37,16 @@ class Mapped(Struct, kw_only=True):
     #: ours = scale * (theirs, in our unit) + offset; offset in our unit.
     scale: float = 1.0
     offset: float = 0.0
-    #: How old the value is when it is stamped, ms: half the time over which it is a mean, and a filter's delay. Left out it is
-    #: 0, and half a sampling period for CurrentQ: a mean since the last frame, as on our bus.
-    delay_ms: float | None = None
+    #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
+    #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
+    mean_ms: NonNegative | None = None
     #: A constant in our unit, for what the rig does not measure.
     value: float | None = None
 
     def __post_init__(self):
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
-        if self.value is not None and (self.unit, self.scale, self.offset, self.delay_ms) != (None, 1.0, 0.0, None):
+        if self.value is not None and (self.unit, self.scale, self.offset, self.mean_ms) != (None, 1.0, 0.0, None):
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
             raise ValueError("scale: 0 leaves nothing of the signal")
@@ -81,18 +81,18 @@ class MappingFile(Struct, kw_only=True):
 
 
 class _Source:
-    """One foreign signal, and how it becomes ours; ``delay_ns`` None is half a sampling period."""
+    """One foreign signal, and how it becomes ours; ``span_ns`` None is a sampling period."""
 
-    def __init__(self, name: str, scale: float, offset: float, delay_ns: float | None):
-        self.name, self.scale, self.offset, self.delay_ns = name, scale, offset, delay_ns
+    def __init__(self, name: str, scale: float, offset: float, span_ns: float | None):
+        self.name, self.scale, self.offset, self.span_ns = name, scale, offset, span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         known = np.isfinite(values)
         time_ns, values = time_ns[known], values[known]
         order = np.argsort(time_ns, kind="stable")
         series = Series(time_ns[order], self.scale * values[order] + self.offset)
-        delay_ns = 0.5 * series.period_ns if self.delay_ns is None else self.delay_ns
-        return Series(series.time_ns - round(delay_ns), series.values)
+        span_ns = series.period_ns if self.span_ns is None else self.span_ns
+        return Series(series.time_ns - round(0.5 * span_ns), series.values, span_ns)
 
 
 class Mapping:
@@ -147,11 +147,9 @@ class Mapping:
             return self._fault(
                 name, f"{mapped.signal} is in {unit or 'no unit'}, which cannot become {ours.unit or 'a number'}{hint}"
             )
-        delay_ms = mapped.delay_ms
-        if delay_ms is None and signal_name != "CurrentQ":
-            delay_ms = 0.0
-        delay_ns = None if delay_ms is None else 1e6 * delay_ms
-        signals[signal_name] = _Source(mapped.signal, mapped.scale * factor, mapped.scale * shift + mapped.offset, delay_ns)
+        span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
+        span_ns = None if span_ms is None else 1e6 * span_ms
+        signals[signal_name] = _Source(mapped.signal, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
     def _their_unit(self, signal: str) -> str:

@@ -30,10 +30,14 @@ _SLOW_MS = 40
 
 @dataclass(frozen=True)
 class Series:
-    """One signal, in our unit, at its own times: int64 nanoseconds, ascending, and float values, shape (n,)."""
+    """One signal, in our unit: int64 nanoseconds, ascending, and float values, shape (n,).
+
+    Each value is the mean over ``span_ns`` about its time; 0 is the value at that time.
+    """
 
     time_ns: np.ndarray
     values: np.ndarray
+    span_ns: float = 0.0
 
     @cached_property
     def period_ns(self) -> float:
@@ -57,16 +61,40 @@ class Series:
         """The value at each time, straight between samples, NaN in gaps."""
         return np.where(self._near(at_ns), self._between(at_ns), np.nan)
 
+    @property
+    def is_slow(self) -> bool:
+        """Whether it is sampled more slowly than we do."""
+        return self.period_ns > (1.0 + _SAME_PERIOD) * CYCLE_NS
+
+    def smoothed(self, at_ns: np.ndarray) -> np.ndarray:
+        """Of a slow signal: mean over a period about each time, NaN in gaps.
+
+        Its change over a cycle is then that of means over periods, straight between their middles, as `mean` has it of the
+        current: speed and current of a slow rig agree in what they say of the inertia.
+        """
+        half = round(0.5 * self.period_ns)
+        if not len(self.time_ns):
+            return np.full(len(at_ns), np.nan)
+        # Straight on either side of the one corner in the period.
+        corner = np.clip(self.time_ns[self.nearest(at_ns)], at_ns - half, at_ns + half)
+        share = (corner - at_ns + half) / (2.0 * half)
+        before, at, after = self._between(at_ns - half), self._between(corner), self._between(at_ns + half)
+        mean = 0.5 * (share * (before + at) + (1.0 - share) * (at + after))
+        return np.where(self._near(at_ns), mean, np.nan)
+
     def mean(self, at_ns: np.ndarray) -> np.ndarray:
         """Mean over the cycle that ends at each time, NaN in gaps.
 
         A value that is sampled as fast as we do stands for its own period about its time, so that means over periods add up to
-        means over cycles; one that is sampled more slowly runs straight to the next.
+        means over cycles; means of one that is sampled more slowly run straight from one to the next.
         """
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
+        if self.is_slow and self.span_ns < 0.5 * self.period_ns and len(self.time_ns) > 1:
+            middles = self.time_ns[:-1] + np.diff(self.time_ns) // 2
+            return Series(middles, 0.5 * (self.values[1:] + self.values[:-1]), self.period_ns).mean(at_ns)
         middle = at_ns - CYCLE_NS // 2
-        if self.period_ns > (1.0 + _SAME_PERIOD) * CYCLE_NS:
+        if self.is_slow:
             # Simpson's rule: at most one corner of the straight lines lies in a cycle.
             mean = (self._between(at_ns - CYCLE_NS) + 4.0 * self._between(middle) + self._between(at_ns)) / 6.0
         else:
@@ -187,7 +215,7 @@ def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, i
     corner, kind = (*message.name.split("_"), "")[1:3]
     if corner in ticks and kind in ("Resolver", "Current", "Force"):
         times, cycles = ticks[corner]
-        columns = {key: _fast(kind, source, times) for key, source in signals.items()}
+        columns = {key: _fast(key, source, times) for key, source in signals.items()}
     else:
         cycle_ns = (message.cycle_time or _SLOW_MS) * 1_000_000
         times = np.arange(span[0], span[1] + 1, cycle_ns)
@@ -221,10 +249,12 @@ def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, i
     return frames
 
 
-def _fast(kind: str, source: Series | float | None, times: np.ndarray) -> np.ndarray | float | None:
+def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.ndarray | float | None:
     if not isinstance(source, Series):
         return source
-    return source.mean(times) if kind == "Current" else source.sampled(times)
+    if name.startswith("Current"):
+        return source.mean(times)
+    return source.smoothed(times) if name == "MotorSpeed" and source.is_slow else source.sampled(times)
 
 
 def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:
