@@ -235,4 +235,5 @@ def test_a_measurement_has_units_comments_and_texts(log, tmp_path):
                 np.testing.assert_array_equal(signal.samples, expected)
             else:
                 assert [text.decode() for text in signal.samples] == list(expected)
-            np.testing.assert_array_equal(signal.timestamps, columns["time_s"].to_numpy())
+            stamps = file.header.start_time.timestamp() + signal.timestamps
+            np.testing.assert_allclose(stamps, columns["time_s"].to_numpy(), rtol=0.0, atol=1e-6)

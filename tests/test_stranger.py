@@ -7,8 +7,9 @@ import pyarrow.parquet
 import pytest
 import strangerkit
 
+import emb_daemon
 from emb_daemon.cli.main import main
-from emb_daemon.errors import InputErrors
+from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import load_log
@@ -168,6 +169,33 @@ def test_a_caliper_is_no_pad(tmp_path):
     text = strangerkit.COLUMNS.replace("InnerBackplateTemp", "CaliperTemp")
     with pytest.raises(InputErrors, match="EMB_FL_Thermocouple: expected InnerBackplateTemp or OuterBackplateTemp"):
         Mapping(strangerkit.write_rig(tmp_path, text))
+
+
+def test_arrays_are_a_log(truth):
+    columns = strangerkit.sampled(truth, 100.0)
+    time_s, force_N = columns["time_s"], columns["force_N"]
+    motion = (columns["angle_rad"], columns["speed_rad_per_s"], columns["current_A"])
+    log = emb_daemon.log_of_arrays(time_s, *motion, inner_backplate_C=22.0, wheel_speed_rad_per_s=0.0, force_N=force_N)
+    estimates = emb_daemon.run(log, strangerkit.calibration())
+    error = (estimates["force"] - log.force_N)[1:]
+    assert np.sqrt(np.nanmean(error**2)) < 40.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.93
+    without = emb_daemon.log_of_arrays(time_s, columns["angle_rad"])
+    assert not without.samples["has_current"].any() and np.isnan(without.force_N).all()
+    for wrong, expected in (
+        ({"current_mA": motion[2]}, "current_mA: no such column; expected one of angle_rad"),
+        ({"force_N": force_N[:5]}, "force_N: expected as many values as times"),
+        ({"caliper_C": 20.0}, "expected inner_backplate_C or outer_backplate_C"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            emb_daemon.log_of_arrays(time_s, *motion, **wrong)
+    with pytest.raises(InputError, match="expected one of them"):
+        emb_daemon.log_of_arrays(time_s, current_A=motion[2])
+
+
+def test_a_log_of_other_ids_is_told_by_them(bus, capsys):
+    assert main(["replay", str(bus)]) == 2
+    said = capsys.readouterr().err
+    assert "no frame of id 0x100, the resolver of corner FL; found 0x18feef01, 0x18feef02; " in said and "--mapping" in said
 
 
 def test_a_converted_log_is_replayed_alike(bus, capsys):

@@ -116,7 +116,7 @@ def _parse(text, frames, octets):
         if end > start:
             if not _parse_line(text, start, end, frames[count], octets[filled:]):
                 return count, line, stop == size
-            filled += frames[count].length
+            filled += np.int64(frames[count].length)
             count += 1
         start = stop + 1
     return count, 0, False

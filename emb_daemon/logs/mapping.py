@@ -87,12 +87,7 @@ class _Source:
         self.name, self.scale, self.offset, self.span_ns = name, scale, offset, span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
-        known = np.isfinite(values)
-        time_ns, values = time_ns[known], values[known]
-        order = np.argsort(time_ns, kind="stable")
-        series = Series(time_ns[order], self.scale * values[order] + self.offset)
-        span_ns = series.period_ns if self.span_ns is None else self.span_ns
-        return Series(series.time_ns - round(0.5 * span_ns), series.values, span_ns)
+        return Series.of(time_ns, self.scale * values + self.offset).averaged(self.span_ns)
 
 
 class Mapping:

@@ -39,6 +39,18 @@ class Series:
     values: np.ndarray
     span_ns: float = 0.0
 
+    @classmethod
+    def of(cls, time_ns: np.ndarray, values: np.ndarray) -> "Series":
+        """Values of the moment in any order; those that are no numbers are left out."""
+        known = np.isfinite(values)
+        order = np.argsort(time_ns[known], kind="stable")
+        return cls(time_ns[known][order], values[known][order])
+
+    def averaged(self, span_ns: float | None = None) -> "Series":
+        """The same taken for means over ``span_ns`` that end with their stamps; None is the sampling period."""
+        span_ns = self.period_ns if span_ns is None else span_ns
+        return Series(self.time_ns - round(0.5 * span_ns), self.values, span_ns)
+
     @cached_property
     def period_ns(self) -> float:
         return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 2 else float(CYCLE_NS)
