@@ -34,8 +34,9 @@ class Mapped(Struct, kw_only=True):
     signal: str | None = None
     #: Its unit, where the rig's DBC states none or a wrong one; always for columns and channels.
     unit: str | None = None
-    #: ours = scale * (theirs, in our unit) + offset; offset in our unit.
+    #: ours = scale * (theirs, in our unit) + offset; -1 turns a direction round.
     scale: float = 1.0
+    #: In our unit.
     offset: float = 0.0
     #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
     #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
@@ -55,6 +56,7 @@ class Mapped(Struct, kw_only=True):
 class Time(Struct, kw_only=True):
     """The column of times of a table."""
 
+    #: Name of the column.
     signal: str
     #: s, ms or us.
     unit: str = "s"
@@ -67,6 +69,7 @@ class Time(Struct, kw_only=True):
 class MappingFile(Struct, kw_only=True):
     """mapping.yaml."""
 
+    #: Version of this file format.
     format: Annotated[int, Meta(ge=1, le=1)]
     #: The rig's DBC, ARXML or KCD, relative to this file; left out for tables and measurements.
     dbc: str | None = None
