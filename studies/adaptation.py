@@ -27,6 +27,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
+from emb_daemon.offline.score import rmse
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
@@ -107,7 +108,7 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
                 judged = round(10.0 / CYCLE_S)
                 error = estimates["force"][-judged:] - truth["force"][:, 0][-judged:]
                 row[name] = {
-                    "rmse_N": float(np.sqrt(np.mean(error**2))),
+                    "rmse_N": rmse(error),
                     "inside_two_sigma": float(np.mean(np.abs(error) < 2.0 * estimates["sigma"][-judged:])),
                 }
                 if learner:

@@ -1,6 +1,7 @@
 """Park brake adaptation: what is learned, when it is not, and what is remembered."""
 
 import itertools
+import shutil
 import time
 
 import adaptkit
@@ -20,13 +21,14 @@ from emb_daemon.adapt.pairs import FORCE, pairs_of_passes
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.estimator.records import ADAPTING, DEGRADED, INVALID, PARAMETERS, new_state
+from emb_daemon.estimator.records import PARAMETERS, new_state
 from emb_daemon.logs.read import read_frames
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.scenarios import park, random_angle, rest, training
 from emb_daemon.replay import Replay
 from emb_daemon.wire import contract
+from emb_daemon.wire.contract import ADAPTING, DEGRADED, INVALID
 from emb_daemon.wire.layout import load_database
 from studies.adaptation import kills, specimen, wear
 
@@ -636,12 +638,20 @@ def test_pads_softer_than_any_that_were_calibrated_are_rejected(ideal):
 # --- Memory ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def learned(tmp_path):
-    """A closed loop that has learned, and its folder."""
-    loop = ClosedLoop(tmp_path, pads_mm=6.0)
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taught")
+    loop = ClosedLoop(folder, pads_mm=6.0)
     loop.run(parked(60.0), until=lambda e: e["adapt_result"] != contract.NO_RESULT)
-    return loop, tmp_path
+    return loop, folder
+
+
+@pytest.fixture
+def learned(taught, tmp_path):
+    """A closed loop that has learned, to look at, and a copy of its folder."""
+    loop, folder = taught
+    shutil.copytree(folder, tmp_path / "state")
+    return loop, tmp_path / "state"
 
 
 def test_learned_values_come_back_after_a_restart(learned):

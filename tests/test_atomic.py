@@ -57,3 +57,13 @@ def test_mode_and_missing_folder(tmp_path):
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
     with pytest.raises(OSError):
         write_atomically(tmp_path / "none" / "a", b"x")
+
+
+def test_a_device_a_pipe_or_a_folder_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "pipe", tmp_path / "folder", Path("/dev/null")):
+        before = os.stat(path).st_ino
+        with pytest.raises(OSError, match="expected a regular file or none") as caught:
+            write_atomically(path, b"x")
+        assert caught.value.filename == str(path) and os.stat(path).st_ino == before

@@ -88,8 +88,8 @@ def test_catalogue_is_that_of_the_contract():
     assert sorted(effect.name for effect in REGISTRY) == sorted(CONTRACT)
 
 
-#: `identify` names what it fits of a campaign; `plant` is a brake of its own, with effects of its own.
-_MAY_NAME = ("effects", "plant", "identify")
+#: `plant` is a brake of its own, with effects of its own.
+_MAY_NAME = ("effects", "plant")
 
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
@@ -117,6 +117,7 @@ import dataclasses
 import numpy as np
 from emb_daemon import offline
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.offline.run import held
@@ -135,10 +136,9 @@ wider = 1e-6 * 0.8 * warmth / calibration.motor.gear_gain_m_per_rad
 samples["caliper"] += warmth
 samples["angle"] += wider
 samples["speed"] += np.gradient(wider, log.time_s)
-p = held(to_parameters(calibration))
 for widening in (0.0, 0.8):
-    p["effects"]["own_effect"]["widening_um_per_K"] = widening
-    error = offline.estimate(samples, p)["stiffness_force"] - log.force_N
+    own = moved(calibration, {"effects.own_effect.widening_um_per_K": widening}, checked=True)
+    error = offline.estimate(samples, held(to_parameters(own)))["stiffness_force"] - log.force_N
     print(np.sqrt(np.nanmean(error**2)))
 result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
 print([(f.effect.name, f.values["widening_um_per_K"]) for f in result.accepted])

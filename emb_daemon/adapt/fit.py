@@ -36,7 +36,7 @@ from emb_daemon.adapt.learned import (
 from emb_daemon.adapt.pairs import ANGLE, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
+from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
@@ -69,15 +69,6 @@ _RANGES = 5
 
 
 @njit
-def settle(s, p, row):
-    """Bring the path models of a STATE to rest at the first sample of a training."""
-    s.started = True
-    s.angle, s.slid_angle, s.speed = row.angle, row.angle, row.speed
-    s.friction_state, s.friction_variance = 0.0, 1.0
-    rest(s, p, position(s, p, row), row.factor)
-
-
-@njit
 def unexplained_step(s, p, row):
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
     before = s.force
@@ -88,18 +79,14 @@ def unexplained_step(s, p, row):
 
 
 @njit
-def unexplained(s, p, rows, residual, force):
-    """`unexplained_step` and stiffness force (N) at each row from the settled state ``s``; the first residual is NaN."""
+def _run(states, parameters, rows, residual, force):
+    """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
+    s, p = states[0], parameters[0]
+    settle_paths(s, p, rows[0], rows[0].factor)
     residual[0], force[0] = np.nan, s.force
     for i in range(1, len(rows)):
         residual[i] = unexplained_step(s, p, rows[i])
         force[i] = s.force
-
-
-@njit
-def _run(states, parameters, rows, residual, force):
-    settle(states[0], parameters[0], rows[0])
-    unexplained(states[0], parameters[0], rows, residual, force)
 
 
 class _Training:

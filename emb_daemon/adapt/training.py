@@ -9,9 +9,10 @@ from math import hypot
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.fit import settle, unexplained_step
+from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
+from emb_daemon.estimator.paths import settle_paths
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
@@ -158,7 +159,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     scratch[0] = s
     t = scratch[0]
     t.contact_angle = contact + weight * (a.contact_angle - contact)
-    settle(t, learned, rows[first])
+    settle_paths(t, learned, rows[first], rows[first].factor)
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])
     s.contact_angle, s.past_contact = t.contact_angle, t.past_contact

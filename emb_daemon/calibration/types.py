@@ -367,7 +367,7 @@ class Calibration(Struct, kw_only=True):
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
 
 
-def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
+def _fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
     """Write the thermal part into a THERMAL record."""
     pad, disc = thermal.pad, thermal.disc
     t["conductivity"] = pad.conductivity_W_per_mK
@@ -424,7 +424,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["speed_sigma"] = c.noise.speed_rad_per_s
     p["presliding_sigma"] = c.noise.presliding
     p["torque_relative_sigma"] = c.noise.torque_relative
-    fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
+    _fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
     for name, values in c.effects.items():
         for key, value in values.items():
             p["effects"][name][key] = value

@@ -11,24 +11,6 @@ from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
-from emb_daemon.wire.contract import (  # noqa: F401
-    ADAPTING,
-    CONTACT_UNCERTAIN,
-    DEGRADED,
-    FAULT,
-    FUSED,
-    INIT,
-    INVALID,
-    OUT_OF_RANGE,
-    OUTSIDE_RANGE,
-    PATHS_DISAGREE,
-    PREDICTED,
-    RUNNING,
-    STIFFNESS_ONLY,
-    STUCK,
-    TEMPERATURE_UNCERTAIN,
-    TORQUE_ONLY,
-)
 
 CURVE_TERMS = 5
 FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID = 6, 6, 8

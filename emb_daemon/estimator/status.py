@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_daemon.estimator.records import (
+from emb_daemon.jit import njit
+from emb_daemon.wire.contract import (
     CONTACT_UNCERTAIN,
     FUSED,
     INVALID,
@@ -21,7 +22,6 @@ from emb_daemon.estimator.records import (
     TEMPERATURE_UNCERTAIN,
     TORQUE_ONLY,
 )
-from emb_daemon.jit import njit
 
 
 class Fact(NamedTuple):

@@ -14,7 +14,6 @@ from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
-from emb_daemon.estimator.records import INIT, INVALID, PREDICTED, RUNNING
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -35,6 +34,7 @@ from emb_daemon.models.fusion import SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
+from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
 #: Without a resolver sample for this long the last force is no estimate any more: the brake may have opened and closed, s.
 SILENCE_S = 0.1

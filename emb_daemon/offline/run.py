@@ -13,7 +13,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
-from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
+from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import njit
@@ -47,11 +47,8 @@ _COLD = np.ones(1)
 @njit
 def _run_paths(samples, factor, parameters, states, force, out):
     p, s = parameters[0], states[0]
-    s.started = True
-    s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
-    s.friction_variance = 1.0
     s.contact_angle = samples[0].angle + p.clearance
-    rest(s, p, position(s, p, samples[0]), factor[0])
+    settle_paths(s, p, samples[0], factor[0])
     for row in range(len(samples)):
         m = samples[row]
         stiffness_path(s, p, m, factor[row] if len(factor) > 1 else factor[0])

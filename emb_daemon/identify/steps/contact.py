@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.calibration.types import Contact
-from emb_daemon.identify.dynamics import simulate
+from emb_daemon.identify.dynamics import CLEARANCE, simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.wire.contract import CYCLE_S
@@ -24,12 +23,13 @@ def identify(stiffness: StiffnessStep, count_rad: float) -> Step:
     found = np.concatenate([curve.clearances_rad for curve in curves])
     errors = np.concatenate([curve.clearance_sigmas_rad for curve in curves])
     spread = float(np.std(found, ddof=1)) if len(found) > 1 else 0.0
-    contact = Contact(
-        clearance_rad=float(np.mean(found)),
-        clearance_sigma_rad=float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
-        walk_rad_per_sqrt_s=_walk(stiffness),
+    return Step(
+        values={
+            CLEARANCE: float(np.mean(found)),
+            "contact.clearance_sigma_rad": float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
+            "contact.walk_rad_per_sqrt_s": _walk(stiffness),
+        }
     )
-    return Step(values={"contact": contact})
 
 
 def _walk(stiffness: StiffnessStep) -> float:
@@ -38,10 +38,12 @@ def _walk(stiffness: StiffnessStep) -> float:
     The scatter of each estimate is in it, so that it errs to the safe side.
     """
     squares, seconds = 0.0, 0.0
-    values = stiffness.fit.values
-    for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
+    fit = stiffness.fit
+    for pads, curve in zip(stiffness.pads, fit.curves, strict=True):
         for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
-            at, moved = (simulate(log, values, curve.coefficients, clearance + s) for s in (0.0, _STEP))
+            at, moved = (
+                simulate(log, fit.calibration, pads.thickness_mm, clearance + step, fit.delay_s) for step in (0.0, _STEP)
+            )
             slope, error = (moved - at) / _STEP, at - log.force_N
             shifts = []
             for start in range(0, len(error) - _ROWS + 1, _ROWS):

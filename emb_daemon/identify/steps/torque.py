@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from emb_daemon.calibration.types import Friction, Motor
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import Campaign, Datasheet
-from emb_daemon.identify.dynamics import EPISODE, Pads, with_dynamics
+from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.offline import Log
@@ -26,9 +27,10 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Parameters in the order of every covariance.
-NAMES = ("torque_constant_Nm_per_A", "inertia_kg_m2", "offset_Nm", "load_m_per_rad", "presliding_angle_rad")
-_KEYS = tuple(f"{'motor' if name in NAMES[:2] else 'friction'}.{name}" for name in NAMES)
+TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
+OFFSET, LOAD, PRESLIDING = "friction.offset_Nm", "friction.load_m_per_rad", "friction.presliding_angle_rad"
+#: Parameters in the order of every covariance, with their least value that is physical.
+KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 1e-6}
 #: Variance of the friction state up to which it counts as known.
 _KNOWN = 0.01
 #: Step of the derivative by the logarithm of the presliding angle.
@@ -41,7 +43,7 @@ class TorqueFit:
     """Parameters of the torque path.
 
     Attributes:
-        values: by name (`NAMES`).
+        values: by the calibration's keys (`KEYS`).
         covariance: in their order.
         residuals: unexplained current by log path: (row of the log, A).
     """
@@ -52,17 +54,20 @@ class TorqueFit:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        return dict(zip(KEYS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def rms_A(self) -> float:
         """Of the current that stays unexplained."""
         return rmse(np.concatenate([residual for _, residual in self.residuals.values()]))
 
-    def friction(self) -> Friction:
-        """That section of the calibration; what noise pushed below what is physical stands at its least."""
-        least = {"load_m_per_rad": 0.0, "offset_Nm": 0.0, "presliding_angle_rad": 1e-6}
-        return Friction(**{name: max(self.values[name], low) for name, low in least.items()})
+    def physical(self) -> dict[str, float]:
+        """Values for a calibration; what noise pushed below what is physical stands at its least."""
+        return {key: max(self.values[key], least) for key, least in KEYS.items()}
+
+    def friction(self) -> dict[str, float]:
+        """Those of them that wear changes."""
+        return {key: value for key, value in self.physical().items() if key in (OFFSET, LOAD, PRESLIDING)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +85,12 @@ class TorqueStep(Step):
     gears: list[tuple[str, TorqueFit]]
 
     def gear_wear(self) -> float:
-        """Relative error of the torque path from not knowing how worn the gear is; its spread over the states measured."""
-        worn = [fit.values["load_m_per_rad"] for _, fit in self.gears]
-        return float(np.std(worn, ddof=1)) / self.values["motor"].gear_gain_m_per_rad if len(worn) > 1 else 0.0
+        """Spread of the load friction over the states of wear that were measured, m/rad."""
+        worn = [fit.values[LOAD] for _, fit in self.gears]
+        return float(np.std(worn, ddof=1)) if len(worn) > 1 else 0.0
 
 
-def identify(campaign: Campaign, pads: list[Pads]) -> TorqueStep:
+def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> TorqueStep:
     """Torque path from all logs with motor current, and each gear's from its training log.
 
     Raises:
@@ -95,44 +100,33 @@ def identify(campaign: Campaign, pads: list[Pads]) -> TorqueStep:
     logs = [log for own in pads for log in own.logs if log.samples["has_current"].any()]
     if not logs:
         raise InputError(f"{campaign.path}: curves, random: no log holds motor current; needed: EMB_*_Current frames")
-    found = fit_torque(logs, sheet)
-    for name in NAMES[:2]:
-        campaign.compare_with_datasheet(f"motor.{name}", found.values[name])
+    found = fit_torque(logs, nominal, sheet)
+    for key in (TORQUE_CONSTANT, INERTIA):
+        campaign.compare_with_datasheet(key, found.values[key])
     gears = []
     for entry in campaign.file.gear_wear:
         log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
         if log is not None:
-            gears.append((entry.training, fit_torque([log], sheet)))
+            gears.append((entry.training, fit_torque([log], nominal, sheet)))
     return TorqueStep(
-        values=sections(found, sheet),
-        sigmas=dict(zip(_KEYS, found.sigmas.values(), strict=True)),
+        values=found.physical(),
+        sigmas=found.sigmas,
         fit=found,
         log=pads[len(pads) // 2].logs[-1],
         gears=gears,
     )
 
 
-def sections(found: TorqueFit, sheet: Datasheet) -> dict:
-    """Sections of the calibration that a fit fills."""
-    motor = Motor(
-        torque_constant_Nm_per_A=found.values["torque_constant_Nm_per_A"],
-        inertia_kg_m2=found.values["inertia_kg_m2"],
-        gear_gain_m_per_rad=sheet.actuator.gear_gain_m_per_rad,
-        maximum_speed_rad_per_s=sheet.actuator.max_motor_speed_rad_per_s,
-    )
-    return {"motor": motor, "friction": found.friction()}
-
-
 class _Regression:
     """One log's part of the regression."""
 
-    def __init__(self, log: Log):
+    def __init__(self, log: Log, calibration: Calibration):
         samples = log.samples
         angle, speed = samples["angle"], samples["speed"]
         rows = np.arange(2, len(samples) - 1)
         full_rate = np.all([np.abs(samples["dt"][rows + k] - CYCLE_S) < 1e-6 for k in (-1, 0, 1)], axis=0)
         known = np.isfinite(log.force_N[rows]) & np.isfinite(log.force_N[rows - 1]) & samples["has_current"][rows]
-        self.log = log
+        self.log, self.calibration = log, calibration
         self.rows = r = rows[full_rate & known]
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
         self.current = samples["current_q"][r]
@@ -141,8 +135,7 @@ class _Regression:
 
     def matrices(self, presliding_angle: float):
         """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model."""
-        parameters = with_dynamics({})
-        parameters["presliding_angle"] = presliding_angle
+        parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
@@ -151,12 +144,13 @@ class _Regression:
         return regressors, instruments, paths["friction_variance"] < _KNOWN
 
 
-def fit_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
+def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> TorqueFit:
     """Instrumental-variable regression with the presliding angle sought in one dimension.
 
-    The datasheet's torque constant and inertia are priors; its resolver count is what no turning over is known better than.
+    Of the calibration only the gear counts. The datasheet's torque constant and inertia are priors; its resolver count is what
+    no turning over is known better than.
     """
-    parts = [_Regression(log) for log in logs]
+    parts = [_Regression(log, calibration) for log in logs]
 
     def solve(presliding):
         matrices = [part.matrices(presliding) for part in parts]
@@ -181,7 +175,7 @@ def fit_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
         str(part.log.path): (part.rows[use], residual)
         for part, (_, _, use), residual in zip(parts, matrices, residuals, strict=True)
     }
-    return TorqueFit(dict(zip(NAMES, physical.tolist(), strict=True)), covariance, left_over)
+    return TorqueFit(dict(zip(KEYS, physical.tolist(), strict=True)), covariance, left_over)
 
 
 def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
@@ -199,7 +193,7 @@ def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
 
 
 def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
-    """`NAMES` from coefficients b: K_m = gamma / b0, J = b1 K_m, eta = b2 K_m, mu = b3 K_m."""
+    """`KEYS` from coefficients b: K_m = gamma / b0, J = b1 K_m, eta = b2 K_m, mu = b3 K_m."""
     constant = sheet.actuator.gear_gain_m_per_rad / solution[0]
     change = np.diag([-constant / solution[0], constant, constant, constant, presliding])
     change[1:4, 0] = -solution[1:] * constant / solution[0]
@@ -211,9 +205,9 @@ def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.nd
 
 def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
     """Values and covariance after the datasheet's torque constant and inertia, which its tolerances say how far to believe."""
-    stated = np.array([sheet.stated(f"motor.{name}") for name in NAMES[:2]])
+    stated = np.array([sheet.stated(key) for key in (TORQUE_CONSTANT, INERTIA)])
     sigma = stated[:, 0] * stated[:, 1] / 2.0
-    seen = np.eye(2, len(NAMES))
+    seen = np.eye(2, len(KEYS))
     gain = covariance @ seen.T @ np.linalg.inv(covariance[:2, :2] + np.diag(sigma**2))
     return values + gain @ (stated[:, 0] - values[:2]), covariance - gain @ seen @ covariance
 
@@ -236,11 +230,12 @@ class Unexplained:
     force_N: np.ndarray
 
 
-def unexplained_current(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
-    """Current of a log that a fit does not explain."""
-    part, values = _Regression(log), found.values
-    regressors, _, use = part.matrices(values["presliding_angle_rad"])
-    coefficients = np.array([gear_gain, *(values[name] for name in NAMES[1:4])]) / values["torque_constant_Nm_per_A"]
+def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
+    """Current of a log that a fit does not explain; of the calibration only the gear counts."""
+    part, values = _Regression(log, calibration), found.values
+    regressors, _, use = part.matrices(values[PRESLIDING])
+    gear_gain = calibration.motor.gear_gain_m_per_rad
+    coefficients = np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET, LOAD))]) / values[TORQUE_CONSTANT]
     residual = part.current - regressors @ coefficients
     return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
 
@@ -264,8 +259,8 @@ def section(page: Page, step: TorqueStep) -> None:
     )
     fits = [step.fit, *(found for _, found in step.gears)]
     rows = [
-        [title, *(with_sigma(found.values[name], found.sigmas[name], factor) for found in fits)]
-        for name, (title, factor) in zip(NAMES, _ROWS, strict=True)
+        [title, *(with_sigma(found.values[key], found.sigmas[key], factor) for found in fits)]
+        for key, (title, factor) in zip(KEYS, _ROWS, strict=True)
     ]
     rows.append(["unexplained current / A", *(f"{found.rms_A:.3f}" for found in fits)])
     gears = [name.rsplit("/", 1)[-1].split(".log")[0] for name, _ in step.gears]
