@@ -17,7 +17,7 @@ _emb_daemon() {
         check) options="--config" ;;
         replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --output --report --json" ;;
         convert) options="--mapping --output" ;;
-        identify) options="--mapping --output --report" ;;
+        identify) options="--mapping --output --report --example" ;;
         diagnose) options="--calibration --validate --output --mapping --corner" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;

@@ -92,7 +92,9 @@ def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
     for field in msgspec.structs.fields(kind):
         text, struct = _describe(field.type)
         what = ", ".join(filter(None, (text, _default(field))))
-        meaning = next(comments[owner.__name__][field.name] for owner in kind.__mro__ if field.name in comments[owner.__name__])
+        meaning = next(
+            comments[owner.__name__][field.name] for owner in kind.__mro__ if field.name in comments[owner.__name__]
+        )
         if struct and not meaning:
             meaning = (inspect.getdoc(struct) or "").splitlines()[0]
         out.append(f"| `{field.encode_name}` | {what} | {_cell(meaning)} |")

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+from scipy.signal import lfilter
 
 import emb_daemon
 from emb_daemon.calibration.files import save_calibration
@@ -70,6 +71,29 @@ for _signal, _column in (
 ):
     COLUMNS = COLUMNS.replace(_signal, _column)
 
+DATASHEET = """actuator:
+  gear_gain_m_per_rad: {:g}
+  motor_torque_constant_Nm_per_A: {:g}
+  lumped_inertia_kg_m2: {:g}
+  max_motor_speed_rad_per_s: 300.0
+  rated_clamp_force_N: 20000.0
+  pad_clearance_rad: {:g}
+resolver: {{counts_per_revolution: 4096}}
+pad:
+  thickness_mm: 10.0
+  frontal_area_m2: 0.0046
+  density_kg_per_m3: 2450.0
+  specific_heat_J_per_kgK: 1200.0
+  conductivity_W_per_mK: 1.2
+disc:
+  mass_kg: 5.6
+  specific_heat_J_per_kgK: 480.0
+  effective_radius_m: 0.131
+  cooling_area_m2: 0.19
+  conductivity_W_per_mK: 50.0
+friction_coefficient: 0.39
+"""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -90,9 +114,30 @@ def calibration() -> Calibration:
     return msgspec.structs.replace(emb_daemon.shipped_calibration(), effects={})
 
 
+def parameters() -> np.void:
+    """PARAMETERS record of the brake."""
+    return brake.ideal(np.atleast_1d(to_parameters(calibration())))
+
+
+def slow(top_rad: float = 20.0, seconds: float = 24.0) -> np.ndarray:
+    """Motor angles of two slow clamps to ``top_rad`` past contact and releases, beginning and ending with 0.4 s of rest."""
+    phase = np.clip((np.arange(round(seconds / FINE_S)) * FINE_S - 0.4) / (seconds - 0.8), 0.0, 1.0)
+    return (parameters()["clearance"] + top_rad) * (1.0 - np.cos(4.0 * np.pi * phase)) / 2.0
+
+
+def random(top_rad: float = 20.0, seconds: float = 10.0, seed: int = 1) -> np.ndarray:
+    """Motor angles after 0.4 s of rest: a random target every 100 ms, reached as a motor of 40 rad/s reaches it."""
+    rng, rest = np.random.default_rng(seed), round(0.4 / FINE_S)
+    count = round(seconds / FINE_S)
+    targets = parameters()["clearance"] + rng.uniform(-0.05, 1.0, count) * top_rad
+    held = np.where(np.arange(count) < rest, 0.0, targets[(np.arange(count) // round(0.1 / FINE_S))])
+    decay = np.exp(-40.0 * FINE_S)
+    return lfilter([1.0 - decay], [1.0, -decay], lfilter([1.0 - decay], [1.0, -decay], held))
+
+
 def truth(angle: np.ndarray | None = None) -> Truth:
     """Stops of ordinary driving, or any motion given every `FINE_S`."""
-    p = brake.ideal(np.atleast_1d(to_parameters(calibration())))
+    p = parameters()
     rows, force = brake.samples(p, brake.stops(p, 4, dt=FINE_S) if angle is None else angle, dt=FINE_S)
     return Truth(rows["angle"], rows["speed"], rows["current_q"], force)
 
@@ -121,6 +166,21 @@ def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
     (folder / "mapping.yaml").write_text(mapping)
     save_calibration(calibration(), folder / "calibration.yaml")
     return folder / "mapping.yaml"
+
+
+def write_campaign(folder: Path, **motions: np.ndarray) -> Path:
+    """Campaign, datasheet, mapping and tables of 500 Hz of the motions given: ``curve…`` are slow clamps, others random."""
+    p = parameters()
+    write_rig(folder, COLUMNS)
+    for name, angle in motions.items():
+        write_table(folder / f"{name}.parquet", sampled(truth(angle), 500.0))
+    (folder / "datasheet.yaml").write_text(
+        DATASHEET.format(p["gear_gain"], 1.05 * p["torque_constant"], 0.95 * p["inertia"], 1.1 * p["clearance"])
+    )
+    parts = {"curves": [n for n in motions if n.startswith("curve")], "random": [n for n in motions if n.startswith("random")]}
+    lines = [f"{part}: [{', '.join(f'{{log: {name}.parquet}}' for name in names)}]" for part, names in parts.items()]
+    (folder / "campaign.yaml").write_text("rig: stranger\ndatasheet: datasheet.yaml\n" + "\n".join(lines))
+    return folder / "campaign.yaml"
 
 
 def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
