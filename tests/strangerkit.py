@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+import wirekit
 from scipy.signal import lfilter
 
 import emb_daemon
@@ -195,6 +196,18 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
     table = pyarrow.table(columns)
     (pyarrow.csv.write_csv if path.suffix == ".csv" else pyarrow.parquet.write_table)(table, path)
     return path
+
+
+def our_frames(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """The columns in our own layout, at the rig's rate: FRAME array without slow messages."""
+    parts = []
+    for row, (time_s, angle, speed, current) in enumerate(zip(*list(columns.values())[:4], strict=True)):
+        time_ns = round(1e9 * (START_S + time_s))
+        parts += [
+            wirekit.frame("EMB_FL_Resolver", time_ns, row % 15, MotorAngle=angle, MotorSpeed=speed),
+            wirekit.frame("EMB_FL_Current", time_ns + 100_000, row % 15, CurrentQ=current, CurrentD=0.0, DcBusVoltage=13.0),
+        ]
+    return np.concatenate(parts)
 
 
 def write_log(path: Path, columns: dict[str, np.ndarray]) -> Path:

@@ -12,7 +12,9 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
+from emb_daemon.wire.contract import E2E_ERROR
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +85,23 @@ def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, 
     assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 500.0
     assert theirs["fused"]["rmse"] < ours["fused"]["rmse"] + 5.0 < 45.0
     assert theirs["inside_two_sigma"] > 0.93
+
+
+@pytest.mark.parametrize("rate_Hz", [100, 500, 1000])
+def test_our_own_layout_may_be_logged_at_any_rate(truth, tmp_path, capsys, rate_Hz):
+    columns = {key: values[: 4 * rate_Hz] for key, values in strangerkit.sampled(truth, rate_Hz).items()}
+    frames = strangerkit.our_frames(columns)
+    write_frames(tmp_path / "ours.log", frames)
+    samples = load_log(tmp_path / "ours.log").samples
+    assert "sampled at another rate than every 4 ms" in capsys.readouterr().err
+    at = samples["time_ns"] * 1e-9 - strangerkit.START_S
+    assert np.all(samples["dt"][1:] == 0.004) and not (samples["reasons"] & E2E_ERROR).any()
+    assert np.abs(samples["angle"] - np.interp(at, truth.time_s, truth.angle)).max() < 0.05
+    assert np.abs((samples["current_q"] - np.interp(at - 0.002, truth.time_s, truth.current))[2:].mean()) < 0.05
+    twice = np.concatenate([frames, frames])
+    write_frames(tmp_path / "repeated.log", twice[np.argsort(twice["time_ns"], kind="stable")])
+    assert (load_log(tmp_path / "repeated.log").samples["reasons"] & E2E_ERROR).any(), "no rate, but repetition"
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("name", ["stops.csv", "stops.parquet", "stops.1.mf4"])

@@ -15,7 +15,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import NonNegative, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
-from emb_daemon.logs.resample import SUBSTITUTES, Series, completed, frames_of, our_messages
+from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, completed, frames_of, is_received, our_messages
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, load_database
@@ -24,7 +24,6 @@ from emb_daemon.wire.units import UNITS
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
-_HEADER = ("CRC", "Counter", "Status")
 
 
 class Mapped(Struct, kw_only=True):
@@ -123,10 +122,10 @@ class Mapping:
 
     def _add(self, name: str, mapped: Mapped) -> None:
         message_name, _, signal_name = name.partition(".")
-        if message_name not in self._ours or (message_name.startswith("EMB_") and not _is_received(message_name)):
+        if message_name not in self._ours or (message_name.startswith("EMB_") and not is_received(message_name)):
             return self._fault(name, "expected Message.Signal of what the daemon receives, such as EMB_FL_Resolver.MotorAngle")
         ours = {signal.name: signal for signal in self._ours[message_name][0].signals}.get(signal_name)
-        if ours is None or signal_name in _HEADER:
+        if ours is None or signal_name in HEADER:
             return self._fault(name, f"{message_name} has no such signal to map")
         signals = self._messages.setdefault(message_name, {})
         if mapped.value is not None:
@@ -171,7 +170,7 @@ class Mapping:
         for name, signals in self._messages.items():
             substitutes = SUBSTITUTES.get(name.rpartition("_")[2], {})
             for signal in self._ours[name][0].signals:
-                optional = signal.name in (*_UNUSED, *_HEADER) or name.startswith("RIG_")
+                optional = signal.name in (*_UNUSED, *HEADER) or name.startswith("RIG_")
                 other = name in ("VEH_WheelSpeed", "VEH_WheelPulse") and signal.name[-2:] not in corners
                 if signal.name in signals or optional or other:
                     continue
@@ -246,10 +245,6 @@ class Mapping:
                 values = [row.get(signal.rpartition(".")[2], np.nan) for row in decoded]
                 found[signal] = (frames["time_ns"][rows], np.array(values, float))
         return found
-
-
-def _is_received(message: str) -> bool:
-    return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
 
 
 #: What a corner loses with a message that is not mapped.

@@ -12,6 +12,8 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import parse_candump
+from emb_daemon.logs.resample import at_our_rate
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITTED
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
@@ -94,24 +96,33 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
 
 
 def read_frames(path: str | Path) -> np.ndarray:
-    """All frames of a log as a FRAME array in file order; ``time_ns`` is the log's own clock.
+    """All frames of a log as a FRAME array; ``time_ns`` is the log's own clock.
 
-    The format goes by the last ending alone (before ``.gz``), so that names with dots in them are fine.
+    They stand in file order; those of a log whose resolver has another rate than ours are brought to it
+    (`resample.at_our_rate`), with a word on stderr. The format goes by the last ending alone (before ``.gz``), so that names
+    with dots in them are fine.
 
     Raises:
         InputError: missing, damaged, empty or unknown file; names the file and the line where there are lines.
     """
-    return read_log(path).frames
+    return read_with_digest(path)[0]
 
 
 def read_with_digest(path: str | Path) -> tuple[np.ndarray, str]:
     """`read_frames`, and the SHA-256 of the file as it was read."""
     recorded = read_log(path)
-    return recorded.frames, recorded.digest
+    frames = at_our_rate(recorded.frames)
+    if frames is not recorded.frames:
+        print(f"{path}: sampled at another rate than every {CYCLE_NS // 1_000_000} ms, brought to it", file=sys.stderr)
+    return frames, recorded.digest
 
 
 def read_log(path: str | Path) -> Recorded:
-    """`read_frames`, with payloads whole."""
+    """A log as it stands.
+
+    Raises:
+        InputError: as `read_frames`.
+    """
     path = Path(path)
     ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     if ending != ".log" and ending not in _PYTHON_CAN:

@@ -10,9 +10,9 @@ from functools import cached_property
 
 import numpy as np
 
-from emb_daemon.logs.columns import absent_raw
+from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right
 from emb_daemon.resources import resource
-from emb_daemon.wire.contract import CYCLE_NS
+from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
@@ -24,6 +24,9 @@ _SAME_PERIOD = 0.05
 _SPARSE_CYCLES = 5
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
 _CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
+#: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
+_LEAST_SAMPLES, _IN_TURN = 50, 0.9
+HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
 
@@ -72,6 +75,11 @@ class Series:
     def sampled(self, at_ns: np.ndarray) -> np.ndarray:
         """The value at each time, straight between samples, NaN in gaps."""
         return np.where(self._near(at_ns), self._between(at_ns), np.nan)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether the way between two samples is unknown."""
+        return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
 
     @property
     def is_slow(self) -> bool:
@@ -223,6 +231,49 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     return result[np.argsort(result["time_ns"], kind="stable")]
 
 
+def at_our_rate(frames: np.ndarray) -> np.ndarray:
+    """Frames of a log in our own layout; if a resolver in it has another rate, above 50 Hz, all brought to ours.
+
+    Frames with a wrong CRC, or whose sender says not to use them, are then left out.
+    """
+    decoder = Decoder()
+    resolvers = [frames["can_id"] == decoder.can_id(f"EMB_{corner}_Resolver") for corner in CORNERS]
+    if not any(_has_another_rate(frames[mine]) for mine in resolvers):
+        return frames
+    right = crc_is_right(frames) & (frames["data"] >> np.uint64(12) & np.uint64(0xF) <= STATUS_DEGRADED)
+    rig, messages = Decoder("dbc/rig.dbc"), {}
+    for name in our_messages():
+        if name.startswith("RIG_"):
+            columns = rig.columns(frames, name)
+        elif name.startswith("VEH_") or is_received(name):
+            columns = decoder.columns(frames[right], name)
+        else:
+            continue
+        times = columns.pop("time_ns")
+        signals = {key: Series.of(times, values) for key, values in columns.items() if key not in HEADER}
+        signals = {key: series.averaged() if key == "CurrentQ" else series for key, series in signals.items()}
+        if known := {key: series for key, series in signals.items() if len(series.time_ns)}:
+            messages[name] = known
+    return frames_of(messages)
+
+
+def _has_another_rate(resolver: np.ndarray) -> bool:
+    """Whether one sender sends a corner's resolver frames at a rate of its own, that fills the way between two samples.
+
+    Two senders, or one whose frames are repeated, have no counter that goes up by one."""
+    if len(resolver) < _LEAST_SAMPLES:
+        return False
+    clock = Series(np.sort(resolver["time_ns"]), resolver["time_ns"])
+    counters = (resolver["data"] >> np.uint64(8) & np.uint64(0xF)).astype(int)
+    in_turn = np.mean(np.diff(counters) % COUNTER_MODULO == 1) > _IN_TURN
+    return bool(in_turn) and not (clock.is_ours or clock.is_sparse)
+
+
+def is_received(message: str) -> bool:
+    """Whether the daemon receives a corner's message."""
+    return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
+
+
 def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, int]) -> np.ndarray:
     corner, kind = (*message.name.split("_"), "")[1:3]
     if corner in ticks and kind in ("Resolver", "Current", "Force"):
@@ -234,7 +285,7 @@ def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, i
         cycles = np.arange(len(times))
         columns = {key: _slow(source, times, cycle_ns) for key, source in signals.items()}
     is_reference = message.name.startswith("RIG_")
-    names = tuple(signal.name for signal in message.signals if signal.name not in ("CRC", "Counter", "Status"))
+    names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
     payload, usable = np.zeros(len(times), np.uint64), np.ones(len(times), bool)
     for layout, name in zip(signal_columns(database, message.name, names), names, strict=True):
         start, length = np.uint64(layout["start"]), int(layout["length"])
@@ -279,7 +330,7 @@ def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
     times = angle.time_ns
     if len(times) < 3:
         return times, np.arange(len(times))
-    if angle.is_ours or angle.period_ns >= _SPARSE_CYCLES * CYCLE_NS:
+    if angle.is_ours or angle.is_sparse:
         steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
         return times, np.concatenate([[0], np.cumsum(steps)])
     grid = np.arange(int(times[0]), int(times[-1]) + 1, CYCLE_NS)

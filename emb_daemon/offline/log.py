@@ -8,11 +8,9 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
-from emb_daemon.jit import njit
-from emb_daemon.logs.columns import Decoder, References
+from emb_daemon.logs.columns import Decoder, References, crc_is_right
 from emb_daemon.logs.read import read_frames
 from emb_daemon.pipeline import Pipeline
-from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.frames import EXTENDED, FRAME
 from emb_daemon.wire.layout import CORNERS
 
@@ -62,20 +60,12 @@ class Log:
     @cached_property
     def slow(self) -> SlowChannels:
         """Thermocouples, wheel speeds and vehicle status at their own rate."""
-        decoder, frames = Decoder(), self.frames[_crc_is_right(self.frames)]
+        decoder, frames = Decoder(), self.frames[crc_is_right(self.frames)]
         return SlowChannels(*(decoder.columns(frames, message) for message in _slow_messages(self.corner)))
 
 
 def _slow_messages(corner: str) -> tuple[str, str, str]:
     return f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"
-
-
-@njit
-def _crc_is_right(frames):
-    right = np.empty(len(frames), np.bool_)
-    for row in range(len(frames)):
-        right[row] = crc(frames[row].can_id, frames[row].data) == frames[row].data & np.uint64(0xFF)
-    return right
 
 
 def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
