@@ -184,6 +184,19 @@ def test_what_nothing_can_stand_in_for_is_a_fault(tmp_path, left_out, expected):
         Mapping(strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, *left_out)))
 
 
+def test_an_angle_that_starts_anew_each_turn_is_put_together(truth, tmp_path):
+    columns = {key: values[:3000] for key, values in strangerkit.sampled(truth, 500.0).items()}
+    samples = []
+    for name, period in (("whole", None), ("turn", 360.0)):
+        degrees = np.degrees(columns["angle_rad"]) - 90.0
+        mapped = "angle_rad, unit: deg" + (f", period: {period:g}" if period else "")
+        strangerkit.write_rig(tmp_path, strangerkit.COLUMNS.replace("angle_rad, unit: rad", mapped))
+        table = columns | {"angle_rad": degrees % period if period else degrees}
+        path = strangerkit.write_table(tmp_path / f"{name}.parquet", table)
+        samples.append(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples["angle"])
+    assert np.ptp(samples[0]) > 4.0 * np.pi and np.allclose(np.diff(samples[0]), np.diff(samples[1]), atol=4e-4)
+
+
 def test_a_caliper_is_no_pad(tmp_path):
     text = strangerkit.COLUMNS.replace("InnerBackplateTemp", "CaliperTemp")
     with pytest.raises(InputErrors, match="EMB_FL_Thermocouple: expected InnerBackplateTemp or OuterBackplateTemp"):

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import NonNegative, Struct
+from emb_daemon.calibration.types import NonNegative, Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, completed, frames_of, is_received, our_messages
@@ -37,6 +37,9 @@ class Mapped(Struct, kw_only=True):
     scale: float = 1.0
     #: In our unit.
     offset: float = 0.0
+    #: What the value jumps by where it starts anew, in the rig's unit: 360 of an angle in degrees within one turn. Between two
+    #: samples it must move by less than half of it.
+    period: Positive | None = None
     #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
     #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
     mean_ms: NonNegative | None = None
@@ -46,7 +49,8 @@ class Mapped(Struct, kw_only=True):
     def __post_init__(self):
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
-        if self.value is not None and (self.unit, self.scale, self.offset, self.mean_ms) != (None, 1.0, 0.0, None):
+        alone = (self.unit, self.period, self.mean_ms) == (None, None, None) and (self.scale, self.offset) == (1.0, 0.0)
+        if self.value is not None and not alone:
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
             raise ValueError("scale: 0 leaves nothing of the signal")
@@ -83,13 +87,17 @@ class MappingFile(Struct, kw_only=True):
 
 
 class _Source:
-    """One foreign signal, and how it becomes ours; ``span_ns`` None is a sampling period."""
+    """One foreign signal, and how it becomes ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a
+    sampling period."""
 
-    def __init__(self, name: str, scale: float, offset: float, span_ns: float | None):
-        self.name, self.scale, self.offset, self.span_ns = name, scale, offset, span_ns
+    def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
+        self.name, self.period = mapped.signal, mapped.period
+        self.scale, self.offset, self.span_ns = scale, offset, span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
-        return Series.of(time_ns, self.scale * values + self.offset).averaged(self.span_ns)
+        series = Series.of(time_ns, values)
+        turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
+        return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
 
 
 class Mapping:
@@ -146,7 +154,7 @@ class Mapping:
             )
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
-        signals[signal_name] = _Source(mapped.signal, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
+        signals[signal_name] = _Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
     def _their_unit(self, signal: str) -> str:
