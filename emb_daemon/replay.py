@@ -170,12 +170,11 @@ class Replay:
             for corner, log in logs.items():
                 samples["brake_torque"][mine[corner]] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
         estimates = estimate(samples, pipeline.parameters, pipeline.states, self.adaptation)
-        return [
-            Result(
-                log.path, log.time_ns - shift, estimates[mine[corner]], samples[mine[corner]], log.reference, log.force_N
-            ).since(self._start_ns(frames) - shift if self._start_s > 0.0 else 0)
+        results = [
+            Result(log.path, log.time_ns - shift, estimates[mine[corner]], samples[mine[corner]], log.reference, log.force_N)
             for corner, log in logs.items()
         ]
+        return [result.since(self._start_ns(frames) - shift) for result in results] if self._start_s > 0.0 else results
 
 
 def _corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:

@@ -190,7 +190,6 @@ class Mapping:
                 self._fault(name, f"expected {' or '.join(_PLATES)}")
             if name.endswith("_Resolver") and not self._sources(name):
                 self._fault(name, "only constants: expected at least one signal of the rig")
-
         for corner in corners:
             for message, text in _LOST.items():
                 if (name := message.format(corner)) not in self._messages:

@@ -26,6 +26,7 @@ _SPARSE_CYCLES = 5
 _CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
+#: Signals of an E2E protected message that its protection fills.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
