@@ -8,6 +8,7 @@ it is written down, and the parameters are moved with that held.
 import numpy as np
 
 from emb_daemon.effects import paths as effects
+from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.estimator.paths import rest, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
 from emb_daemon.estimator.step import step
@@ -15,15 +16,17 @@ from emb_daemon.jit import njit
 from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline.run import TRACE
 
-#: What the force paths take from the rest of the step, at each sample: rise of the mean pad temperature and its ``history``
-#: (K), friction ``power`` (W), ``disc`` (degC), and whether temperatures are known. ``contact_angle`` (rad) shows whether the
-#: zero was lost, which a held run cannot follow.
+#: What the force paths take from the rest of the step, at each sample: the pads' ``mean`` temperatures (degC) and the
+#: ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known, and the heat of the
+#: motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost, which a held run cannot follow.
 HELD = np.dtype(
     [
-        ("rise", "f8"),
+        ("mean", "f8", (2,)),
         ("history", "f8"),
         ("power", "f8"),
         ("disc", "f8"),
+        ("winding", "f8"),
+        ("housing", "f8"),
         ("contact_angle", "f8"),
         ("temperature_known", "?"),
     ],
@@ -35,14 +38,16 @@ HELD = np.dtype(
 def _record(samples, parameters, states, estimate, out):
     p, s, e = parameters[0], states[0], estimate[0]
     for row in range(len(samples)):
-        step(s, p, samples[row], e)
         o = out[row]
-        o.rise, o.history = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference, s.history
+        o.winding, o.housing = s.winding, s.housing
+        step(s, p, samples[row], e)
+        o.mean[:] = s.mean
+        o.history = s.history
         o.power, o.disc, o.contact_angle, o.temperature_known = s.power, s.disc, s.contact_angle, s.temperature_known
 
 
 @njit
-def _run(samples, parameters, states, held, out):
+def _run(samples, parameters, states, held, out, signals):
     p, s = parameters[0], states[0]
     s.started = True
     s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
@@ -52,7 +57,12 @@ def _run(samples, parameters, states, held, out):
     for row in range(len(samples)):
         m, h, o = samples[row], held[row], out[row]
         s.disc, s.power, s.temperature_known = h.disc, h.power, h.temperature_known
-        stiffness_path(s, p, m, stiffness_factor(p.thermal, h.rise, h.history) if h.temperature_known else 1.0)
+        s.mean[:] = h.mean
+        s.winding, s.housing = h.winding, h.housing
+        rise = 0.5 * (h.mean[0] + h.mean[1]) - p.thermal.reference
+        stiffness_path(s, p, m, stiffness_factor(p.thermal, rise, h.history) if h.temperature_known else 1.0)
+        if len(signals) > 0:
+            signals[row] = s.effects.terms.signal
         o.force = s.force
         o.torque, o.leverage, _ = torque_path(s, p, m)
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
@@ -70,5 +80,14 @@ def record_heat(samples: np.ndarray, parameters: np.void) -> np.ndarray | None:
 def run_held(samples: np.ndarray, parameters: np.void, held: np.ndarray) -> np.ndarray:
     """TRACE rows with force, torque, leverage and torque constant; the rest of them is zero."""
     out = np.zeros(len(samples), TRACE)
-    _run(samples, np.atleast_1d(parameters), np.zeros(1, STATE), held, out)
+    _run(samples, np.atleast_1d(parameters), np.zeros(1, STATE), held, out, np.zeros((0, len(SIGNALS))))
     return out
+
+
+def follow_signals(samples: np.ndarray, parameters: np.void, held: np.ndarray) -> np.ndarray:
+    """What terms see (`effects.terms.SIGNALS`) at each sample of a held run; NaN where it is not known."""
+    watching = parameters.copy()
+    watching["effects"]["terms"]["count"] = max(watching["effects"]["terms"]["count"], 1)
+    signals = np.zeros((len(samples), len(SIGNALS)))
+    _run(samples, np.atleast_1d(watching), np.zeros(1, STATE), held, np.zeros(len(samples), TRACE), signals)
+    return signals

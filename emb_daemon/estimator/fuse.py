@@ -105,7 +105,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     known = p.clearance_sigma == 0.0
     softening = p.thermal.softening * hypot(s.temperature_sigma, p.thermal.sigma)
     softening += p.thermal.softening_history * s.history_sigma
-    relative = (p.stiffness_relative_sigma + softening) * s.force
+    relative = hypot((p.stiffness_relative_sigma + softening) * s.force, s.effects.terms.doubt)
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)

@@ -1,0 +1,405 @@
+"""The last rung: when the catalogue is exhausted and something is left, make the term.
+
+Every form of the grammar (`forms`) is screened on episodes left out of its fit, beside all that the path's own parameters
+can do. The best few are run through the estimator and fitted; the one whose gain is worth its length (minimum description
+length, Rissanen, Automatica 14, 1978) is asked what every effect is asked, and more: chance over the *whole* grammar, by the
+best that all forms together do with their signals moved in time (maxima as Romano, Wolf, Econometrica 73, 2005), its own
+signal at another time, and whether resampled episodes would choose the same.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from emb_daemon.calibration.terms import Term, fill_terms
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.coordinates import Coordinate, Move
+from emb_daemon.diagnose.evidence import Evidence, leave_out
+from emb_daemon.diagnose.forms import Form, enumerate_forms, harmonic, made_effect, rippling
+from emb_daemon.diagnose.held_heat import follow_signals, record_heat
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.orders import strongest_order
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.screening import Q_VALUE, Candidate
+from emb_daemon.diagnose.selection import Selection
+from emb_daemon.diagnose.unexplained import achieved, is_beyond
+from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
+from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
+from emb_daemon.errors import InvalidValue
+from emb_daemon.offline.run import held
+
+#: Share of the rest that a smooth function of some signal must explain on left-out episodes before anything is made up.
+_CEILING = 0.2
+#: Samples that are averaged for the screening: what a term does lasts longer than 16 ms, its noise does not. For chance, which
+#: asks all forms a hundred times, an eighth of a second.
+_AVERAGED, _COARSE = 4, 32
+#: Forms that are run through the estimator.
+_SHORTLIST = 10
+#: Shifts of all signals in time, and of the chosen one's; bootstraps.
+_CHANCES, _SHIFTS, _BOOTSTRAPS = 99, 5, 100
+#: Share of bootstraps that must choose the same port and signal; share of the gain with which another is as good.
+_STABLE, _AS_GOOD = 0.8, 0.95
+#: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
+_OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
+#: Orders of ripples that are scanned.
+_ORDERS = (0.05, 100.0)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What left-out episodes say of forms, one row each: with ``u`` = xᵀr and ``a`` = xᵀx of each episode, nuisances projected
+    out of the regressor x."""
+
+    u: np.ndarray
+    a: np.ndarray
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Fall of the squared error summed over left-out episodes."""
+        rest = self.a.sum(axis=1, keepdims=True) - self.a
+        without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=rest > 0.0)
+        return np.sum(2.0 * without * self.u - without**2 * self.a, axis=1)
+
+
+class Screen:
+    """One channel's residual, averaged, with its nuisances, against which forms are held."""
+
+    def __init__(self, model: Model, channel: str, averaged: int = _AVERAGED):
+        self.model, self.channel, bench = model, channel, model.bench
+        episode = bench.episode[channel]
+        index = np.arange(len(episode))
+        begins = np.flatnonzero(np.diff(episode, prepend=-1))
+        within = index - begins[np.searchsorted(begins, index, side="right") - 1]
+        self._starts = np.flatnonzero(within % averaged == 0)
+        self._counts = np.diff(np.append(self._starts, len(episode)))
+        weight = np.sqrt(self._counts)
+        self._weight = weight / self._counts
+        #: What makes a plain mean of an averaged column.
+        self.per_mean = 1.0 / weight
+        at = episode[self._starts]
+        self._bounds = np.searchsorted(at, np.arange(bench.episodes + 1))
+        own = model.own(channel)
+        table = np.column_stack([model.columns[c] for c in own]) if own else np.zeros((len(episode), 0))
+        self.nuisances = self.averaged(table)
+        penalty = model.penalty(own, channel) if own else np.zeros(0)
+        self._normal = self.nuisances.T @ self.nuisances + np.diag(penalty + 1e-12)
+        residual = self.averaged(model.residual[channel][:, None])
+        self.residual = residual - self.nuisances @ self._solve(self.nuisances.T @ residual)
+        self.keep = model.residual[channel] != 0.0
+
+    def averaged(self, columns: np.ndarray) -> np.ndarray:
+        """Means over a few samples, weighted as so many; columns (N, k)."""
+        return np.add.reduceat(columns, self._starts, axis=0) * self._weight[:, None]
+
+    def _solve(self, right: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(self._normal, right, rcond=1e-12)[0] if len(self._normal) else right
+
+    def scores(self, columns: np.ndarray) -> Scores:
+        """Of regressors (N, k)."""
+        return self.scores_of(self.averaged(columns * self.keep[:, None]))
+
+    def scores_of(self, averaged: np.ndarray) -> Scores:
+        """Of regressors that are averaged already."""
+        averaged = averaged - self.nuisances @ self._solve(self.nuisances.T @ averaged)
+        episodes = len(self._bounds) - 1
+        u, a = np.zeros((averaged.shape[1], episodes)), np.zeros((averaged.shape[1], episodes))
+        for number in range(episodes):
+            part = slice(self._bounds[number], self._bounds[number + 1])
+            u[:, number] = averaged[part].T @ self.residual[part, 0]
+            a[:, number] = np.einsum("nk,nk->k", averaged[part], averaged[part])
+        return Scores(u, a)
+
+
+def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
+    """Terms made for what the catalogue leaves, one after the other until none is proven."""
+    for channel in (channel for channel in selection.model.bench.channels if channel in FORCE_CHANNELS):
+        while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
+            progress(f"making a term for the {channel} residual")
+            before, selection = selection, _one_more(selection, channel)
+            if selection is before:
+                break
+    return selection
+
+
+def _wanted(selection: Selection, channel: str) -> bool:
+    """Whether enough is left, and enough of it looks explicable, for a term to be made up."""
+    model, screening = selection.model, selection.screening
+    ceiling, _ = screening.rival(model, channel, {})
+    explicable = ceiling > _CEILING * float(model.residual[channel] @ model.residual[channel])
+    explicable = explicable and model.rms(ceiling, channel) >= screening.floor(model, channel)
+    known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
+    return explicable or is_beyond(float(np.sqrt(model.noise(channel))), known)
+
+
+def _one_more(selection: Selection, channel: str) -> Selection:
+    """With the best term for one channel, if it is proven."""
+    model, screening = selection.model, selection.screening
+    random = np.random.default_rng(0)
+    signals = [
+        follow_signals(t.log.samples, p, record_heat(t.log.samples, p))
+        for t in model.bench.trials
+        for p in [held(to_parameters(model.bench.calibrated(model.values, t.index)))[0]]
+    ]
+    covered = _covered(np.concatenate(signals))
+    ports = tuple(port for port in PORTS if model.bench.channel_of(HOOKS[port].channel) == channel)
+    ports = tuple(port for port in ports if port != "pad_friction")
+    sensitivities = {port: _sensitivity(model, channel, port) for port in ports}
+    screen = Screen(model, channel)
+    forms = enumerate_forms(covered, ports)
+    scores = _screened(screen, forms, sensitivities, signals)
+    best = _shortlisted(forms, scores, len(screen.model.bench.trials))
+    best += _ripples(model, channel, ports, sensitivities, covered)
+    exact = [_probed(model, channel, form) for form in best]
+    judged = [(form, columns, model.evidence(channel, columns)) for form, columns in zip(best, exact, strict=True)]
+    judged = [row for row in judged if len(row[2].values) and row[2].gain > 0.0 and _stays_in_bounds(row[0], row[2])]
+    if not judged:
+        return selection
+    own = model.own(channel)
+    alone = leave_out(model.moments(channel, [model.columns[c] for c in own]), model.penalty(own, channel)).left_out
+    plain = float(alone.sum())
+    judged.sort(key=lambda row: _length(row[0], row[2], plain, model.bench.episodes))
+    form, _, evidence = judged[0]
+    if model.rms(evidence.gain, channel) < screening.floor(model, channel):
+        return selection
+    q = max(evidence.p_value, _chance(model, channel, forms, sensitivities, signals, scores.gain.max(), random))
+    if form.shape == "harmonic":
+        q = min(1.0, evidence.p_value * len(forms))
+    ceiling, _ = screening.rival(model, channel, {})
+    moved = _at_another_time(screen, form, sensitivities[form.port], signals, random) / max(evidence.gain, 1e-300)
+    if q > Q_VALUE or evidence.gain < _OF_MODEL_FREE * ceiling or moved > _OF_PLACEBO:
+        return selection
+    alike = _as_good(judged, own=judged[0])
+    stable = _stability(screen, judged, random)
+    reason = f"made for what no effect of the catalogue explains; same port and signal in {100 * stable:.0f} % of bootstraps"
+    if alike:
+        reason += f"; as good on these logs: {', '.join(alike)}"
+    elif stable < _STABLE:
+        return selection
+    candidate = Candidate(
+        made_effect(form, _name(form, model.bench.calibration.terms)), channel, evidence=evidence, p_value=evidence.p_value,
+        q_value=q, gain=model.rms(evidence.gain, channel), accepted=True, reason=reason,
+        placebos={"its signal at another time": max(moved, 0.0)} if form.shape != "harmonic" else {},
+        confounded_with=alike[0] if alike else None, over=np.concatenate(signals)[:, list(SIGNALS).index(form.signal)],
+    )  # fmt: skip
+    return _entered(selection, candidate, form)
+
+
+def _covered(signals: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Range of each signal that varies."""
+    result = {}
+    for index, name in enumerate(SIGNALS):
+        known = signals[np.isfinite(signals[:, index]), index]
+        if len(known) and np.ptp(known) > 1e-9 * max(abs(known.max()), 1e-12):
+            result[name] = float(known.min()), float(known.max())
+    return result
+
+
+def _sensitivity(model: Model, channel: str, port: str) -> np.ndarray:
+    """What one unit at a port does to a channel, minus the derivative of the residual."""
+    constant = Form(port, "motor_speed", "none", "constant", "always", 1.0, 0.0, 1.0, 1.0, -1e9, 1e9)
+    return _probed(model, channel, constant)[0]
+
+
+def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
+    """A form's regressors, by the estimator itself."""
+    index = len(model.bench.calibration.terms)
+    bench = _with_term(model.bench, form.term())
+    own = [_coordinate(index, channel, form, "coefficient", "")]
+    if form.shape == "harmonic":
+        own.append(_coordinate(index, channel, form, "sine", ""))
+    return bench.regressors(model.values, [Probe(c) for c in own], model.residual)
+
+
+def _with_term(bench: Bench, term: Term) -> Bench:
+    return bench.under(msgspec.structs.replace(bench.calibration, terms=(*bench.calibration.terms, term)))
+
+
+def _coordinate(index: int, channel: str, form: Form, field: str, effect: str) -> Coordinate:
+    key = f"terms[{index}].{field}"
+    if field in ("coefficient", "sine"):
+        moves = (Move(key, 1.0, -np.inf, np.inf),)
+        return Coordinate(
+            key, channel, 0.0, form.step, np.inf, moves, unit=HOOKS[form.port].unit, effect=effect, parameter=field
+        )
+    low, high, prior = form.bounds(field)
+    start = getattr(form, field)
+    return Coordinate(
+        key, channel, start, 1e-3 * prior, prior, (Move(key, 1.0, low, high),), low, high, effect=effect, parameter=field
+    )  # fmt: skip
+
+
+# -- screening --------------------------------------------------------------------------------------------------------
+
+
+def _screened(
+    screen: Screen, forms: Sequence[Form], sensitivities: Mapping[str, np.ndarray], signals: list[np.ndarray]
+) -> Scores:
+    """All forms, each as what its port does times what its shape makes of its signal."""
+    shapes: dict[Form, list[int]] = {}
+    for index, form in enumerate(forms):
+        shapes.setdefault(replace(form, port=""), []).append(index)
+    episodes = screen.model.bench.episodes
+    u, a = np.zeros((len(forms), episodes)), np.zeros((len(forms), episodes))
+    for members in shapes.values():
+        values = _values(screen.model.bench, forms[members[0]], signals)
+        columns = np.column_stack([sensitivities[forms[index].port] * values for index in members])
+        part = screen.scores(columns)
+        u[members], a[members] = part.u, part.a
+    return Scores(u, a)
+
+
+def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
+    """What a form of coefficient one makes of its signal, at every sample."""
+    record = _record_of(replace(form, port=form.port or PORTS[0]))
+    largest = bench.calibration.stiffness.maximum_force_N
+    parts = zip(bench.trials, signals, strict=True)
+    return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])
+
+
+def _record_of(form: Form) -> np.void:
+    record = np.zeros(1, PARAMETERS)[0]
+    fill_terms(record, (form.term(),))
+    record["term"][0]["coefficient"] = 1.0
+    return record["term"][0]
+
+
+def _chance(
+    model: Model,
+    channel: str,
+    forms: Sequence[Form],
+    sensitivities: Mapping[str, np.ndarray],
+    signals: list[np.ndarray],
+    gain: float,
+    random: np.random.Generator,
+) -> float:
+    """Chance that the best of all forms gains as much with their signals moved in time, as if the log were a circle."""
+    screen = Screen(model, channel, _COARSE)
+    shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
+    row = {shape: index for index, shape in enumerate(shapes)}
+    values = np.column_stack([screen.averaged(_values(model.bench, shape, signals)[:, None]) for shape in shapes])
+    values *= screen.per_mean[:, None]
+    by_port = [
+        (screen.averaged(column[:, None] * screen.keep[:, None]), [row[replace(f, port="")] for f in forms if f.port == port])
+        for port, column in sensitivities.items()
+    ]
+    best = []
+    for _ in range(_CHANCES):
+        moved = np.roll(values, int(len(values) * random.uniform(0.1, 0.9)), axis=0)
+        best.append(max(float(screen.scores_of(own * moved[:, rows]).gain.max()) for own, rows in by_port if rows))
+    return (1.0 + np.count_nonzero(np.array(best) >= gain)) / (1.0 + _CHANCES)
+
+
+def _shortlisted(forms: Sequence[Form], scores: Scores, logs: int) -> list[Form]:
+    """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
+    gains = scores.gain
+    chosen: list[Form] = []
+    for index in np.argsort(-gains):
+        form = forms[index]
+        relatives = [f for f in chosen if (f.port, f.signal, f.memory) == (form.port, form.signal, form.memory)]
+        if gains[index] > 0.0 and len(relatives) < 2:
+            chosen.append(form)
+        if len(chosen) == _SHORTLIST:
+            break
+    return chosen
+
+
+def _ripples(model: Model, channel: str, ports: tuple[str, ...], sensitivities, covered) -> list[Form]:
+    """The strongest ripple over the motor angle at each port that may have one."""
+    found = []
+    for port in rippling(ports):
+        effect = Effect(
+            name=port, hook=port, term=lambda: 0.0, equation="", source="",
+            parameters=(Parameter("o", "1", *_ORDERS, 1.0, "", _ORDERS),),
+            harmonic=Harmonic("o", "c", "s", grows_with="port"),
+        )  # fmt: skip
+        order, _ = strongest_order(model, effect, channel, {"port": sensitivities[port]})
+        if order and "motor_angle" in covered:
+            found.append(harmonic(port, order, model.bench.middle, covered))
+    return found
+
+
+# -- judging ----------------------------------------------------------------------------------------------------------
+
+
+def _stays_in_bounds(form: Form, evidence: Evidence) -> bool:
+    """Whether a calibration may hold the term at the size found."""
+    try:
+        form.term(coefficient=float(np.hypot.reduce(evidence.values)))
+    except InvalidValue:
+        return False
+    return True
+
+
+def _length(form: Form, evidence: Evidence, plain: float, episodes: int) -> float:
+    """Description length of what is left and of the term, in nats; an episode counts as one observation."""
+    left = max(1.0 - evidence.gain / max(plain, 1e-300), 1e-3)
+    return 0.5 * episodes * np.log(left) + 0.5 * form.numbers * np.log(episodes)
+
+
+def _at_another_time(
+    screen: Screen, form: Form, sensitivity: np.ndarray, signals: list[np.ndarray], random: np.random.Generator
+) -> float:
+    """Largest gain of the term with its signal moved in time, as if the log were a circle."""
+    if form.shape == "harmonic":
+        return 0.0
+    values = _values(screen.model.bench, form, signals)
+    shifts = [int(len(values) * random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
+    columns = np.column_stack([sensitivity * np.roll(values, shift) for shift in shifts])
+    return float(screen.scores(columns).gain.max())
+
+
+def _as_good(judged: list, own: tuple) -> list[str]:
+    """Other ports and signals whose best form gains nearly as much, best first."""
+    form, _, evidence = own
+    names = []
+    for other, _, gained in judged:
+        name = f"{other.port} over {other.signal}".replace("_", " ")
+        same = (other.port, other.signal) == (form.port, form.signal)
+        if not same and gained.gain >= _AS_GOOD * evidence.gain and name not in names:
+            names.append(name)
+    return names
+
+
+def _stability(screen: Screen, judged: list, random: np.random.Generator) -> float:
+    """Share of resampled episodes in which the same port and signal would be chosen; equal ones count as the same."""
+    scores = [screen.scores(np.column_stack(columns)) for _, columns, _ in judged]
+    episodes = scores[0].u.shape[1]
+    weights = random.multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
+    gains = np.array([
+        sum((weights @ u) ** 2 / np.maximum(weights @ a, 1e-300) for u, a in zip(score.u, score.a, strict=True))
+        for score in scores
+    ])  # fmt: skip
+    key = (judged[0][0].port, judged[0][0].signal)
+    own = gains[[(form.port, form.signal) == key for form, _, _ in judged]].max(axis=0)
+    return float(np.mean(own >= _AS_GOOD * gains.max(axis=0)))
+
+
+# -- accepting --------------------------------------------------------------------------------------------------------
+
+
+def _name(form: Form, terms: tuple[Term, ...]) -> str:
+    name = f"term:{form.port}:{form.signal}"
+    taken = {term.name for term in terms}
+    return name if name not in taken else next(f"{name}:{n}" for n in range(2, MOST + 2) if f"{name}:{n}" not in taken)
+
+
+def _entered(selection: Selection, candidate: Candidate, form: Form) -> Selection:
+    """With a term, fitted with everything else; without it again if it then proves nothing."""
+    before, channel, name = selection.model, candidate.channel, candidate.effect.name
+    index = len(before.bench.calibration.terms)
+    bench = _with_term(before.bench, form.term(name))
+    fields = ["coefficient", *(["sine"] if form.shape == "harmonic" else [])]
+    amplitudes = [_coordinate(index, channel, form, field, name) for field in fields]
+    sizes = {_coordinate(index, channel, form, field, name): getattr(form, field) for field in form.fitted}
+    values = dict(zip(amplitudes, map(float, candidate.evidence.values), strict=True)) | sizes
+    model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
+    evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0))
+    gain = model.rms(evidence.gain, channel)
+    worse = model.noise(channel) >= before.noise(channel)
+    if worse or evidence.p_value > Q_VALUE or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
+        return selection
+    candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain)
+    explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
+    return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])
