@@ -52,7 +52,7 @@ class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     memory_scale: Positive = 1.0
     #: Signal from which to which the term was found; outside it stays what it is at the edge, and sigma grows.
     low: float
-    #: Its end.
+    #: End of that range.
     high: float
     #: Date and logs.
     provenance: str = ""
