@@ -29,9 +29,11 @@ from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
 from emb_daemon.offline.run import held
+from emb_daemon.offline.score import rmse
 
-#: Share of the rest that a smooth function of some signal must explain on left-out episodes before anything is made up.
-_CEILING = 0.2
+#: Share of the rest that a smooth function of some signal must explain on left-out episodes before anything is made up, or
+#: RMS of the rest over what of it differs from sample to sample: what memories do is no function of any signal now.
+_CEILING, _ROUGH = 0.2, 2.0
 #: Samples that are averaged for the screening: what a term does lasts longer than 16 ms, its noise does not. For chance, which
 #: asks all forms a hundred times, an eighth of a second.
 _AVERAGED, _COARSE = 4, 32
@@ -130,7 +132,10 @@ def _wanted(selection: Selection, channel: str) -> bool:
     explicable = ceiling > _CEILING * float(model.residual[channel] @ model.residual[channel])
     explicable = explicable and model.rms(ceiling, channel) >= screening.floor(model, channel)
     known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
-    return explicable or is_beyond(float(np.sqrt(model.noise(channel))), known)
+    rms = float(np.sqrt(model.noise(channel)))
+    residual = model.residual[channel]
+    rough = rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) / np.sqrt(2.0)
+    return explicable or is_beyond(rms, known) or rms > _ROUGH * rough
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
