@@ -3,6 +3,8 @@
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -213,3 +215,48 @@ class TestPacer:
         pacer.arrived(0, 0)
         pacer.last_tick_ns = 9 * CYCLE_NS
         assert pacer.next_wake(9 * CYCLE_NS + 1) <= 10 * CYCLE_NS + 500_000
+
+
+#: Arguments: configuration, frames, state folder. A second start goes on from what the first one left.
+_COMPILES_NOTHING = """
+import sys
+from pathlib import Path
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.runtime.daemon import Daemon
+from emb_daemon.runtime.rawcan import socket_pair
+
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("emb_daemon")]
+    kernels = [kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, Dispatcher)]
+    return {(kernel.__module__, kernel.__name__, len(kernel.signatures)) for kernel in kernels}
+
+
+frames = np.load(sys.argv[2])
+for _ in range(2):
+    daemon = Daemon(Setup(sys.argv[1]), socket_pair()[1], state=Path(sys.argv[3]))
+    daemon.warm_up()
+    before = compiled()
+    daemon.pipeline.begin(int(frames["time_ns"][0]))
+    start = 0
+    while start < len(frames):
+        start, count = daemon.pipeline.collect(frames, start)
+        daemon.pipeline.answer(count)
+        daemon.pipeline.broadcast(count)
+    daemon._adaptation.close(daemon.pipeline.states, daemon.pipeline.parameters)
+    assert Path(sys.argv[3], "restart-FL.json").exists(), "nothing was kept"
+    assert compiled() == before, compiled() - before
+"""
+
+
+def test_nothing_is_compiled_once_the_loop_runs(setup: Setup, drive, tmp_path: Path):
+    """A compiler in the real-time loop holds up everything for seconds, and on one CPU everybody else too."""
+    np.save(tmp_path / "frames.npy", drive[0])
+    arguments = [setup.path, tmp_path / "frames.npy", tmp_path / "state"]
+    (tmp_path / "state").mkdir()
+    done = subprocess.run([sys.executable, "-c", _COMPILES_NOTHING, *arguments], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -22,8 +22,16 @@ from emb_daemon.models.fusion import (
     force_variance,
     predict_errors,
     update_errors,
+    variance_along,
 )
 from emb_daemon.offline import estimate
+
+
+def _update(x, P, gain, innovation, h, variance):
+    """A measurement update; returns the innovation's variance before it."""
+    s = variance + variance_along(P, h, gain)
+    update_errors(x, P, gain, innovation, s)
+    return s
 
 
 def test_steady_state_solves_the_riccati_equation():
@@ -37,7 +45,7 @@ def test_steady_state_solves_the_riccati_equation():
     for _ in range(20_000):
         predict_errors(x, P, decay, noise_decay, noise_variance, walked)
         predicted = P.copy()
-        update_errors(x, P, gain, 0.0, h, variance)
+        _update(x, P, gain, 0.0, h, variance)
     transition = np.diag([decay, 1.0, noise_decay])
     noise = np.diag([1.0 - decay**2, walk, (1.0 - noise_decay**2) * noise_variance])
     expected = solve_discrete_are(transition.T, h[seen, None], noise, np.array([[variance]]))
@@ -69,7 +77,7 @@ def test_covariance_stays_symmetric_and_positive_over_long_random_input(paramete
         _, h = _sensitivities(
             p, force, rng.uniform(0, 2e3), rng.uniform(-2e2, 2e2), rng.normal(), 4e-5 * force, rng.uniform(-1, 1), 0.0, heats
         )
-        s = update_errors(x, P, gain, rng.normal(0.0, 0.1), h, 10.0 ** rng.uniform(-6, -2))
+        s = _update(x, P, gain, rng.normal(0.0, 0.1), h, 10.0 ** rng.uniform(-6, -2))
         assert s > 0.0
         if number % 100 == 0:
             assert np.array_equal(P, P.T)
@@ -115,7 +123,7 @@ def test_filter_is_consistent_on_data_of_its_own_model(parameters):
             truth += rng.normal(size=STATES) * np.sqrt(drive)
             predict_errors(x, P, decay, noise_decay, noise, walked)
             innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x
-            s = update_errors(x, P, gain, innovation, h, variance)
+            s = _update(x, P, gain, innovation, h, variance)
             nis.append(innovation**2 / s)
             signed.append(innovation / np.sqrt(s))
             if step % 50 == 49:
@@ -170,7 +178,7 @@ def test_an_error_of_each_kind_is_found_from_strokes(parameters, name):
         set_walks(walked, p, x, 0.0, 0.0, 0.004)
         predict_errors(x, P, decay, noise_decay, variance, walked)
         innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x
-        update_errors(x, P, gain, innovation, h, variance)
+        _update(x, P, gain, innovation, h, variance)
     off = truth[state] - x[state]
     assert abs(off) < share * abs(truth[state]), x[state] / truth[state]
     assert abs(off) < 3.0 * np.sqrt(P[state, state])

@@ -41,6 +41,7 @@ signals:
   EMB_FL_Thermocouple.InnerBackplateTemp: {signal: Climate.Inner}
   EMB_FL_Thermocouple.OuterBackplateTemp: {signal: Climate.Outer}
   EMB_FL_Thermocouple.CaliperTemp: {signal: Climate.Inner, offset: -1.5}
+  VEH_WheelSpeed.WheelSpeedFL: {value: 0.0}
   RIG_FL_Force.ClampForceRef: {signal: Inverter.Load}
 """
 

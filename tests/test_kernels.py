@@ -82,11 +82,13 @@ def test_filter_measurement_update():
         x, P, h = _random_filter(rng)
         innovation, variance = rng.normal(), rng.uniform(0.1, 2.0)
         expected = naive.update_errors(x, P, innovation, h, variance)
-        assert variance_along(P, h) == pytest.approx(h @ P @ h)
-        s = update_errors(x, P, np.empty(STATES), innovation, h, variance)
+        gain = np.empty(STATES)
+        along = variance_along(P, h, gain)
+        assert along == pytest.approx(h @ P @ h)
+        update_errors(x, P, gain, innovation, variance + along)
         np.testing.assert_allclose(x, expected[0], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(P, expected[1], rtol=1e-8, atol=1e-10)
-        assert s == pytest.approx(expected[2])
+        assert variance + along == pytest.approx(expected[2])
 
 
 def test_maximum_likelihood_weighs_by_inverse_variance():

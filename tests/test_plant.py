@@ -388,13 +388,7 @@ def campaign(calibration):
     return scenarios.rig_campaign(plant, np.random.default_rng(0), stops=6, drag_seconds=20.0)
 
 
-_GROWS = pytest.mark.xfail(strict=True, reason="29 N: its growth is learned a second time; 25 promised")
-
-
-@pytest.mark.parametrize(
-    "effect",
-    [pytest.param(e, id=e.name, marks=_GROWS if e.name == "disc_thermal_expansion" else ()) for e in REGISTRY],
-)
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
 def test_an_estimator_that_knows_the_effect_is_as_good_as_without_it(calibration, campaign, effect):
     """Plant and catalogue were written apart: where they agree, an effect means the same in both."""
     values = VISIBLE[effect.name]

@@ -23,7 +23,7 @@ from emb_daemon.adapt.snapshots import Snapshots
 from emb_daemon.adapt.training import answer_adapting
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator import restart
-from emb_daemon.estimator.records import PARAMETERS, STATE
+from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
 from emb_daemon.wire.contract import NO_RESULT
 from emb_daemon.wire.layout import CORNERS
 
@@ -124,6 +124,9 @@ class Adaptation:
         for corner in self._stores:
             self.rows[corner] = np.zeros((), r.TRAINING)
         compile_fit(next(iter(self._calibrations.values())), pipeline.states[0])
+        state, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+        restart.take_snapshot(state, pipeline.parameters[0], snapshot)
+        restart.resume(state, pipeline.parameters[0], snapshot, 0.0)
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)
             self._thread.start()

@@ -49,7 +49,6 @@ from emb_daemon.models.fusion import (
     VISCOUS,
     force_variance,
     predict_errors,
-    variance_along,
 )
 from emb_daemon.models.plausibility import (
     AGREE,
@@ -144,8 +143,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
         to_torque(h, leverage, s_mean, mean_force, speed, slow_friction, accelerating, needed, s.winding, s.housing)
         h[FAST] = leverage * spread
-        slow = variance_along(s.covariance, h) - h[FAST] * h[FAST] * s.covariance[FAST, FAST]
-        out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + max(slow, 0.0) / (leverage * leverage))
+        fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         trusted = s.plausibility.verdict == AGREE and not s.unknown
         if trusted != s.trusted:
             # What the alternatives saw around a sensor's fault tells nothing of the brake.
@@ -153,6 +151,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             s.trusted = trusted
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
+        slow = max(variance - white - fast, 0.0)
+        out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
         out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
         for kind in range(ALTERNATIVES if not known else 0):
             a = s.alternatives[kind]

@@ -68,13 +68,14 @@ STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH = range(ALTERNATIVES)
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
-#: One hypothesis beside the first. ``log_odds`` against it; ``slope`` N/rad at its own contact angle; ``shift`` N: its force
-#: over the first one's.
+#: One hypothesis beside the first. ``log_odds`` against it, and the ``share`` of all that it has by them; ``slope`` N/rad at
+#: its own contact angle; ``shift`` N: its force over the first one's.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("log_odds", "f8"),
+        ("share", "f8"),
         ("shift", "f8"),
         ("slope", "f8"),
     ],
@@ -124,12 +125,15 @@ def _strongest(s, but):
 
 
 @njit
-def share(s, kind):
-    """Probability of an alternative."""
+def _share_out(s):
+    """Probability of each alternative."""
     total = 1.0
-    for other in range(ALTERNATIVES):
-        total += exp(min(s.alternatives[other].log_odds, 600.0))
-    return exp(min(s.alternatives[kind].log_odds, 600.0)) / total
+    for kind in range(ALTERNATIVES):
+        a = s.alternatives[kind]
+        a.share = exp(a.log_odds)
+        total += a.share
+    for kind in range(ALTERNATIVES):
+        s.alternatives[kind].share /= total
 
 
 @njit
@@ -149,7 +153,7 @@ def unproven(s):
     """How far unproven alternatives may move the force, N: the largest of probability times difference."""
     most = 0.0
     for kind in range(ALTERNATIVES):
-        most = max(most, share(s, kind) * abs(s.alternatives[kind].shift))
+        most = max(most, s.alternatives[kind].share * abs(s.alternatives[kind].shift))
     return most
 
 
@@ -210,9 +214,9 @@ def learn(x, P, gain, h, unexplained, variance, trusted):
     for i in range(STATES):
         if i not in (CONTACT, SCALE, GROWTH):
             innovation -= h[i] * x[i]
-    s = variance + variance_along(P, h)
+    s = variance + variance_along(P, h, gain)
     if trusted and innovation * innovation < GATE * GATE * s:
-        update_errors(x, P, gain, innovation, h, variance)
+        update_errors(x, P, gain, innovation, s)
     return innovation, s
 
 
@@ -243,7 +247,7 @@ def settle(s, p, released, dt):
             s.drive += a.shift
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
-    if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
+    if given_up or (not suspected(s) and s.open_s > _OPENED_S):
         open_again(s, p)
     return False
 
@@ -273,11 +277,13 @@ def fold(s, warmth, linear):
 def mix(s, h, spread, warmth):
     """Force (N) and standard deviation of all hypotheses together, over their common model of the force. ``h``: scratch."""
     to_force(h, spread, s.slope, s.force, warmth)
+    _share_out(s)
     rest = 1.0
     first = spread * s.error[FAST]
     mean = variance = square = 0.0
     for kind in range(ALTERNATIVES):
-        a, w = s.alternatives[kind], share(s, kind)
+        a = s.alternatives[kind]
+        w = a.share
         rest -= w
         apart = a.shift + spread * a.error[FAST] - first
         mean += w * apart

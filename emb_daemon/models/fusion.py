@@ -62,31 +62,29 @@ def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
 
 
 @njit
-def update_errors(x, P, gain, innovation, h, variance):
-    """Measurement update for z = h x + white noise; ``gain`` is scratch. Returns the innovation's variance before it."""
-    s = variance
+def variance_along(P, h, gain):
+    """h P h'; ``gain``, shape (STATES,), becomes P h'."""
+    # Columns outside: the sums of a row are independent of each other, and one instruction takes several.
     for i in range(STATES):
-        gain[i] = 0.0
-        for j in range(STATES):
-            gain[i] += P[i, j] * h[j]
-        s += h[i] * gain[i]
+        gain[i] = P[0, i] * h[0]
+    for j in range(1, STATES):
+        for i in range(STATES):
+            gain[i] += P[j, i] * h[j]
+    total = 0.0
     for i in range(STATES):
-        x[i] += gain[i] / s * innovation
-    for i in range(STATES):
-        for j in range(i + 1):
-            P[i, j] -= gain[i] * gain[j] / s
-            P[j, i] = P[i, j]
-    return s
+        total += h[i] * gain[i]
+    return total
 
 
 @njit
-def variance_along(P, h):
-    """h P h'."""
-    total = 0.0
+def update_errors(x, P, gain, innovation, s):
+    """Measurement update with an innovation of variance ``s``; ``gain`` is P h' (`variance_along`)."""
+    scale = 1.0 / s
     for i in range(STATES):
+        x[i] += gain[i] * scale * innovation
+        # The product first: it is the same for (i, j) and (j, i), and P stays symmetric to the last bit.
         for j in range(STATES):
-            total += h[i] * P[i, j] * h[j]
-    return total
+            P[i, j] -= gain[i] * gain[j] * scale
 
 
 @njit
