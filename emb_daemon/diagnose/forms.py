@@ -29,6 +29,8 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
     "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", "winding_heat", "housing_heat", *_SLOW),
 }
+#: Ports at which there are forms.
+FORMED = tuple(_TYPED)
 _GATES: dict[str, tuple[str, ...]] = {
     "thickness": ("always", "turning"),
     "stiffness": ("always", "load", "turning"),
@@ -37,6 +39,7 @@ _GATES: dict[str, tuple[str, ...]] = {
 }
 #: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
 _EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
+_SMOOTHED_S = 0.05
 _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
 #: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
 _WIDER, _SHAPE = 8.0, 0.5
@@ -73,8 +76,10 @@ class Form:
 
     @property
     def numbers(self) -> int:
-        """How many numbers it takes to state it: coefficients, sizes, and one for a gate."""
-        return 1 + (self.shape == "harmonic") + len(self.fitted) + (self.gate != "always")
+        """How many numbers it takes to state it: coefficients, sizes, one for a gate, and where a count began: no brake's
+        physics starts at zero with the power."""
+        counted = self.signal in ("energy", "time_since_last_clamp")
+        return 1 + (self.shape == "harmonic") + len(self.fitted) + (self.gate != "always") + counted
 
     @property
     def step(self) -> float:
@@ -135,6 +140,11 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for place in np.linspace(low, high, _BUMPS)[1:-1]:
             for share in (0.03, 0.1):
                 yield "none", "bump", share * width, float(place), 1.0, 1.0
+        return
+    if port == "torque_constant" and signal == "current":
+        # The residual of the torque path is itself current: without its noise, or it would be its own shadow.
+        for exponent in _EXPONENTS:
+            yield "lag", "even_power", reach, 0.0, exponent, _SMOOTHED_S
         return
     if port == "force":
         for time in _CREEP_S:
@@ -204,7 +214,7 @@ def equation(term: Term) -> str:
     u = f"({z}{place})/{term.scale:.3g}{'' if term.memory == 'slip' else ' ' + own}"
     shaped = {
         "constant": "1",
-        "odd_power": u if term.exponent == 1.0 else f"{u}^{term.exponent:.2g}",
+        "odd_power": u if abs(term.exponent - 1.0) < 0.005 else f"[{u}]^{term.exponent:.2g}",
         "even_power": f"|{u}|^{term.exponent:.2g}",
         "saturation": f"u/(1 + |u|), u = {u}",
         "decay": f"exp(−|{u}|)",

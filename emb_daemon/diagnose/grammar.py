@@ -17,13 +17,13 @@ from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Move
 from emb_daemon.diagnose.evidence import Evidence, leave_out
-from emb_daemon.diagnose.forms import Form, enumerate_forms, harmonic, made_effect, rippling
+from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, made_effect, rippling
 from emb_daemon.diagnose.held_heat import follow_signals, record_heat
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_order
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import Selection
+from emb_daemon.diagnose.selection import UNSURE, Selection
 from emb_daemon.diagnose.unexplained import achieved, is_beyond
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
@@ -31,9 +31,10 @@ from emb_daemon.errors import InvalidValue
 from emb_daemon.offline.run import held
 from emb_daemon.offline.score import rmse
 
-#: Share of the rest that a smooth function of some signal must explain on left-out episodes before anything is made up, or
-#: RMS of the rest over what of it differs from sample to sample: what memories do is no function of any signal now.
-_CEILING, _ROUGH = 0.2, 2.0
+#: A term is made if a smooth function of some signal explains this share of the rest, less what of it differs from sample to
+#: sample; or if that much of the rest does not: what memories do is no function of any signal now. Of the torque path of
+#: brakes with nothing hidden 0.11 to 0.15 does not, because the noise of the current is coloured.
+_CEILING, _STRUCTURED = 0.2, 0.2
 #: Samples that are averaged for the screening: what a term does lasts longer than 16 ms, its noise does not. For chance, which
 #: asks all forms a hundred times, an eighth of a second.
 _AVERAGED, _COARSE = 4, 32
@@ -120,7 +121,7 @@ def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
         while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             before, selection = selection, _one_more(selection, channel)
-            if selection is before:
+            if selection.accepted == before.accepted:
                 break
     return selection
 
@@ -128,67 +129,114 @@ def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
 def _wanted(selection: Selection, channel: str) -> bool:
     """Whether enough is left, and enough of it looks explicable, for a term to be made up."""
     model, screening = selection.model, selection.screening
-    ceiling, _ = screening.rival(model, channel, {})
-    explicable = ceiling > _CEILING * float(model.residual[channel] @ model.residual[channel])
-    explicable = explicable and model.rms(ceiling, channel) >= screening.floor(model, channel)
+    residual, square = model.residual[channel], model.noise(channel)
     known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
-    rms = float(np.sqrt(model.noise(channel)))
-    residual = model.residual[channel]
-    rough = rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) / np.sqrt(2.0)
-    return explicable or is_beyond(rms, known) or rms > _ROUGH * rough
+    noise = 0.5 * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) ** 2
+    if is_beyond(np.sqrt(square), known) or square - noise > _STRUCTURED * square:
+        return True
+    ceiling = model.rms(screening.rival(model, channel, {})[0], channel)
+    return ceiling >= screening.floor(model, channel) and ceiling**2 > _CEILING * (square - noise)
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """A form with its regressors, by the estimator itself, and what left-out episodes say of them."""
+
+    form: Form
+    columns: list[np.ndarray]
+    evidence: Evidence
+
+    def is_of(self, other: "Prospect") -> bool:
+        """Whether it says the same of port and signal."""
+        return (self.form.port, self.form.signal) == (other.form.port, other.form.signal)
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
-    """With the best term for one channel, if it is proven."""
+    """With the best term for one channel, accepted if it is proven, else with what speaks against it."""
     model, screening = selection.model, selection.screening
-    random = np.random.default_rng(0)
-    signals = [
-        follow_signals(t.log.samples, p, record_heat(t.log.samples, p))
-        for t in model.bench.trials
-        for p in [held(to_parameters(model.bench.calibrated(model.values, t.index)))[0]]
-    ]
-    covered = _covered(np.concatenate(signals))
-    ports = tuple(port for port in PORTS if model.bench.channel_of(HOOKS[port].channel) == channel)
-    ports = tuple(port for port in ports if port != "pad_friction")
-    sensitivities = {port: _sensitivity(model, channel, port) for port in ports}
-    screen = Screen(model, channel)
-    forms = enumerate_forms(covered, ports)
-    scores = _screened(screen, forms, sensitivities, signals)
-    best = _shortlisted(forms, scores, len(screen.model.bench.trials))
-    best += _ripples(model, channel, ports, sensitivities, covered)
-    exact = [_probed(model, channel, form) for form in best]
-    judged = [(form, columns, model.evidence(channel, columns)) for form, columns in zip(best, exact, strict=True)]
-    judged = [row for row in judged if len(row[2].values) and row[2].gain > 0.0 and _stays_in_bounds(row[0], row[2])]
-    if not judged:
+    signals = _signals(model)
+    if signals is None:
         return selection
-    own = model.own(channel)
-    alone = leave_out(model.moments(channel, [model.columns[c] for c in own]), model.penalty(own, channel)).left_out
-    plain = float(alone.sum())
-    judged.sort(key=lambda row: _length(row[0], row[2], plain, model.bench.episodes))
-    form, _, evidence = judged[0]
-    if model.rms(evidence.gain, channel) < screening.floor(model, channel):
+    search = _Search(model, channel, signals)
+    prospects = search.prospects()
+    if not prospects or model.rms(prospects[0].evidence.gain, channel) < screening.floor(model, channel):
         return selection
-    q = max(evidence.p_value, _chance(model, channel, forms, sensitivities, signals, scores.gain.max(), random))
-    if form.shape == "harmonic":
-        q = min(1.0, evidence.p_value * len(forms))
-    ceiling, _ = screening.rival(model, channel, {})
-    moved = _at_another_time(screen, form, sensitivities[form.port], signals, random) / max(evidence.gain, 1e-300)
-    if q > Q_VALUE or evidence.gain < _OF_MODEL_FREE * ceiling or moved > _OF_PLACEBO:
-        return selection
-    alike = _as_good(judged, own=judged[0])
-    stable = _stability(screen, judged, random)
-    reason = f"made for what no effect of the catalogue explains; same port and signal in {100 * stable:.0f} % of bootstraps"
+    best, *others = prospects
+    alike, stable = _as_good(best, others), _stability(search.screen, prospects)
+    chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
+    made_of = f"same port and signal in {100 * stable:.0f} % of bootstraps"
     if alike:
-        reason += f"; as good on these logs: {', '.join(alike)}"
-    elif stable < _STABLE:
-        return selection
+        made_of += f"; as good on these logs: {', '.join(alike)}"
+    ceiling, rival = screening.rival(model, channel, {})
+    objections = {
+        f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
+        f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
+        < _OF_MODEL_FREE * ceiling,
+        f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
+        made_of: stable < _STABLE and not alike,
+    }
+    against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
-        made_effect(form, _name(form, model.bench.calibration.terms)), channel, evidence=evidence, p_value=evidence.p_value,
-        q_value=q, gain=model.rms(evidence.gain, channel), accepted=True, reason=reason,
-        placebos={"its signal at another time": max(moved, 0.0)} if form.shape != "harmonic" else {},
-        confounded_with=alike[0] if alike else None, over=np.concatenate(signals)[:, list(SIGNALS).index(form.signal)],
+        made_effect(best.form, _name(best.form, selection)), channel, evidence=best.evidence, p_value=best.evidence.p_value,
+        q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
+        placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
+        confounded_with=alike[0] if alike else None, over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
     )  # fmt: skip
-    return _entered(selection, candidate, form)
+    return selection.noted([candidate]) if against else _entered(selection, candidate, best.form)
+
+
+def _signals(model: Model) -> list[np.ndarray] | None:
+    """What terms see, by log; None where an angle lost its zero."""
+    result = []
+    for trial in model.bench.trials:
+        parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
+        heat = record_heat(trial.log.samples, parameters)
+        if heat is None:
+            return None
+        result.append(follow_signals(trial.log.samples, parameters, heat))
+    return result
+
+
+class _Search:
+    """All forms at the ports of one channel."""
+
+    def __init__(self, model: Model, channel: str, signals: list[np.ndarray]):
+        self.model, self.channel, self.signals = model, channel, signals
+        self.random = np.random.default_rng(0)
+        self.covered = _covered(np.concatenate(signals))
+        self.ports = tuple(
+            port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
+        )  # fmt: skip
+        self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
+        self.screen = Screen(model, channel)
+        self.forms = enumerate_forms(self.covered, self.ports)
+        self.scores = _screened(self.screen, self.forms, self.sensitivities, signals)
+
+    def prospects(self) -> list[Prospect]:
+        """The best forms, through the estimator, those worth their length first."""
+        model, own = self.model, self.model.own(self.channel)
+        best = [*_shortlisted(self.forms, self.scores), *_ripples(self)]
+        exact = [_probed(model, self.channel, form) for form in best]
+        found = [Prospect(form, own, model.evidence(self.channel, own)) for form, own in zip(best, exact, strict=True)]
+        moments = model.moments(self.channel, [model.columns[c] for c in own])
+        alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
+        kept = [p for p in found if p.evidence.p_value < UNSURE and p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+    def chance(self, best: Prospect) -> float:
+        """That of the best among all forms; a ripple's is that of its order among as many."""
+        if best.form.shape == "harmonic":
+            return min(1.0, best.evidence.p_value * len(self.forms))
+        return _chance(self)
+
+    def at_another_time(self, form: Form) -> float:
+        """Largest gain of a term with its signal moved in time, as if the log were a circle; none for a ripple."""
+        if form.shape == "harmonic":
+            return 0.0
+        values = _values(self.model.bench, form, self.signals)
+        shifts = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
+        columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in shifts])
+        return float(self.screen.scores(columns).gain.max())
 
 
 def _covered(signals: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -270,33 +318,26 @@ def _record_of(form: Form) -> np.void:
     return record["term"][0]
 
 
-def _chance(
-    model: Model,
-    channel: str,
-    forms: Sequence[Form],
-    sensitivities: Mapping[str, np.ndarray],
-    signals: list[np.ndarray],
-    gain: float,
-    random: np.random.Generator,
-) -> float:
-    """Chance that the best of all forms gains as much with their signals moved in time, as if the log were a circle."""
-    screen = Screen(model, channel, _COARSE)
-    shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
+def _chance(search: _Search) -> float:
+    """Chance that the best of all forms gains as much with their signals moved in time."""
+    screen = Screen(search.model, search.channel, _COARSE)
+    shapes = list(dict.fromkeys(replace(form, port="") for form in search.forms))
     row = {shape: index for index, shape in enumerate(shapes)}
-    values = np.column_stack([screen.averaged(_values(model.bench, shape, signals)[:, None]) for shape in shapes])
-    values *= screen.per_mean[:, None]
-    by_port = [
-        (screen.averaged(column[:, None] * screen.keep[:, None]), [row[replace(f, port="")] for f in forms if f.port == port])
-        for port, column in sensitivities.items()
-    ]
-    best = []
+    every = [screen.averaged(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
+    values = np.column_stack(every) * screen.per_mean[:, None]
+    by_port = []
+    for port, column in search.sensitivities.items():
+        rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
+        if rows:
+            by_port.append((screen.averaged((column * screen.keep)[:, None]), rows))
+    best, gain = [], search.scores.gain.max()
     for _ in range(_CHANCES):
-        moved = np.roll(values, int(len(values) * random.uniform(0.1, 0.9)), axis=0)
-        best.append(max(float(screen.scores_of(own * moved[:, rows]).gain.max()) for own, rows in by_port if rows))
+        moved = np.roll(values, int(len(values) * search.random.uniform(0.1, 0.9)), axis=0)
+        best.append(max(float(screen.scores_of(own * moved[:, rows]).gain.max()) for own, rows in by_port))
     return (1.0 + np.count_nonzero(np.array(best) >= gain)) / (1.0 + _CHANCES)
 
 
-def _shortlisted(forms: Sequence[Form], scores: Scores, logs: int) -> list[Form]:
+def _shortlisted(forms: Sequence[Form], scores: Scores) -> list[Form]:
     """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
     gains = scores.gain
     chosen: list[Form] = []
@@ -310,83 +351,63 @@ def _shortlisted(forms: Sequence[Form], scores: Scores, logs: int) -> list[Form]
     return chosen
 
 
-def _ripples(model: Model, channel: str, ports: tuple[str, ...], sensitivities, covered) -> list[Form]:
+def _ripples(search: _Search) -> list[Form]:
     """The strongest ripple over the motor angle at each port that may have one."""
     found = []
-    for port in rippling(ports):
+    for port in rippling(search.ports) if "motor_angle" in search.covered else ():
         effect = Effect(
             name=port, hook=port, term=lambda: 0.0, equation="", source="",
             parameters=(Parameter("o", "1", *_ORDERS, 1.0, "", _ORDERS),),
             harmonic=Harmonic("o", "c", "s", grows_with="port"),
         )  # fmt: skip
-        order, _ = strongest_order(model, effect, channel, {"port": sensitivities[port]})
-        if order and "motor_angle" in covered:
-            found.append(harmonic(port, order, model.bench.middle, covered))
+        order, _ = strongest_order(search.model, effect, search.channel, {"port": search.sensitivities[port]})
+        if order:
+            found.append(harmonic(port, order, search.model.bench.middle, search.covered))
     return found
 
 
 # -- judging ----------------------------------------------------------------------------------------------------------
 
 
-def _stays_in_bounds(form: Form, evidence: Evidence) -> bool:
+def _stays_in_bounds(prospect: Prospect) -> bool:
     """Whether a calibration may hold the term at the size found."""
     try:
-        form.term(coefficient=float(np.hypot.reduce(evidence.values)))
+        prospect.form.term(coefficient=float(np.hypot.reduce(prospect.evidence.values)))
     except InvalidValue:
         return False
     return True
 
 
-def _length(form: Form, evidence: Evidence, plain: float, episodes: int) -> float:
-    """Description length of what is left and of the term, in nats; an episode counts as one observation."""
-    left = max(1.0 - evidence.gain / max(plain, 1e-300), 1e-3)
-    return 0.5 * episodes * np.log(left) + 0.5 * form.numbers * np.log(episodes)
+def _length(prospect: Prospect, alone: float, episodes: int) -> float:
+    """Description length of what is left and of the term, in nats; an episode counts as one observation.
+
+    ``alone``: squared error of left-out episodes without the term."""
+    left = max(1.0 - prospect.evidence.gain / max(alone, 1e-300), 1e-3)
+    return 0.5 * episodes * np.log(left) + 0.5 * prospect.form.numbers * np.log(episodes)
 
 
-def _at_another_time(
-    screen: Screen, form: Form, sensitivity: np.ndarray, signals: list[np.ndarray], random: np.random.Generator
-) -> float:
-    """Largest gain of the term with its signal moved in time, as if the log were a circle."""
-    if form.shape == "harmonic":
-        return 0.0
-    values = _values(screen.model.bench, form, signals)
-    shifts = [int(len(values) * random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
-    columns = np.column_stack([sensitivity * np.roll(values, shift) for shift in shifts])
-    return float(screen.scores(columns).gain.max())
+def _as_good(best: Prospect, others: Sequence[Prospect]) -> list[str]:
+    """Other ports and signals whose best form gains nearly as much."""
+    alike = [p.form for p in others if not p.is_of(best) and p.evidence.gain >= _AS_GOOD * best.evidence.gain]
+    return list(dict.fromkeys(f"{form.port} over {form.signal}".replace("_", " ") for form in alike))
 
 
-def _as_good(judged: list, own: tuple) -> list[str]:
-    """Other ports and signals whose best form gains nearly as much, best first."""
-    form, _, evidence = own
-    names = []
-    for other, _, gained in judged:
-        name = f"{other.port} over {other.signal}".replace("_", " ")
-        same = (other.port, other.signal) == (form.port, form.signal)
-        if not same and gained.gain >= _AS_GOOD * evidence.gain and name not in names:
-            names.append(name)
-    return names
-
-
-def _stability(screen: Screen, judged: list, random: np.random.Generator) -> float:
+def _stability(screen: Screen, prospects: Sequence[Prospect]) -> float:
     """Share of resampled episodes in which the same port and signal would be chosen; equal ones count as the same."""
-    scores = [screen.scores(np.column_stack(columns)) for _, columns, _ in judged]
+    scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     episodes = scores[0].u.shape[1]
-    weights = random.multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
-    gains = np.array([
-        sum((weights @ u) ** 2 / np.maximum(weights @ a, 1e-300) for u, a in zip(score.u, score.a, strict=True))
-        for score in scores
-    ])  # fmt: skip
-    key = (judged[0][0].port, judged[0][0].signal)
-    own = gains[[(form.port, form.signal) == key for form, _, _ in judged]].max(axis=0)
+    weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
+    gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
+    own = gains[[prospect.is_of(prospects[0]) for prospect in prospects]].max(axis=0)
     return float(np.mean(own >= _AS_GOOD * gains.max(axis=0)))
 
 
 # -- accepting --------------------------------------------------------------------------------------------------------
 
 
-def _name(form: Form, terms: tuple[Term, ...]) -> str:
+def _name(form: Form, selection: Selection) -> str:
     name = f"term:{form.port}:{form.signal}"
-    taken = {term.name for term in terms}
+    taken = {term.name for term in selection.model.bench.calibration.terms}
     return name if name not in taken else next(f"{name}:{n}" for n in range(2, MOST + 2) if f"{name}:{n}" not in taken)
 
 
@@ -403,8 +424,8 @@ def _entered(selection: Selection, candidate: Candidate, form: Form) -> Selectio
     evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0))
     gain = model.rms(evidence.gain, channel)
     worse = model.noise(channel) >= before.noise(channel)
-    if worse or evidence.p_value > Q_VALUE or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
-        return selection
-    candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain)
+    if worse or evidence.p_value > UNSURE or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
+        return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+    candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
     return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])

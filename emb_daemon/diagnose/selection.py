@@ -23,8 +23,8 @@ _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
 #: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
-#: before it is judged.
-_UNSURE, _LARGE = 0.05, 0.25
+#: before it is judged. Chance of a term, whose significance is judged over the whole grammar, on its own.
+UNSURE, _LARGE = 0.05, 0.25
 
 Progress = Callable[[str, float], None]
 
@@ -208,7 +208,7 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
         c
         for c in tested
         if c.channel in FORCE_CHANNELS
-        and c.p_value < _UNSURE
+        and c.p_value < UNSURE
         and c.q_value > Q_VALUE
         and c.gain**2 > _LARGE * model.noise(c.channel)
     ]
@@ -239,7 +239,7 @@ def revised(selection: Selection) -> Selection:
         gone = []
         for group in groups(candidate.effect, amplitudes):
             evidence = model.evidence_against(dict.fromkeys(group, 0.0))
-            if evidence.p_value > Q_VALUE or evidence.gain <= 0.0:
+            if evidence.p_value > (UNSURE if candidate.made else Q_VALUE) or evidence.gain <= 0.0:
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
