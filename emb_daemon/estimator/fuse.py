@@ -109,6 +109,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
+    relative = hypot(relative, s.effects.terms.doubt)
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
