@@ -36,24 +36,14 @@ class Trial(Struct, kw_only=True):
     pad_thickness_mm: Positive | None = None
 
 
-class Sine(Struct, kw_only=True):
+class Sine(Trial, kw_only=True):
     """Motor angle a sinusoid."""
 
-    log: str
     frequency_Hz: Positive
-    pad_thickness_mm: Positive | None = None
 
 
-class Adaptation(Struct, kw_only=True):
-    """Park brake training without the reference force, for the study of adaptation; identification judges on ``judge``."""
-
-    training: str
-    judge: str
-    pad_thickness_mm: Positive | None = None
-
-
-class Gear(Struct, kw_only=True):
-    """One state of wear of the gear."""
+class Training(Struct, kw_only=True):
+    """Park brake training, and a log to judge on what is known then."""
 
     training: str
     judge: str | None = None
@@ -96,9 +86,11 @@ class CampaignFile(Struct, kw_only=True):
     pad_thickness_mm: Positive | None = None
     curves: tuple[Trial, ...] = ()
     random: tuple[Trial, ...] = ()
-    adaptation: tuple[Adaptation, ...] = ()
+    #: Of other pads, without the reference force: for the study of adaptation; identification judges alone.
+    adaptation: tuple[Training, ...] = ()
     frequency_response: tuple[Sine, ...] = ()
-    gear_wear: tuple[Gear, ...] = ()
+    #: One for each state of wear.
+    gear_wear: tuple[Training, ...] = ()
     thermal: ThermalLogs | None = None
     integrated: tuple[Integrated, ...] = ()
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from msgspec import structs
 
-from emb_daemon.calibration.parameters import moved, parameter, value_of
+from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Curve, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
@@ -15,7 +15,7 @@ from emb_daemon.offline.run import stiffness_force
 
 #: Terms of the characteristic curve, the thesis's cubic.
 TERMS = 3
-RELAXATION, CLEARANCE = "stiffness.relaxation_time_s", "contact.clearance_rad"
+RELAXATION = "stiffness.relaxation_time_s"
 #: By how much the rig's reference is later than its resolver, s: fitted beside the calibration's keys, none of the brake's.
 DELAY = "reference delay"
 #: Effects on the static force, which the dynamics may have or not.
