@@ -152,7 +152,7 @@ def test_figures_of_known_errors():
     assert figures(np.full(3, np.nan)) == {"samples": 0}
     assert rmse(np.array([1.0, 3.0]), np.array([3.0, 1.0])) == pytest.approx(np.sqrt(3.0))
     assert share_inside(error, np.full(5, 1.6)) == 0.75
-    assert share_inside(error, np.full(5, 1.6), sigmas=1.0) == 0.5
+    assert share_inside(error, np.full(5, 0.8)) == 0.5
 
 
 def test_episode_errors_are_those_of_the_samples_chosen():
