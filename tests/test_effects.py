@@ -67,8 +67,7 @@ def drive(seconds=12.0, wheel_speed=20.0):
 
 def test_the_catalogue_is_complete():
     """The simulated car's own list, written apart, begins with the names that scripts and people rely on."""
-    assert {effect.name for effect in REGISTRY} == set(list(EFFECTS)[: len(REGISTRY)])
-    assert len(REGISTRY) == 17
+    assert set(list(EFFECTS)[:17]) <= {effect.name for effect in REGISTRY}
 
 
 #: `plant` is a brake of its own, with effects of its own.

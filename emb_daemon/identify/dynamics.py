@@ -156,8 +156,8 @@ def clearance_guess(log: Log) -> float:
 def _rest_noise(log: Log) -> float:
     """Standard deviation in N of the reference force before the motor first moves by a hundredth of its travel."""
     angle = log.samples["angle"]
-    moved = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
-    return float(np.nanstd(log.force_N[: max(moved[0] if len(moved) else 0, 5)]))
+    left = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
+    return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
 
 
 def _travel(log: Log) -> np.ndarray:

@@ -167,10 +167,17 @@ PLANT_STATE = np.dtype(
     [
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip element, drive of the relaxations and their states.
-        *fields(
-            "f8",
-            "driven_angle past_contact slip drive slow creep excitation force force_rate static_force stiffness_factor",
-        ),
+        ("driven_angle", "f8"),
+        ("past_contact", "f8"),
+        ("slip", "f8"),
+        ("drive", "f8"),
+        ("slow", "f8"),
+        ("creep", "f8"),
+        ("excitation", "f8"),
+        ("force", "f8"),
+        ("force_rate", "f8"),
+        ("static_force", "f8"),
+        ("stiffness_factor", "f8"),
         # Controller.
         ("latched", "?"),
         *fields("f8", "position_target target_rate speed_integral force_correction"),

@@ -6,13 +6,20 @@ what is held out contains it too.
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold, second_halves
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import TorqueStep, Unexplained, unexplained_current
+from emb_daemon.identify.steps.torque import (
+    INERTIA,
+    LOAD,
+    OFFSET,
+    TORQUE_CONSTANT,
+    TorqueStep,
+    Unexplained,
+    unexplained_current,
+)
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
@@ -160,9 +167,9 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         torque = values[TORQUE_CONSTANT] * current
         series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
         sliding = 1.0 - mean**2
-        turning.append((sliding * (values[OFFSET_FRICTION] + values[LOAD_FRICTION] * np.maximum(force, 0.0))) ** 2)
+        turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < 0.1] ** 2))
-        load = (gear_gain + values[LOAD_FRICTION] * mean) * force
+        load = (gear_gain + values[LOAD] * mean) * force
         # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)

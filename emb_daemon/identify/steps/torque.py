@@ -13,7 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, TORQUE_CONSTANT, moved
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, moved
+from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
+from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
+from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import Campaign, Datasheet
@@ -28,7 +31,7 @@ from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Parameters in the order of every covariance, with their least value that is physical.
-KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET_FRICTION: 0.0, LOAD_FRICTION: 0.0, PRESLIDING_ANGLE: 1e-6}
+KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 1e-6}
 #: Variance of the friction state up to which it counts as known.
 _KNOWN = 0.01
 #: Step of the derivative by the logarithm of the presliding angle.
@@ -65,9 +68,7 @@ class TorqueFit:
 
     def friction(self) -> dict[str, float]:
         """Those of them that wear changes."""
-        return {
-            key: value for key, value in self.physical().items() if key in (OFFSET_FRICTION, LOAD_FRICTION, PRESLIDING_ANGLE)
-        }
+        return {key: value for key, value in self.physical().items() if key in (OFFSET, LOAD, PRESLIDING)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +87,7 @@ class TorqueStep(Step):
 
     def gear_wear(self) -> float:
         """Spread of the load friction over the states of wear that were measured, m/rad."""
-        worn = [fit.values[LOAD_FRICTION] for _, fit in self.gears]
+        worn = [fit.values[LOAD] for _, fit in self.gears]
         return float(np.std(worn, ddof=1)) if len(worn) > 1 else 0.0
 
 
@@ -135,7 +136,7 @@ class _Regression:
 
     def matrices(self, presliding_angle: float):
         """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model."""
-        parameters = to_parameters(moved(self.calibration, {PRESLIDING_ANGLE: presliding_angle}))
+        parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
@@ -233,11 +234,9 @@ class Unexplained:
 def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
     """Current of a log that a fit does not explain; of the calibration only the gear counts."""
     part, values = _Regression(log, calibration), found.values
-    regressors, _, use = part.matrices(values[PRESLIDING_ANGLE])
+    regressors, _, use = part.matrices(values[PRESLIDING])
     gear_gain = calibration.motor.gear_gain_m_per_rad
-    coefficients = (
-        np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET_FRICTION, LOAD_FRICTION))]) / values[TORQUE_CONSTANT]
-    )
+    coefficients = np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET, LOAD))]) / values[TORQUE_CONSTANT]
     residual = part.current - regressors @ coefficients
     return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
 
