@@ -22,9 +22,6 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.learned import (
-    LOAD_FRICTION,
-    OFFSET_FRICTION,
-    PRESLIDING_ANGLE,
     STIFFNESS_RELATIVE_SIGMA,
     STIFFNESS_SIGMA,
     TRAVELS,
@@ -34,7 +31,14 @@ from emb_daemon.adapt.learned import (
     why_out_of_bounds,
 )
 from emb_daemon.adapt.pairs import ANGLE, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
-from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.parameters import (
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    TORQUE_CONSTANT,
+    moved,
+    value_of,
+)
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
@@ -47,7 +51,7 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
 _CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
-TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
+INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3

@@ -14,13 +14,7 @@ from emb_daemon.calibration.curves import curve_at, rising_force, thickness_rang
 from emb_daemon.calibration.terms import Term, faults_of, fill_terms
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InvalidValue
-from emb_daemon.estimator.records import (
-    CURVE_TERMS,
-    FORCE_GRID,
-    PARAMETERS,
-    SPEED_GRID,
-    TEMPERATURE_GRID,
-)
+from emb_daemon.estimator.records import CURVE_TERMS, FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
 from emb_daemon.models.thermal import mesh
 
 Positive = Annotated[float, Meta(gt=0.0)]
