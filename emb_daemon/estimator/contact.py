@@ -59,22 +59,22 @@ def follow_zero(s, p, m):
     stuck = s.plausibility.still > 1 or frozen_s > 0.0
     reach = p.maximum_speed * (m.dt + frozen_s)
     moved, sigma = 0.0, 0.0
-    if abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
+    seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
+    slip = jump - 0.5 * (m.speed + s.speed) * m.dt
+    unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
+    if seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
+        moved, sigma = slip, _ZERO_RAD
+    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
         moved, sigma = jump, reach
-    elif 0.0 < m.dt <= ONE_CYCLE_S and not stuck:
-        slip = jump - 0.5 * (m.speed + s.speed) * m.dt
-        unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
-        if abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
-            moved, sigma = slip, _ZERO_RAD
-        elif max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
-            s.drifted = s.stood_s = 0.0
-        else:
-            s.drifted += slip
-            s.stood_s += m.dt
-            noise = p.speed_sigma * sqrt(CYCLE_S * s.stood_s)
-            if abs(s.drifted) > _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * s.stood_s + _CERTAIN * noise:
-                moved, sigma = s.drifted, abs(s.drifted)
-                s.drifting_s = _DRIFTING_S
+    elif seen and max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
+        s.drifted = s.stood_s = 0.0
+    elif seen:
+        s.drifted += slip
+        s.stood_s += m.dt
+        noise = p.speed_sigma * sqrt(CYCLE_S * s.stood_s)
+        if abs(s.drifted) > _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * s.stood_s + _CERTAIN * noise:
+            moved, sigma = s.drifted, abs(s.drifted)
+            s.drifting_s = _DRIFTING_S
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
     if moved == 0.0:
         return False
