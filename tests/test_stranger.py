@@ -74,15 +74,16 @@ def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):
     ("rate_Hz", "means"), [(100, True), (100, False), (250, False), (400, True), (500, False), (1000, True)]
 )
 def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, means):
-    """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate."""
-    figures = []
+    """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate, in random
+    motion as in stops. What a current of the moment does between two samples is unknown, so that it has stops alone."""
+    figures, motion = [], strangerkit.truth(strangerkit.random()) if means else truth
     for rate, as_means in ((250, True), (rate_Hz, means)):
         text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
         strangerkit.write_rig(tmp_path, text)
-        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, rate, as_means))
+        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(motion, rate, as_means))
         figures.append(_replay(tmp_path, table, capsys)[0]["force_N"])
     ours, theirs = figures
-    assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 500.0
+    assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 700.0
     assert theirs["fused"]["rmse"] < ours["fused"]["rmse"] + 5.0 < 45.0
     assert theirs["inside_two_sigma"] > 0.93
 
