@@ -118,6 +118,14 @@ def test_columns_and_channels_are_logs(truth, tmp_path, name):
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
 
 
+def test_a_table_may_have_decimal_commas(tmp_path):
+    strangerkit.write_rig(tmp_path, strangerkit.COLUMNS)
+    rows = "".join(f"{0.004 * n:.3f};{0.1 * n:.1f};25.0;1.5;22;0\n".replace(".", ",") for n in range(100))
+    (tmp_path / "a.csv").write_text("time_s;angle_rad;speed_rad_per_s;current_A;plate_C;force_N\n" + rows)
+    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
