@@ -72,6 +72,8 @@ def _describe(kind) -> tuple[str, type | None]:
         return f"{text}, or null", struct
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return "keys below", kind
+    if origin is typing.Literal:
+        return "one of " + ", ".join(arguments), None
     return {float: "number", int: "whole number", str: "text", bool: "true or false"}[kind], None
 
 
@@ -85,7 +87,8 @@ def _default(field) -> str:
     return f"default {text}"
 
 
-def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
+def _struct(kind: type, path: str, out: list[str]) -> None:
+    comments = _comments(sys.modules[kind.__module__])
     out += [f"## `{path}`" if path else "## The file", "", inspect.getdoc(kind) or "", ""]
     out += ["| key | what | meaning |", "| --- | --- | --- |"]
     below = []
@@ -102,16 +105,16 @@ def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
             below.append((struct, f"{path}.{field.encode_name}" if path else field.encode_name))
     out.append("")
     for struct, name in below:
-        _struct(struct, name, comments, out)
+        _struct(struct, name, out)
 
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _structs(title: str, text: str, kind: type, module) -> str:
+def _structs(title: str, text: str, kind: type) -> str:
     out = [f"# {title}", "", text, ""]
-    _struct(kind, "", _comments(module), out)
+    _struct(kind, "", out)
     return "\n".join(out).rstrip() + "\n"
 
 
@@ -158,13 +161,13 @@ def pages() -> dict[str, str]:
             "`emb-daemon check` lists every fault of one with its line. Keys carry their unit; an unknown key, a key that "
             "stands twice or a number that is not finite is refused. [Learned values](integration.md#files) are never "
             "written into it.",
-            types.Calibration, types,
+            types.Calibration,
         ),
         "configuration.md": _structs(
             "Configuration file",
             "What `emb-daemon run` and `check` read, for example `config/emb.yaml`. Bus options on the command line and "
             "python-can's `CAN_*` variables come before what stands here.",
-            configuration.Configuration, configuration,
+            configuration.Configuration,
         ),
         "mapping.md": _structs(
             "Mapping file",

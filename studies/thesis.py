@@ -16,21 +16,13 @@ import numpy as np
 from msgspec.structs import replace
 from scipy.optimize import least_squares, minimize_scalar
 
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.curves import curve_at
+from emb_daemon.calibration.parameters import CLEARANCE, INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import Campaign, Datasheet, load_campaign
-from emb_daemon.identify.dynamics import (
-    CLEARANCE,
-    EPISODE,
-    RELAXATION,
-    Pads,
-    clearance_guess,
-    curve_keys,
-    powers,
-    simulate,
-)
+from emb_daemon.identify.dynamics import EPISODE, RELAXATION, TERMS, Pads, clearance_guess, curve_keys, powers, simulate
 from emb_daemon.identify.judge import Judged, at_thickness, judge
 from emb_daemon.identify.recording import Recording, recording
 from emb_daemon.identify.run import Identification, identify
@@ -38,17 +30,7 @@ from emb_daemon.identify.steps import noise
 from emb_daemon.identify.steps.heat import thermal_parameters
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.softening import cold_bursts
-from emb_daemon.identify.steps.thickness import predict_curve
-from emb_daemon.identify.steps.torque import (
-    INERTIA,
-    KEYS,
-    LOAD,
-    OFFSET,
-    TORQUE_CONSTANT,
-    TorqueFit,
-    TorqueStep,
-    Unexplained,
-)
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, TorqueStep, Unexplained
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.score import rmse
@@ -150,7 +132,7 @@ def _regressors(log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def unexplained(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
     """Current that the thesis's form leaves on a log."""
     rows, columns, current = _regressors(log)
-    coefficients = np.array([gear_gain, *(found.values[key] for key in (INERTIA, OFFSET, LOAD))])
+    coefficients = np.array([gear_gain, *(found.values[key] for key in (INERTIA, OFFSET_FRICTION, LOAD_FRICTION))])
     residual = current - columns @ coefficients / found.values[TORQUE_CONSTANT]
     return Unexplained(found, rows, residual, columns[:, 2], columns[:, 0])
 
@@ -424,7 +406,7 @@ def frequency_lines(result: Identification) -> list[str]:
     for entry in campaign.file.frequency_response:
         log = campaign.load(entry.log, "frequency_response", "a sinusoid in contact")
         try:
-            coefficients = predict_curve(fit.curves, campaign.thickness(entry))
+            coefficients = curve_at(fit.calibration.stiffness.curves, campaign.thickness(entry))[:TERMS]
         except InputError:
             continue
         if log is not None:

@@ -241,7 +241,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
             elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate)
+        _advance(a, s, parameters, learned, limits, scratch, rows, m)
     estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
@@ -282,7 +282,7 @@ def _follow(a, s, p, limits, m, estimate):
 
 
 @njit
-def _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate):
+def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:

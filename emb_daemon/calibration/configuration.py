@@ -2,10 +2,9 @@
 
 import difflib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from msgspec import Meta
 
 from emb_daemon.calibration.files import load_calibration
@@ -111,8 +110,8 @@ class Setup:
 def _named(path: Path) -> tuple[str | None, dict[str, str]]:
     """(DBC, calibration by corner) that a faulty configuration names all the same: their faults are told with its own."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        content = load_yaml(path, Any)
+    except InputError:
         content = None
     stated = content if isinstance(content, dict) else {}
     dbc, corners = stated.get("dbc"), stated.get("corners")

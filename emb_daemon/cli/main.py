@@ -83,6 +83,9 @@ def main(argv: list[str] | None = None) -> int:
         # A file that cannot be used is the user's; a full disk or a device that is gone may be better later.
         print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
+    except MemoryError:
+        print(f"emb-daemon {chosen.command}: this machine has not the memory for that", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 

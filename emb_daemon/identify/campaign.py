@@ -39,24 +39,14 @@ class Trial(Struct, kw_only=True):
     pad_thickness_mm: Positive | None = None
 
 
-class Sine(Struct, kw_only=True):
+class Sine(Trial, kw_only=True):
     """Motor angle a sinusoid."""
 
-    log: str
     frequency_Hz: Positive
-    pad_thickness_mm: Positive | None = None
 
 
-class Adaptation(Struct, kw_only=True):
-    """Park brake training without the reference force, for the study of adaptation; identification judges on ``judge``."""
-
-    training: str
-    judge: str
-    pad_thickness_mm: Positive | None = None
-
-
-class Gear(Struct, kw_only=True):
-    """One state of wear of the gear."""
+class Training(Struct, kw_only=True):
+    """Park brake training, and a log to judge on what is known then."""
 
     training: str
     judge: str | None = None
@@ -113,10 +103,12 @@ class CampaignFile(Struct, kw_only=True):
     curves: tuple[Trial, ...] = ()
     #: A new random motor angle every 100 ms between released and clamped, beginning released: relaxation, inertia, friction.
     random: tuple[Trial, ...] = ()
-    adaptation: tuple[Adaptation, ...] = ()
+    #: Of other pads, without the reference force: for the study of adaptation; identification judges alone.
+    adaptation: tuple[Training, ...] = ()
     #: Sinusoids, for figures over frequency.
     frequency_response: tuple[Sine, ...] = ()
-    gear_wear: tuple[Gear, ...] = ()
+    #: One for each state of wear.
+    gear_wear: tuple[Training, ...] = ()
     #: Logs with thermocouples in the pads; without any the force does not follow temperature.
     thermal: ThermalLogs | None = None
     #: Hot pads, everything together.
@@ -222,23 +214,6 @@ class Datasheet(Struct, kw_only=True):
         }[key]
 
 
-@dataclass(frozen=True)
-class Excitation:
-    """How much a log moves the brake.
-
-    Attributes:
-        travel_rad: between the smallest and the largest motor angle.
-        reversals_per_s: turning points of the motor angle by more than a twentieth of the travel, per second of motion.
-        force_N: largest reference force.
-        noise_N: standard deviation of the reference force before the pads first touch.
-    """
-
-    travel_rad: float
-    reversals_per_s: float
-    force_N: float
-    noise_N: float
-
-
 @njit
 def _turning_points(angle, threshold):
     count, direction, extreme = 0, 0, angle[0]
@@ -255,21 +230,22 @@ def _turning_points(angle, threshold):
     return count
 
 
-def excitation(log: Log, clearance_rad: float) -> Excitation:
-    """What a log excites; ``clearance_rad`` is the datasheet's, of which the first half is surely free of contact."""
+def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
+    """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is surely free of contact.
+
+    Returns:
+        (largest reference force in N, its standard deviation before the pads first touch, turning points of the motor angle by
+        more than a twentieth of its travel per second of motion).
+    """
     angle, force = log.samples["angle"], log.force_N
     travel = float(np.ptp(angle))
     reversals = _turning_points(angle, max(travel / 20.0, 1e-6)) if travel > 0.0 else 0
     moving = float(np.sum(log.samples["dt"][1:][np.diff(angle) != 0.0]))
     left = np.flatnonzero(angle - angle[0] > 0.5 * clearance_rad)
-    free = np.isfinite(force) & (np.arange(len(angle)) < (left[0] if len(left) else 0))
-    known = force[np.isfinite(force)]
-    return Excitation(
-        travel_rad=travel,
-        reversals_per_s=reversals / moving if moving > 0.0 else 0.0,
-        force_N=float(known.max()) if len(known) else np.nan,
-        noise_N=float(np.std(force[free])) if free.sum() > 20 else np.nan,
-    )
+    known = np.isfinite(force)
+    free = known & (np.arange(len(angle)) < (left[0] if len(left) else 0))
+    noise_N = float(np.std(force[free])) if free.sum() > 20 else np.nan
+    return float(force[known].max()), noise_N, reversals / moving if moving > 0.0 else 0.0
 
 
 @dataclass
@@ -363,18 +339,18 @@ class Campaign:
         if log is None:
             return None
         actuator = self.datasheet.actuator
-        found = excitation(log, actuator.pad_clearance_rad)
+        force_N, noise_N, reversals_per_s = _excitation(log, actuator.pad_clearance_rad)
         cycle = float(np.median(log.samples["dt"][1:])) if len(log.samples) > 1 else np.inf
         lacking = None
         if len(log.samples) < 500 or cycle > 0.0041:
             lacking = f"{len(log.samples)} samples, one every {1e3 * cycle:.0f} ms"
-        elif not found.force_N > 0.1 * actuator.rated_clamp_force_N:
-            lacking = f"clamp force reaches only {1e-3 * found.force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
-        elif not np.isfinite(found.noise_N):
+        elif not force_N > 0.1 * actuator.rated_clamp_force_N:
+            lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
+        elif not np.isfinite(noise_N):
             lacking = "does not begin with the brake released"
-        elif not reversals[0] <= found.reversals_per_s <= reversals[1]:
+        elif not reversals[0] <= reversals_per_s <= reversals[1]:
             lacking = (
-                f"motor turns round {found.reversals_per_s:.2f} times per second, "
+                f"motor turns round {reversals_per_s:.2f} times per second, "
                 f"expected {reversals[0]:g} to {reversals[1]:g}: a log of another kind"
             )
         if lacking:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from msgspec import structs
 
-from emb_daemon.calibration.parameters import moved, parameter, value_of
+from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Curve, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
@@ -15,7 +15,7 @@ from emb_daemon.offline.run import stiffness_force
 
 #: Terms of the characteristic curve, the thesis's cubic.
 TERMS = 3
-RELAXATION, CLEARANCE = "stiffness.relaxation_time_s", "contact.clearance_rad"
+RELAXATION = "stiffness.relaxation_time_s"
 #: By how much the rig's reference is later than its resolver, s: fitted beside the calibration's keys, none of the brake's.
 DELAY = "reference delay"
 #: Effects on the static force, which the dynamics may have or not.
@@ -156,8 +156,8 @@ def clearance_guess(log: Log) -> float:
 def _rest_noise(log: Log) -> float:
     """Standard deviation in N of the reference force before the motor first moves by a hundredth of its travel."""
     angle = log.samples["angle"]
-    moved = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
-    return float(np.nanstd(log.force_N[: max(moved[0] if len(moved) else 0, 5)]))
+    left = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
+    return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
 
 
 def _travel(log: Log) -> np.ndarray:

@@ -3,6 +3,7 @@
 import gzip
 import hashlib
 import io
+import os
 import sys
 import zlib
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.bounded import read_bounded
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.resample import at_our_rate
@@ -19,10 +21,15 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITT
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
 
 
+def _most_bytes() -> int:
+    """Bytes of a log that this machine can hold, with what is made of them: a quarter of its memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
 def read_file(path: Path) -> bytes:
     """The one place where a log file is read."""
     try:
-        return path.read_bytes()
+        return read_bounded(path, _most_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
@@ -33,11 +40,14 @@ def unpacked(path: Path, raw: bytes) -> bytes:
     """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
     if raw[:2] != b"\x1f\x8b":
         return raw
-    parts = []
+    parts, left = [], _most_bytes()
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(raw)) as file:
             while part := file.read1(1 << 20):
                 parts.append(part)
+                left -= len(part)
+                if left < 0:
+                    raise InputError(f"{path}: unpacks to more than {_most_bytes()} bytes, a quarter of this machine's memory")
     except (zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{path}: damaged gzip file ({error})") from None
     except EOFError:

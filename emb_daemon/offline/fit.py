@@ -67,9 +67,7 @@ class Fit:
         covariance: of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out;
             Wu, Annals of Statistics 14, 1986), which stays honest with few episodes, and the priors' own part.
         residuals: one array per block.
-        at_bound: parameters that stand at a bound; their sigmas are those of a free parameter.
         from_prior: share of each parameter's information that is its prior's, 0 to 1.
-        converged: the search ended before its limit of evaluations.
     """
 
     keys: tuple[Hashable, ...]
@@ -77,9 +75,7 @@ class Fit:
     sigmas: Values
     covariance: np.ndarray
     residuals: list[np.ndarray] = field(repr=False)
-    at_bound: frozenset
     from_prior: Values
-    converged: bool
 
     @property
     def rms(self) -> float:
@@ -122,7 +118,6 @@ def fit(
     covariance, from_prior = problem.covariance(found.x)
     unit = np.where(problem.logarithmic, np.exp(np.where(problem.logarithmic, found.x, 0.0)), 1.0)
     covariance = covariance * np.outer(unit, unit)
-    near = (found.x - low <= problem.steps) | (high - found.x <= problem.steps)
     keys = problem.keys
     return Fit(
         keys=keys,
@@ -130,9 +125,7 @@ def fit(
         sigmas=dict(zip(keys, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         covariance=covariance,
         residuals=residuals,
-        at_bound=frozenset(key for key, at in zip(keys, near, strict=True) if at),
         from_prior=dict(zip(keys, from_prior.tolist(), strict=True)),
-        converged=found.status > 0,
     )
 
 

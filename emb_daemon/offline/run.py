@@ -60,22 +60,24 @@ def _run_paths(samples, factor, parameters, states, force, out):
             s.angle, s.speed = m.angle, m.speed
 
 
-def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
-    """Both force paths, the contact angle held; returns PATHS rows.
+def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
+    """Both force paths of cold pads, the contact angle held; returns PATHS rows.
 
     Args:
         samples: SAMPLE rows, shape (n,), or any rows with their fields.
         parameters: one PARAMETERS record, or an array of shape (1,).
-        factor: stiffness factor, shape (1,) for all rows or (n,).
     """
     force, out = np.empty(len(samples)), np.zeros(len(samples), PATHS)
-    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
+    _run_paths(samples, _COLD, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
     out["force"] = force
     return out
 
 
 def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
-    """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`; same arguments."""
+    """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`.
+
+    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,).
+    """
     force = np.empty(len(samples))
     _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, np.zeros(0, PATHS))
     return force

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from emb_daemon.identify.dynamics import CLEARANCE, simulate
+from emb_daemon.calibration.parameters import CLEARANCE
+from emb_daemon.identify.dynamics import simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.wire.contract import CYCLE_S

@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import CLEARANCE, DynamicsFit, Pads, fit_dynamics, is_slow, simulate
+from emb_daemon.identify.dynamics import DynamicsFit, Pads, fit_dynamics, is_slow, simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import Unexplained, fit_torque, unexplained_current

@@ -80,10 +80,12 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign) -> float:
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
     """Covariance at lags 0 to ``lags``, shape (lags + 1,), over gap-free series of zero mean."""
-    return np.array([
-        sum(float(s[: len(s) - k] @ s[k:]) for s in series) / max(sum(len(s) - k for s in series), 1)
-        for k in range(lags + 1)
-    ])  # fmt: skip
+    total, count = np.zeros(lags + 1), np.zeros(lags + 1)
+    for s in series:
+        # By the spectrum, padded with as many zeros as no lag wraps around.
+        total += np.fft.irfft(np.abs(np.fft.rfft(s, 2 * len(s))) ** 2)[: lags + 1]
+        count += len(s) - np.arange(lags + 1)
+    return total / np.maximum(count, 1)
 
 
 def integral_time(series: list[np.ndarray]) -> float:

@@ -13,7 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, moved
+from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
+from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
+from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import Campaign, Datasheet
@@ -27,8 +30,6 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
 from emb_daemon.wire.contract import CYCLE_S
 
-TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
-OFFSET, LOAD, PRESLIDING = "friction.offset_Nm", "friction.load_m_per_rad", "friction.presliding_angle_rad"
 #: Parameters in the order of every covariance, with their least value that is physical.
 KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 1e-6}
 #: Variance of the friction state up to which it counts as known.
