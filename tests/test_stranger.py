@@ -239,6 +239,17 @@ def test_a_log_of_other_ids_is_told_by_them(bus, capsys):
     assert "no frame of id 0x100, the resolver of corner FL; found 0x18feef01, 0x18feef02; " in said and "--mapping" in said
 
 
+def test_diagnosis_reads_a_bus_of_other_people(bus, monkeypatch, capsys):
+    def stop(logs, *_):
+        raise InputError(f"{len(logs)} log, {len(logs[0].samples)} samples, {np.nanmax(logs[0].force_N):.0f} N")
+
+    monkeypatch.setattr("emb_daemon.diagnose.diagnosis.diagnose", stop)
+    options = ["--mapping", bus.parent / "mapping.yaml", "--calibration", bus.parent / "calibration.yaml"]
+    assert main(["diagnose", str(bus), *map(str, options), "--output", str(bus.parent / "found")]) == 2
+    log = load_log(bus, read=Mapping(bus.parent / "mapping.yaml").read)
+    assert f"1 log, {len(log.samples)} samples, {np.nanmax(log.force_N):.0f} N" in capsys.readouterr().err
+
+
 def test_a_converted_log_is_replayed_alike(bus, capsys):
     out, mapping = bus.parent / "ours.log", bus.parent / "mapping.yaml"
     assert main(["convert", str(bus), "--mapping", str(mapping), "--output", str(out)]) == 0
