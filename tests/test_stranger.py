@@ -74,15 +74,16 @@ def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):
     ("rate_Hz", "means"), [(100, True), (100, False), (250, False), (400, True), (500, False), (1000, True)]
 )
 def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, means):
-    """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate."""
-    figures = []
+    """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate, in random
+    motion as in stops. What a current of the moment does between two samples is unknown, so that it has stops alone."""
+    figures, motion = [], strangerkit.truth(strangerkit.random()) if means else truth
     for rate, as_means in ((250, True), (rate_Hz, means)):
         text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
         strangerkit.write_rig(tmp_path, text)
-        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, rate, as_means))
+        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(motion, rate, as_means))
         figures.append(_replay(tmp_path, table, capsys)[0]["force_N"])
     ours, theirs = figures
-    assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 500.0
+    assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 700.0
     assert theirs["fused"]["rmse"] < ours["fused"]["rmse"] + 5.0 < 45.0
     assert theirs["inside_two_sigma"] > 0.93
 
@@ -115,6 +116,14 @@ def test_columns_and_channels_are_logs(truth, tmp_path, name):
     assert len(samples) == 500 and np.abs(samples["angle"] - columns["angle_rad"]).max() < 1.1e-4
     start_s = strangerkit.START_S if name.endswith("mf4") else 0.0
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
+
+
+def test_a_table_may_have_decimal_commas(tmp_path):
+    strangerkit.write_rig(tmp_path, strangerkit.COLUMNS)
+    rows = "".join(f"{0.004 * n:.3f};{0.1 * n:.1f};25.0;1.5;22;0\n".replace(".", ",") for n in range(100))
+    (tmp_path / "a.csv").write_text("time_s;angle_rad;speed_rad_per_s;current_A;plate_C;force_N\n" + rows)
+    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
 
 
 @pytest.mark.parametrize(
@@ -228,6 +237,17 @@ def test_a_log_of_other_ids_is_told_by_them(bus, capsys):
     assert main(["replay", str(bus)]) == 2
     said = capsys.readouterr().err
     assert "no frame of id 0x100, the resolver of corner FL; found 0x18feef01, 0x18feef02; " in said and "--mapping" in said
+
+
+def test_diagnosis_reads_a_bus_of_other_people(bus, monkeypatch, capsys):
+    def stop(logs, *_):
+        raise InputError(f"{len(logs)} log, {len(logs[0].samples)} samples, {np.nanmax(logs[0].force_N):.0f} N")
+
+    monkeypatch.setattr("emb_daemon.diagnose.diagnosis.diagnose", stop)
+    options = ["--mapping", bus.parent / "mapping.yaml", "--calibration", bus.parent / "calibration.yaml"]
+    assert main(["diagnose", str(bus), *map(str, options), "--output", str(bus.parent / "found")]) == 2
+    log = load_log(bus, read=Mapping(bus.parent / "mapping.yaml").read)
+    assert f"1 log, {len(log.samples)} samples, {np.nanmax(log.force_N):.0f} N" in capsys.readouterr().err
 
 
 def test_a_converted_log_is_replayed_alike(bus, capsys):

@@ -36,12 +36,11 @@ _SLOW_MS = 40
 class Series:
     """One signal, in our unit: int64 nanoseconds, ascending, and float values, shape (n,).
 
-    Each value is the mean over ``span_ns`` about its time; 0 is the value at that time.
+    Each value is that of its time, or a mean about it.
     """
 
     time_ns: np.ndarray
     values: np.ndarray
-    span_ns: float = 0.0
 
     @classmethod
     def of(cls, time_ns: np.ndarray, values: np.ndarray) -> "Series":
@@ -53,7 +52,7 @@ class Series:
     def averaged(self, span_ns: float | None = None) -> "Series":
         """The same taken for means over ``span_ns`` that end with their stamps; None is the sampling period."""
         span_ns = self.period_ns if span_ns is None else span_ns
-        return Series(self.time_ns - round(0.5 * span_ns), self.values, span_ns)
+        return Series(self.time_ns - round(0.5 * span_ns), self.values)
 
     @cached_property
     def period_ns(self) -> float:
@@ -111,9 +110,6 @@ class Series:
         """
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
-        if self.is_slow and self.span_ns < 0.5 * self.period_ns and len(self.time_ns) > 1:
-            middles = self.time_ns[:-1] + np.diff(self.time_ns) // 2
-            return Series(middles, 0.5 * (self.values[1:] + self.values[:-1]), self.period_ns).mean(at_ns)
         middle = at_ns - CYCLE_NS // 2
         if self.is_slow:
             # Simpson's rule: at most one corner of the straight lines lies in a cycle.

@@ -49,9 +49,15 @@ def _columns(path: Path, content: bytes, ending: str, names: list[str]) -> dict[
         if ending == ".parquet":
             table = pyarrow.parquet.read_table(io.BytesIO(content))
         else:
-            header = content.partition(b"\n")[0].decode(errors="replace")
-            options = pyarrow.csv.ParseOptions(delimiter=max(_DELIMITERS, key=header.count))
-            table = pyarrow.csv.read_csv(io.BytesIO(content), parse_options=options)
+            header, _, rest = content.partition(b"\n")
+            delimiter = max(_DELIMITERS, key=header.decode(errors="replace").count)
+            # Where a comma does not separate, it is a decimal one.
+            point = "," if delimiter != "," and b"," in rest.partition(b"\n")[0] else "."
+            table = pyarrow.csv.read_csv(
+                io.BytesIO(content),
+                parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter),
+                convert_options=pyarrow.csv.ConvertOptions(decimal_point=point),
+            )
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
     columns = {}
