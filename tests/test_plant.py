@@ -34,6 +34,7 @@ VISIBLE = {
     "disc_thermal_expansion": {"growth_um_per_K": 0.3},
     "pad_wear": {"wear_um_per_MJ": 50.0},
     "torque_constant_fade": {"fade_per_K": 0.0012, "disc_share": 0.3},
+    "motor_heat_fade": {"fade_per_A2": 4e-5, "time_constant_s": 20.0},
     "current_offset": {"offset_A": 0.5},
     "viscous_friction": {"viscous_Nms_per_rad": 3e-4},
     "stribeck_friction": {"rise": 0.5, "speed_rad_per_s": 5.0},
@@ -53,6 +54,11 @@ VISIBLE = {
     "spindle_lead_error": {"amplitude_um": 10.0, "order_per_turn": 0.3},
     "cold_grease": {"per_K": 0.05},
     "current_delay": {"delay_s": 0.004 / 3.0},
+    "drawn_stiffness": {"size": 0.05, "signal": 0, "exponent": 0.7, "other": -1, "lag_s": 2.0},
+    "drawn_thickness": {"size": 10.0, "signal": 1, "exponent": 1.5, "other": -1},
+    "drawn_torque_constant": {"size": -0.05, "signal": 5, "exponent": 2.0, "other": -1},
+    "drawn_gear_friction": {"size": 0.3, "signal": 4, "exponent": 0.5, "other": 3},
+    "drawn_gear_gain": {"size": 0.05, "signal": 3, "exponent": 1.0, "other": -1},
 }
 
 

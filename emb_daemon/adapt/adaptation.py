@@ -73,10 +73,13 @@ class Adaptation:
         for name, calibration in calibrations.items():
             self.replace(name, calibration, self.read(name, calibration))
             if self._snapshots:
-                snapshot, time_ns, warning = self._snapshots.load(name, self.in_use(name))
+                in_use = self.in_use(name)
+                snapshot, time_ns, warning = self._snapshots.load(name, in_use)
+                if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
+                    warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
                 if warning:
                     log.warning("corner %s: %s", name, warning)
-                if snapshot is not None:
+                elif snapshot is not None:
                     self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:

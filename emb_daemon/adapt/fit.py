@@ -42,16 +42,22 @@ from emb_daemon.calibration.parameters import (
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
+from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
+from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
-_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(7)
+_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
+INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
+#: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
+#: off than a calibration leaves it.
+_INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
@@ -74,11 +80,16 @@ _RANGES = 5
 @njit
 def unexplained_step(s, p, row):
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
-    before = s.force
+    before, speed = s.force, s.speed
     stiffness_path(s, p, row, row.factor)
     torque, leverage, _ = torque_path(s, p, row)
     s.angle, s.speed = row.angle, row.speed
-    return torque - leverage * 0.5 * (before + s.force)
+    force = 0.5 * (before + s.force)
+    # What driving has found of friction at low and at high speed; a training's fit has neither.
+    slow = (
+        s.friction_mean * (p.offset_friction + p.load_friction * force) * exp(-0.5 * abs(row.speed + speed) / SLOW_RAD_PER_S)
+    )
+    return torque - leverage * force - s.error[SLOW] * slow - s.error[VISCOUS] * 0.5 * (row.speed + speed)
 
 
 @njit
@@ -94,8 +105,8 @@ def _run(states, parameters, rows, residual, force):
 
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithm of the presliding
-    angle, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
+    angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
@@ -122,8 +133,10 @@ class _Training:
         The first is the torque's mean over `_BLOCK` samples in standard deviations of what noise makes of it *with the trial's
         torque constant*: current and acceleration are both measured (Deming's regression), and in other units a small torque
         constant would seem to explain more because it makes the current's noise small."""
-        torque_constant = self._calibration.motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
-        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant})
+        motor = self._calibration.motor
+        torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
+        inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
+        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
         self._states[0] = self._state
         self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
@@ -232,11 +245,11 @@ class _Fit(NamedTuple):
     contact_sigma: float
 
 
-def _fit(training, x, steps, free):
+def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA):
     """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
     against that; outliers are left out of the second round."""
     prior = np.zeros(len(x))
-    prior[_GAIN] = _GAIN_SIGMA**-2
+    prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, _INERTIA_SIGMA**-2
     first = _improve(training, x, steps, prior, free)
     far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
     if np.mean(far) <= _FEW:
@@ -252,7 +265,7 @@ def _guess(rows, pairs, now, terms):
     top = rows["angle"].max() - contact
     scale = max(start @ top**powers, 1.0) / top**powers
     friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
-    return np.array([contact, 0.0, 0.0, *friction, *start / scale]), scale
+    return np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale]), scale
 
 
 def _fit_with_and_without_curve(training, x, curve, offset_friction):
@@ -260,10 +273,19 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     much better one with more freedom fits the noise."""
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(offset_friction, 1e-4)
-    free = _fit(training, x, steps, np.arange(len(x)))
-    held = _fit(training, np.concatenate([free.x[:_CURVE], curve]), steps, np.arange(_CURVE))
-    unchanged = held.iterations > 0 and (held.cost - free.cost) / free.spread < _UNCHANGED
-    return held if unchanged else free, unchanged
+    free = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
+    kept = np.concatenate([free.x[:_CURVE], curve])
+    held = _fit(training, kept, steps, np.delete(np.arange(_CURVE), _INERTIA))
+    if not _as_good(held, free):
+        # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+        kept[_GAIN] = 0.0
+        held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
+    return (held, True) if _as_good(held, free) else (free, False)
+
+
+def _as_good(held, fit):
+    """Whether a fit with the curve held explains a training as well as one with a curve of its own."""
+    return held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
 
 
 def _inverse(normal):

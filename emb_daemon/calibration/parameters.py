@@ -147,7 +147,7 @@ def keys(calibration: Calibration) -> list[str]:
 
     def walk(value: Any, path: str) -> None:
         if isinstance(value, msgspec.Struct):
-            for name in value.__struct_fields__:
+            for name in (name for name in value.__struct_fields__ if path or name != "provenance"):
                 walk(getattr(value, name), f"{path}.{name}" if path else name)
         elif isinstance(value, tuple):
             for index, item in enumerate(value):
@@ -158,7 +158,7 @@ def keys(calibration: Calibration) -> list[str]:
         elif type(value) is float:
             found.append(path)
 
-    walk(msgspec.structs.replace(calibration, provenance=None), "")
+    walk(calibration, "")
     return found
 
 

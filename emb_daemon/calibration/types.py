@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.curves import curve_at, rising_force, thickness_range
+from emb_daemon.calibration.terms import Term, faults_of, fill_terms
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InvalidValue
 from emb_daemon.estimator.records import CURVE_TERMS, FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
@@ -322,6 +323,8 @@ class Calibration(Struct, kw_only=True):
     thermal: Thermal
     #: Effects switched on, by name, with their parameters.
     effects: dict[str, dict[str, float]] = {}
+    #: Terms that no catalogue holds, as `emb-daemon diagnose` makes them.
+    terms: tuple[Term, ...] = ()
     #: Limits of park brake adaptation.
     adaptation: Adaptation = Adaptation()
     provenance: Provenance | None = None
@@ -342,6 +345,7 @@ class Calibration(Struct, kw_only=True):
                     )
             if missing := bounds.keys() - values.keys():
                 faults.append(f"effects.{name}: missing {', '.join(sorted(missing))}")
+        faults += faults_of(self.terms)
         try:
             curve_at(self.stiffness.curves, self.pad_thickness_mm)
         except InputError as error:
@@ -422,4 +426,5 @@ def to_parameters(calibration: Calibration) -> np.void:
     for name, values in c.effects.items():
         for key, value in values.items():
             p["effects"][name][key] = value
+    fill_terms(p["effects"]["terms"], c.terms)
     return p

@@ -79,7 +79,7 @@ class Left:
     @property
     def beyond(self) -> bool:
         """Whether the residual is clearly above what the calibration achieved."""
-        return self.rms > _CLEARLY * self.achieved
+        return is_beyond(self.rms, self.achieved)
 
     @property
     def present(self) -> bool:
@@ -88,6 +88,11 @@ class Left:
     @property
     def strongest(self) -> Dependence | None:
         return next(iter([*(d for d in self.dependences if d.matters), *self.dependences]), None)
+
+
+def is_beyond(rms: float, known: float) -> bool:
+    """Whether a residual is clearly above what the calibration achieved; not where it does not say."""
+    return rms > _CLEARLY * known
 
 
 def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:

@@ -28,6 +28,7 @@ _DOUBTFUL_RAD = 0.05
 def position(s, p, m):
     """Motor angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
+    effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
     return m.angle + effects.motor_angle(e, state, m, m.dt) + gained / p.gear_gain + grown - s.contact_angle

@@ -82,11 +82,10 @@ STATE = np.dtype(
         # Whether it goes on from a snapshot, whose heat is ``rested_s`` s old; clearance that counts from the released
         # position.
         ("resumed", "?"),
-        *fields(
-            "f8",
-            "rested_s clearance clearance_sigma since_start_s still_s start_angle passed opposing angle speed angle_before "
-            "dt_before contact_angle",
-        ),
+        *fields("f8", "rested_s clearance clearance_sigma since_start_s still_s start_angle"),
+        # Angle (rad) gone without speed since the motor stands, and for how long; time for which that still counts.
+        *fields("f8", "drifted stood_s drifting_s"),
+        *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
         # Torque path.
@@ -126,6 +125,8 @@ STATE = np.dtype(
         # Standard deviations, K, left from a start with hot pads.
         ("temperature_sigma", "f8"),
         ("history_sigma", "f8"),
+        # What of the stiffness they left open at the last sample, share.
+        ("softening", "f8"),
         ("temperature_known", "?"),
         # Backing plates: last readings, degC, the pads' mean temperatures when they last moved, what these have gained
         # since over time, K s, and whether a reading is stuck.

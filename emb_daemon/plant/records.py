@@ -41,6 +41,10 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("fade_per_K", "1/K", "relative loss of torque constant as the magnets warm over 25 degC"),
         Field("disc_share", "1", "where the motor's surroundings lie between caliper and disc"),
     ),
+    "motor_heat_fade": (
+        Field("fade_per_A2", "1/A2", "relative loss of torque constant per squared current, settled"),
+        Field("time_constant_s", "s", "of the heat on its way from winding to magnets"),
+    ),
     "current_offset": (Field("offset_A", "A", "flows but is not measured"),),
     "viscous_friction": (Field("viscous_Nms_per_rad", "N m s/rad", "friction torque per motor speed"),),
     "stribeck_friction": (
@@ -90,6 +94,23 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),
         Field("viscous_Nms_per_rad", "N m s/rad", "viscous friction at 12 degC, doubling every further 10 K down"),
     ),
+    # Whatever a seed draws: size × signal^exponent × other signal, through a lag. Signals as `brake.SIGNALS` counts them.
+    **{
+        f"drawn_{port}": (
+            Field("size", unit, f"of what is added to {what} where the signals are at their usual sizes"),
+            Field("signal", "1", "index of the signal"),
+            Field("exponent", "1", "of the signal"),
+            Field("other", "1", "index of a second signal that multiplies, negative for none"),
+            Field("lag_s", "s", "time constant, 0 for none"),
+        )
+        for port, unit, what in (
+            ("stiffness", "1", "the stiffness factor"),
+            ("thickness", "um", "disc and pads"),
+            ("torque_constant", "1", "the torque constant's factor"),
+            ("gear_friction", "1", "the gear friction's factor"),
+            ("gear_gain", "1", "the load's factor"),
+        )
+    },
     "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
 }
 
@@ -173,6 +194,9 @@ PLANT_STATE = np.dtype(
         ("drive", "f8"),
         ("slow", "f8"),
         ("creep", "f8"),
+        ("motor_heat", "f8"),
+        # What drawn effects add, in the order of their table.
+        ("drawn", "f8", (5,)),
         ("excitation", "f8"),
         ("force", "f8"),
         ("force_rate", "f8"),

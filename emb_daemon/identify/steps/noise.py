@@ -10,7 +10,7 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold, second_halves
-from emb_daemon.identify.steps.stiffness import StiffnessStep
+from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
 from emb_daemon.identify.steps.torque import (
     INERTIA,
     LOAD,
@@ -62,9 +62,20 @@ def identify(
         "stiffness_correlation_s": integral_time([error for error, _ in errors]),
         **torque_levels(held_out, gear_gain, speed),
     }
+    if not any(pads.random for pads in stiffness.pads):
+        levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign)))
+        notes.append(
+            "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
+        )
     # The daemon is not told how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
     return Step(values={f"noise.{name}": value for name, value in levels.items()}, notes=tuple(notes))
+
+
+def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign) -> float:
+    """Relative force error of a lag that no log shows, in a clamp as hard as the motor can."""
+    travel = max(curve.travel_rad for curve in stiffness.fit.curves)
+    return USUAL_RELAXATION_S * campaign.datasheet.actuator.max_motor_speed_rad_per_s / travel
 
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:

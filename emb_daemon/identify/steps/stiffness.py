@@ -5,12 +5,13 @@ from itertools import combinations
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import parameter
+from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects.base import Effect
 from emb_daemon.identify.dynamics import (
     DELAY,
     OPTIONAL,
+    RELAXATION,
     DynamicsFit,
     Pads,
     curve_keys,
@@ -25,6 +26,9 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report import Page, Panel, Section, Trace, shades, xy_figure
 from emb_daemon.report.figures import Style
 
+#: Relaxation of an ordinary brake, s, and as much its standard deviation where no log shows it: between pads whose force
+#: follows at once and those that need the time of a hard application.
+USUAL_RELAXATION_S = 0.03
 #: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
 _WORTH = 1.02
 #: Standard deviations by which an effect's amplitude must stand clear of zero.
@@ -79,13 +83,26 @@ def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
     Args:
         pads: in ascending order of thickness, for each of which ``nominal`` has a curve.
     """
+    if not any(own.random for own in pads):
+        return _quasistatic(pads, nominal)
     effects = [combination for count in range(len(OPTIONAL) + 1) for combination in combinations(OPTIONAL, count)]
     candidates = [_candidate(pads, nominal, combination) for combination in effects]
     chosen = _choose(candidates)
     fit = fit_dynamics(pads, chosen.fit.calibration, chosen.fit.delay_s)
     separate = [fit_dynamics([own], fit.calibration, fit.delay_s) for own in pads if own.random]
+    return _step(pads, nominal, fit, candidates, chosen, separate)
+
+
+def _step(
+    pads: list[Pads],
+    nominal: Calibration,
+    fit: DynamicsFit,
+    candidates: list[Candidate],
+    chosen: Candidate,
+    separate: list[DynamicsFit],
+) -> StiffnessStep:
     reached = max(float(np.nanmax(log.force_N)) for own in pads for log in own.logs)
-    sigmas = {key: sigma for key, sigma in fit.sigmas.items() if key != DELAY}
+    sigmas = {key: sigma for key, sigma in fit.sigmas.items() if key != DELAY} or {RELAXATION: USUAL_RELAXATION_S}
     for curve in fit.curves:
         keys = curve_keys(fit.calibration, curve.thickness_mm)
         sigmas |= dict(zip(keys, np.sqrt(np.diag(curve.covariance)).tolist(), strict=True))
@@ -98,6 +115,20 @@ def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
         chosen=chosen,
         separate=separate,
     )
+
+
+def _quasistatic(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
+    """Curves alone: a slow clamp does not tell a lag from a loop. The dynamics keep what is usual, as uncertain as it is
+    large."""
+    start = moved(starting_point(pads, nominal, ()), {RELAXATION: USUAL_RELAXATION_S})
+    fit = fit_dynamics(pads, start, fixed=True)
+    held_out = [
+        (simulate(log, fit.calibration, own.thickness_mm, clearance) - log.force_N, log.force_N)
+        for own, curve in zip(pads, fit.curves, strict=True)
+        for log, clearance in zip(own.logs, curve.clearances_rad, strict=True)
+    ]
+    chosen = Candidate((), fit, held_out, clear=True)
+    return _step(pads, nominal, fit, [chosen], chosen, [])
 
 
 def _candidate(groups: list[Pads], nominal: Calibration, effects: tuple[Effect, ...]) -> Candidate:

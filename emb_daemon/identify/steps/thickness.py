@@ -67,7 +67,8 @@ def load_pads(campaign: Campaign) -> list[Pads]:
         raise InputError("\n".join([*campaign.faults, f"{campaign.path}: {error}"])) from None
     if not any(own.random for own in pads):
         campaign.fault(
-            f"random: no usable log, so that relaxation rests on slow clamps, which hardly show it; needed: {NEED_RANDOM}"
+            "random: no usable log, so that relaxation keeps what is usual of brakes, and sigma holds what that may do in a "
+            f"hard clamp; needed: {NEED_RANDOM}"
         )
     return pads
 

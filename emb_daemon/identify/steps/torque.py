@@ -36,6 +36,10 @@ KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 
 _KNOWN = 0.01
 #: Step of the derivative by the logarithm of the presliding angle.
 _STEP = 1e-2
+#: Motor angle within which the friction of rolling gears turns over, rad, before a log has shown it: median, and standard
+#: deviation of its logarithm (rolling elements slide after micrometres to tens of them: Armstrong-Helouvry et al., Automatica
+#: 30(7), 1994, sec. 2.1, over a screw's micrometres per hundredth of a radian).
+_USUAL_PRESLIDING, _PRESLIDING_SPREAD = 0.03, 1.0
 _NEED_TRAINING = "clamp and release with the reference force, at full frame rate"
 
 
@@ -135,33 +139,42 @@ class _Regression:
         self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
 
     def matrices(self, presliding_angle: float):
-        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model."""
+        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model, and
+        what not knowing it leaves in the other rows: regressors times the state's standard deviation."""
         parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
         instruments = regressors.copy()
         instruments[:, 1] = self.of_angle
-        return regressors, instruments, paths["friction_variance"] < _KNOWN
+        known = paths["friction_variance"] < _KNOWN
+        spread = np.sqrt(paths["friction_variance"][~known, None]) * np.column_stack([np.ones(len(s)), self.force])[~known]
+        return regressors, instruments, known, spread
 
 
 def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> TorqueFit:
     """Instrumental-variable regression with the presliding angle sought in one dimension.
 
     Of the calibration only the gear counts. The datasheet's torque constant and inertia are priors; its resolver count is what
-    no turning over is known better than.
+    no turning over is known better than. What logs do not excite keeps a wide prior, and a sigma that says so.
     """
     parts = [_Regression(log, calibration) for log in logs]
+    nominal, precision = _wide_prior(sheet)
 
     def solve(presliding):
         matrices = [part.matrices(presliding) for part in parts]
-        left = sum(z[use].T @ x[use] for x, z, use in matrices)
-        right = sum(z[use].T @ part.current[use] for part, (_, z, use) in zip(parts, matrices, strict=True))
+        left = precision[:4, :4] + sum(z[use].T @ x[use] for x, z, use, _ in matrices)
+        right = precision[:4, :4] @ nominal
+        right += sum(z[use].T @ part.current[use] for part, (_, z, use, _) in zip(parts, matrices, strict=True))
         solution = np.linalg.solve(left, right)
-        return solution, matrices, [p.current[use] - x[use] @ solution for p, (x, _, use) in zip(parts, matrices, strict=True)]
+        residuals = [p.current[use] - x[use] @ solution for p, (x, _, use, _) in zip(parts, matrices, strict=True)]
+        return solution, matrices, residuals
 
     def cost(logarithm):
-        return float(np.mean(np.concatenate(solve(np.exp(logarithm))[2]) ** 2))
+        # A state that is unknown explains nothing: otherwise large angles would be rewarded for the rows that they leave out.
+        solution, matrices, residuals = solve(np.exp(logarithm))
+        left_over = np.concatenate([*residuals, *(spread @ solution[2:] for *_, spread in matrices)])
+        return float(left_over @ left_over + precision[4, 4] * (logarithm - np.log(_USUAL_PRESLIDING)) ** 2)
 
     # The grid finds the valley; below a resolver count the angle says nothing.
     grid = np.log(np.geomspace(1e-3, 1.0, 13))
@@ -169,20 +182,34 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
     bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
     presliding = float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x))
     solution, matrices, residuals = solve(presliding)
-    covariance = _covariance(parts, matrices, residuals, solution, presliding)
+    covariance = _covariance(parts, matrices, residuals, solution, presliding, precision)
     physical, covariance = _physical(solution, presliding, covariance, sheet)
     physical, covariance = _with_priors(physical, covariance, sheet)
+    # What is known of the others moves it along a slope that holds near it alone.
+    physical[4] = np.clip(physical[4], 0.5 * presliding, 2.0 * presliding)
     left_over = {
         str(part.log.path): (part.rows[use], residual)
-        for part, (_, _, use), residual in zip(parts, matrices, residuals, strict=True)
+        for part, (_, _, use, _), residual in zip(parts, matrices, residuals, strict=True)
     }
     return TorqueFit(dict(zip(KEYS, physical.tolist(), strict=True)), covariance, left_over)
 
 
-def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
+def _wide_prior(sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (4,) by the datasheet, and inverse covariance (5, 5) of them and the presliding angle's logarithm for a
+    current known to 1 A: torque constant and inertia to a third, friction no larger than what it rubs against."""
+    actuator = sheet.actuator
+    constant, gear = actuator.motor_torque_constant_Nm_per_A, actuator.gear_gain_m_per_rad
+    nominal = np.array([gear, actuator.lumped_inertia_kg_m2, 0.0, 0.0]) / constant
+    sigma = np.array(
+        [*(nominal[:2] / 3.0), gear * actuator.rated_clamp_force_N / constant, gear / constant, _PRESLIDING_SPREAD]
+    )
+    return nominal, np.diag(sigma**-2)
+
+
+def _covariance(parts, matrices, residuals, solution, presliding, precision) -> np.ndarray:
     """Of the four coefficients and the logarithm of the presliding angle, jackknife over seconds."""
     normals, scores = [], []
-    for part, (regressors, instruments, use), residual in zip(parts, matrices, residuals, strict=True):
+    for part, (regressors, instruments, use, _), residual in zip(parts, matrices, residuals, strict=True):
         moved = part.matrices(presliding * np.exp(_STEP))[0]
         sensitivity = (((moved - regressors) @ solution) / _STEP)[use, None]
         x, z = np.hstack([regressors[use], sensitivity]), np.hstack([instruments[use], sensitivity])
@@ -190,7 +217,7 @@ def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
             rows = slice(start, start + EPISODE)
             normals.append(z[rows].T @ x[rows])
             scores.append(z[rows].T @ residual[rows])
-    return jackknife(np.array(normals), np.array(scores))
+    return jackknife(np.array(normals), np.array(scores), precision)
 
 
 def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
@@ -234,7 +261,7 @@ class Unexplained:
 def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
     """Current of a log that a fit does not explain; of the calibration only the gear counts."""
     part, values = _Regression(log, calibration), found.values
-    regressors, _, use = part.matrices(values[PRESLIDING])
+    regressors, _, use, _ = part.matrices(values[PRESLIDING])
     gear_gain = calibration.motor.gear_gain_m_per_rad
     coefficients = np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET, LOAD))]) / values[TORQUE_CONSTANT]
     residual = part.current - regressors @ coefficients
