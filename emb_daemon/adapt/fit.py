@@ -257,6 +257,32 @@ def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA):
     return _improve(training, first.x, steps, first.spread * prior, free)
 
 
+def _guess(rows, pairs, now, terms):
+    """(fitted values by the pairs of passes, NaN where there are none; unit of each of the curve's coefficients)."""
+    contact, start = curve_from_pairs(pairs, terms)
+    offset, load = friction_from_pairs(pairs)
+    powers = np.arange(1, terms + 1)
+    top = rows["angle"].max() - contact
+    scale = max(start @ top**powers, 1.0) / top**powers
+    friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
+    return np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale]), scale
+
+
+def _fit_with_and_without_curve(training, x, curve, offset_friction):
+    """(`_Fit`, whether the pads are unchanged): such pads keep the ``curve`` of a whole campaign (in the fit's units), however
+    much better one with more freedom fits the noise."""
+    steps = np.full(len(x), 1e-4)
+    steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(offset_friction, 1e-4)
+    free = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
+    kept = np.concatenate([free.x[:_CURVE], curve])
+    held = _fit(training, kept, steps, np.delete(np.arange(_CURVE), _INERTIA))
+    if not _as_good(held, free):
+        # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+        kept[_GAIN] = 0.0
+        held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
+    return (held, True) if _as_good(held, free) else (free, False)
+
+
 def _as_good(held, fit):
     """Whether a fit with the curve held explains a training as well as one with a curve of its own."""
     return held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
@@ -337,32 +363,11 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
     terms = curve_terms(calibration)
     pairs = pairs_of_passes(rows, now)
-    contact, start = curve_from_pairs(pairs, terms)
-    offset, load = friction_from_pairs(pairs)
-    if not (np.isfinite(contact) and np.isfinite(load)):
+    x, scale = _guess(rows, pairs, now, terms)
+    if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
-    powers = np.arange(1, terms + 1)
-    highest = rows["angle"].max()
-    top = highest - contact
-    scale = max(start @ top**powers, 1.0) / top**powers
-    friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
-    x = np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale])
-    steps = np.full(len(x), 1e-4)
-    steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(now["offset_friction"], 1e-4)
-
     training = _Training(rows, calibration, state, scale)
-    fit = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
-    # Pads that did not change keep the curve of a whole campaign, however much better one with more freedom fits the noise.
-    kept = fit.x.copy()
-    kept[_CURVE:] = now["curve"][:terms] / scale
-    held = _fit(training, kept, steps, np.delete(np.arange(_CURVE), _INERTIA))
-    if not _as_good(held, fit):
-        # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
-        kept[_GAIN] = 0.0
-        held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
-    unchanged = _as_good(held, fit)
-    if unchanged:
-        fit = held
+    fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
     x, covariance = fit.x, fit.covariance
     values = training.values(x)
     if unchanged:
@@ -371,7 +376,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     expected, _ = torque_sigma(*_noises(calibration))
     sigma = _deviation(fit.residual)
     sigmas = np.sqrt(np.diag(covariance))
-    top = highest - x[_CONTACT]
+    top = rows["angle"].max() - x[_CONTACT]
     # The torque constant's error scales the whole curve, whose shape is known better than its size.
     along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
     constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
