@@ -260,10 +260,26 @@ def test_ripple_is_averaged_over_the_cycle():
     assert cycle_mean(0.3, -0.2, 7.0, 3.0, 1e-9) == pytest.approx(0.3 * np.cos(21.0) - 0.2 * np.sin(21.0))
 
 
-def test_lost_pulses_leave_no_stale_thickness():
-    samples = drive()
-    samples["has_wheel_pulse"][1500:] = False
+def _variation(samples):
+    """What a known thickness variation adds to the clamp force, N."""
     p = with_effect("disc_thickness_variation", order_1_cosine_um=15.0)
-    change = force(p, samples) - force(bare(), samples)
+    return force(p, samples) - force(bare(), samples)
+
+
+def test_a_pause_of_the_pulses_is_bridged_by_the_wheel_speed():
+    """Even one over which the counter begins anew: 15 s at 80 rad/s are 190 turns, 43 to a round of the counter."""
+    whole = drive(20.0, wheel_speed=80.0)
+    samples = whole.copy()
+    samples["has_wheel_pulse"][1000:4750] = False
+    np.testing.assert_allclose(_variation(samples)[4800:], _variation(whole)[4800:], atol=10.0)
+
+
+def test_a_phase_that_nothing_tells_is_no_thickness_but_a_doubt():
+    samples = drive()
+    samples["has_wheel_pulse"][1500:2000] = samples["has_wheel_speed"][1500:2000] = False
+    change = _variation(samples)
     assert np.abs(change[:1500]).max() > 20.0
     assert np.abs(change[1700:]).max() < 1.0
+    sigmas = [estimate(samples, with_effect("disc_thickness_variation", order_1_cosine_um=um))["sigma"] for um in (15.0, 0.0)]
+    held = np.arange(len(samples)) > 2100
+    assert np.all(sigmas[0][held] > 1.2 * sigmas[1][held])

@@ -4,7 +4,7 @@ The wheel angle comes from the wheel's pulse counter, carried on by the wheel sp
 the counter was at power-on, which is arbitrary, so each order has a cosine and a sine.
 """
 
-from math import cos, sin
+from math import cos, pi, sin, sqrt
 
 import numpy as np
 
@@ -15,6 +15,15 @@ from emb_daemon.models.wheel import PULSE_MODULO, PULSES_PER_TURN, WHEEL, track
 ORDERS = 4
 #: Those that discs commonly have.
 _COMMON_ORDERS = 2
+#: What a wheel speed may be off by where the counter does not correct it: a hundredth, and half a count of the wire, rad/s.
+_SPEED_ERROR, _SPEED_ERROR_RAD_PER_S = 0.01, 0.025
+#: Phase, rad, that the disc may be off by: from here the mean thickness is the better guess; and half of what the counter
+#: counts before it begins anew, from where nothing tells its turn.
+_GUESSED_RAD, _LOST_RAD = 1.0, pi * PULSE_MODULO / PULSES_PER_TURN
+
+#: ``unseen``: phase (rad) by which the wheel may be off since the counter was last heard; ``doubt``: thickness (m, standard
+#: deviation) that this leaves open.
+_STATE = np.dtype([*((name, WHEEL[name]) for name in WHEEL.names), ("unseen", "f8"), ("doubt", "f8")], align=True)
 
 
 @njit
@@ -31,10 +40,26 @@ def term(p, s, m):
         and p.order_4_sine_um == 0.0
     ):
         return 0.0
-    if not m.has_wheel_pulse:
-        s.known = False
+    if m.has_wheel_pulse and s.unseen < _LOST_RAD:
+        angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
+        s.unseen = 0.0
+    elif s.known and m.has_wheel_speed:
+        # The counter is silent or was: the speed carries the wheel on.
+        s.turned += m.wheel_speed * m.dt
+        s.unseen += (_SPEED_ERROR * m.wheel_speed + _SPEED_ERROR_RAD_PER_S) * m.dt
+        angle = s.turned
+    elif s.known:
+        s.unseen, angle = _LOST_RAD, 0.0
+    else:
         return 0.0
-    angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
+    s.doubt = 0.0
+    if s.unseen > 0.0:
+        square = p.order_1_cosine_um**2 + p.order_1_sine_um**2 + 4.0 * (p.order_2_cosine_um**2 + p.order_2_sine_um**2)
+        square += 9.0 * (p.order_3_cosine_um**2 + p.order_3_sine_um**2)
+        square += 16.0 * (p.order_4_cosine_um**2 + p.order_4_sine_um**2)
+        s.doubt = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
+    if s.unseen > _GUESSED_RAD:
+        return 0.0
     return 1e-6 * (
         p.order_1_cosine_um * cos(angle)
         + p.order_1_sine_um * sin(angle)
@@ -86,7 +111,7 @@ EFFECT = Effect(
     ),
     equation="θ → θ + Σ (aₙ cos nφ + bₙ sin nφ) / γ",
     source="Jacobsson, Aspects of disc brake judder, Proc. IMechE D 217, 2003: 10 to 20 µm, orders 1 to 4 when cold",
-    state=WHEEL,
+    state=_STATE,
     signal="disc_angle",
     manoeuvre="hold the clamp force on a turning wheel for several turns",
     placebos=(

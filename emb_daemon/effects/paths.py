@@ -65,3 +65,9 @@ def motor_torque(e, s, m, nominal, travel, mean_speed, disc, disc_known):
 def backplates(e, s, inner, outer, dt):
     """Temperatures (degC) of the backing plates from what their thermocouples show."""
     return backplate(inner, e, s, 0, dt), backplate(outer, e, s, 1, dt)
+
+
+@njit
+def thickness_doubt(s):
+    """Standard deviation (m) of the disc's thickness where its phase is not known."""
+    return s.disc_thickness_variation.doubt

@@ -4,6 +4,7 @@ from math import exp, hypot, sqrt
 
 import numpy as np
 
+from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
@@ -110,6 +111,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     known = p.clearance_sigma == 0.0
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
     relative = hypot(relative, s.effects.terms.doubt)
+    relative = hypot(relative, s.slope * effects.thickness_doubt(s.effects) / p.gear_gain)
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)

@@ -1,6 +1,6 @@
 """Angle of a wheel from its pulse counter, carried on by the wheel speed between the counter's messages."""
 
-from math import pi
+from math import floor, pi
 
 import numpy as np
 
@@ -24,9 +24,11 @@ def track(s, pulse, wheel_speed, dt):
         s.turned = (pulse + 0.5) * width
         return s.turned
     s.turned += wheel_speed * dt
-    moved = (pulse - s.count % PULSE_MODULO + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2
-    if moved != 0.0:
-        s.count += moved
+    # Of the counts that the counter may stand for, the one nearest to where the speed has carried the wheel.
+    wraps = floor((s.turned / width - 0.5 - pulse) / PULSE_MODULO + 0.5)
+    count = pulse + wraps * PULSE_MODULO
+    if count != s.count:
+        s.count = count
         error = (s.count + 0.5) * width - s.turned
         # More than two pulses off is no interpolation error: frames were missing.
         s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
