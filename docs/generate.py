@@ -16,6 +16,8 @@ import msgspec
 from emb_daemon.calibration import configuration, types
 from emb_daemon.effects import REGISTRY
 from emb_daemon.estimator import status
+from emb_daemon.identify import campaign
+from emb_daemon.logs import mapping
 from emb_daemon.wire import contract
 
 _HERE = Path(__file__).parent
@@ -70,6 +72,8 @@ def _describe(kind) -> tuple[str, type | None]:
         return f"{text}, or null", struct
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return "keys below", kind
+    if origin is typing.Literal:
+        return "one of " + ", ".join(arguments), None
     return {float: "number", int: "whole number", str: "text", bool: "true or false"}[kind], None
 
 
@@ -83,14 +87,17 @@ def _default(field) -> str:
     return f"default {text}"
 
 
-def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
+def _struct(kind: type, path: str, out: list[str]) -> None:
+    comments = _comments(sys.modules[kind.__module__])
     out += [f"## `{path}`" if path else "## The file", "", inspect.getdoc(kind) or "", ""]
     out += ["| key | what | meaning |", "| --- | --- | --- |"]
     below = []
     for field in msgspec.structs.fields(kind):
         text, struct = _describe(field.type)
         what = ", ".join(filter(None, (text, _default(field))))
-        meaning = comments[kind.__name__][field.name]
+        meaning = next(
+            comments[owner.__name__][field.name] for owner in kind.__mro__ if field.name in comments[owner.__name__]
+        )
         if struct and not meaning:
             meaning = (inspect.getdoc(struct) or "").splitlines()[0]
         out.append(f"| `{field.encode_name}` | {what} | {_cell(meaning)} |")
@@ -98,16 +105,16 @@ def _struct(kind: type, path: str, comments: dict, out: list[str]) -> None:
             below.append((struct, f"{path}.{field.encode_name}" if path else field.encode_name))
     out.append("")
     for struct, name in below:
-        _struct(struct, name, comments, out)
+        _struct(struct, name, out)
 
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _structs(title: str, text: str, kind: type, module) -> str:
+def _structs(title: str, text: str, kind: type) -> str:
     out = [f"# {title}", "", text, ""]
-    _struct(kind, "", _comments(module), out)
+    _struct(kind, "", out)
     return "\n".join(out).rstrip() + "\n"
 
 
@@ -154,14 +161,26 @@ def pages() -> dict[str, str]:
             "`emb-daemon check` lists every fault of one with its line. Keys carry their unit; an unknown key, a key that "
             "stands twice or a number that is not finite is refused. [Learned values](integration.md#files) are never "
             "written into it.",
-            types.Calibration, types,
+            types.Calibration,
         ),
         "configuration.md": _structs(
             "Configuration file",
             "What `emb-daemon run` and `check` read, for example `config/emb.yaml`. Bus options on the command line and "
             "python-can's `CAN_*` variables come before what stands here.",
-            configuration.Configuration, configuration,
+            configuration.Configuration,
         ),
+        "mapping.md": _structs(
+            "Mapping file",
+            "Where our signals come from in the logs of another rig: `--mapping FILE` of the commands that read logs. "
+            "[How it is used](formats.md#another-rigs-signals); [an example](own_actuator.md).",
+            mapping.MappingFile, mapping,
+        ),
+        "campaign.md": _structs(
+            "Campaign and datasheet",
+            "What `emb-daemon identify` reads: which log plays which part, and what the supplier states. "
+            "[What to record, and why](own_actuator.md).",
+            campaign.CampaignFile, campaign,
+        ) + "\n# Datasheet\n\n" + _structs("", "", campaign.Datasheet, campaign).split("\n", 4)[4],
         "catalogue.md": _catalogue(),
         "safety.md": _safety(),
     }  # fmt: skip

@@ -158,3 +158,8 @@ def depend_on(source: Path) -> None:
     folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     config.CACHE_DIR = str(folder)
+
+
+def fields(kind: str, names: str) -> list[tuple[str, str]]:
+    """Fields of a record that compiled code reads: several of one ``kind`` (``f8``, ``i8``, ``?``), names apart by a blank."""
+    return [(name, kind) for name in names.split()]

@@ -29,18 +29,34 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse
+from emb_daemon.plant.brake import SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
 
 #: Effects that say from which ranges they are to be drawn.
 DRAWN = {effect.name: effect for effect in REGISTRY if all(parameter.drawn for parameter in effect.parameters)}
-#: Effects outside the catalogue, with a size at which they matter.
+#: Effects outside the catalogue, with a size at which they matter, and the terms that say the same: port and signal.
 _FOREIGN = {
     "clamp_creep": {"share": 0.06, "time_constant_s": 30.0},
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
 }
+_SAME = {
+    "clamp_creep": {"term:force:clamp_force"},
+    "brake_torque_coupling": {"term:stiffness:brake_torque"},
+    "spindle_lead_error": {"term:motor_angle:motor_angle"},
+}
+#: Signals of the family from which a seed draws effects, by port; the exponent is between these, every third has a second
+#: signal that multiplies, every third a lag (s) between these.
+_FAMILY = {
+    "stiffness": ("brake_torque", "pad_temperature", "disc_temperature"),
+    "thickness": ("brake_torque", "pad_temperature"),
+    "torque_constant": ("current",),
+    "gear_friction": ("motor_speed", "clamp_force", "brake_torque"),
+    "gear_gain": ("clamp_force", "brake_torque"),
+}
+_EXPONENTS, _LAGS_S = (0.4, 2.6), (1.0, 20.0)
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
 
@@ -73,13 +89,18 @@ class Trial:
 
     @property
     def false_findings(self) -> set[str]:
-        return set(self.found) - set(self.hidden)
+        true = set(self.hidden).union(*(_SAME.get(name, ()) for name in self.hidden))
+        return set(self.found) - true
 
     @property
     def named(self) -> bool:
-        """Whether exactly what was hidden was found; for a foreign effect, that nothing was, and that it was said so."""
+        """Whether exactly what was hidden was found; for a foreign effect, a term of the right signal at the right port."""
+        if self.kind == "drawn":
+            [(name, values)] = self.hidden.items()
+            signals = {SIGNALS[int(values[key])] for key in ("signal", "other") if values[key] >= 0.0}
+            return set(self.found) <= {f"term:{name.removeprefix('drawn_')}:{s}" for s in signals} and len(self.found) > 0
         if self.kind == "foreign":
-            return not self.found and self.unexplained is not None
+            return len(self.found) == 1 and set(self.found) <= _SAME[next(iter(self.hidden))]
         return set(self.found) == set(self.hidden)
 
 
@@ -115,6 +136,37 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
     return values | amplitudes
 
 
+def draw_foreign(rng: np.random.Generator) -> dict[str, dict[str, float]]:
+    """An effect that nobody thought of, of size one."""
+    port = list(_FAMILY)[rng.integers(len(_FAMILY))]
+    signal = rng.choice(_FAMILY[port])
+    other = rng.choice(_FAMILY[port]) if rng.uniform() < 1.0 / 3.0 else None
+    lag = float(np.exp(rng.uniform(*np.log(_LAGS_S)))) if rng.uniform() < 1.0 / 3.0 else 0.0
+    values = {"size": 1.0, "signal": float(SIGNALS.index(signal)), "exponent": float(rng.uniform(*_EXPONENTS))}
+    values |= {"other": float(SIGNALS.index(other)) if other else -1.0, "lag_s": lag}
+    return {f"drawn_{port}": values}
+
+
+def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, size: float, seed: int) -> dict:
+    """A drawn effect scaled until it adds ``size`` N RMS, in quadrature, to its path's residual."""
+    [(name, values)] = hidden.items()
+    channel = "stiffness" if name in ("drawn_stiffness", "drawn_thickness") else "torque"
+    values = values | {"size": 0.0}
+
+    def residual(values) -> float:
+        plant = base.copy()
+        for key, value in values.items():
+            plant["effects"][name][key] = value
+        return rmse(Bench([log_of(simulate_log(plant, schedule, seed=seed)[0])], start).residuals({})[channel])
+
+    floor = residual(values)
+    tried = 10.0 if name == "drawn_thickness" else 0.05
+    for _ in range(3):
+        added = np.sqrt(max(residual(values | {"size": tried}) ** 2 - floor**2, 1.0))
+        tried *= float(np.clip(size / added, 0.1, 10.0))
+    return {name: values | {"size": tried}}
+
+
 def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarray:
     """What an effect does on its own path, N, by the estimator's own term."""
     channel = bench.channel_of(DRAWN[name].channel)
@@ -123,7 +175,7 @@ def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarra
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
-    """One blind trial; ``kind`` is null, single, pair or foreign, ``names`` the effects to hide at ``size`` N each."""
+    """One blind trial; ``kind`` is null, single, pair, foreign or drawn, ``names`` the effects to hide at ``size`` N each."""
     rng = np.random.default_rng(seed)
     start = calibration
     removed = [name for name in names if name in calibration.effects]
@@ -136,7 +188,9 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         base["effects"][name] = 0.0
     schedule = campaign(base, rng, stops)
     hidden: dict[str, dict[str, float]] = {}
-    if kind == "foreign":
+    if kind == "drawn":
+        hidden = sized(base, schedule, start, draw_foreign(np.random.default_rng(seed)), size, seed)
+    elif kind == "foreign":
         hidden[names[0]] = dict(_FOREIGN[names[0]])
     elif names:
         frames, _ = simulate_log(base, schedule, seed=seed)
@@ -201,7 +255,7 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
     return result | {key: float(np.hypot(values[key], values[sine])) for key, sine in pairs.items()}
 
 
-def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, str, tuple[str, ...], float]]:
+def plan(null: int, single: int, pairs: int, foreign: int, drawn: int = 0) -> list[tuple[int, str, tuple[str, ...], float]]:
     """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
     names = list(DRAWN)
@@ -211,6 +265,7 @@ def plan(null: int, single: int, pairs: int, foreign: int) -> list[tuple[int, st
     for k in range(pairs):
         first, second = rng.choice(len(names), 2, replace=False)
         trials.append((40000 + 10 * k, "pair", (names[first], names[second]), float(rng.uniform(150.0, 500.0))))
+    trials += [(60000 + 10 * k, "drawn", (), SIZES_N[1 + k % 2]) for k in range(drawn)]
     strangers = [name for _ in range(foreign) for name in _FOREIGN]
     return trials + [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
 
@@ -244,7 +299,7 @@ def summary(trials: list[Trial]) -> str:
     return "\n".join(lines)
 
 
-_KINDS = {"null": "no effect", "single": "one effect", "pair": "two effects"}
+_KINDS = {"null": "no effect", "single": "one effect", "pair": "two effects", "drawn": "drawn by a seed"}
 #: From here a validation error counts as worse; below it is the noise of the reference.
 _WORSE = 1.05
 
@@ -279,12 +334,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--single", type=int, default=5, help="plants per effect and size")
     parser.add_argument("--pairs", type=int, default=40, help="plants with two effects")
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
+    parser.add_argument("--drawn", type=int, default=16, help="plants with an effect that a seed draws from a wider family")
     parser.add_argument("--output", type=Path, help="trials, one JSON object per line; those already there are not run again")
     parser.add_argument("--calibration", type=Path, help="default: the shipped one")
     arguments = parser.parse_args(argv)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
-    planned = plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign)
-    done = {_key(t.seed, t.kind, t.hidden, t.size): t for t in recorded(arguments.output)}
+    planned = plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign, arguments.drawn)
+    done = {_key(t.seed, t.kind, () if t.kind == "drawn" else t.hidden, t.size): t for t in recorded(arguments.output)}
     trials = []
     for seed, kind, names, size in planned:
         trial = done.get(_key(seed, kind, names, size))
@@ -292,7 +348,8 @@ def main(argv: list[str] | None = None) -> int:
             trial = run_trial(calibration, seed, kind, names, size)
             state = "ok" if trial.named else "WRONG"
             found = ", ".join(trial.found) or "-"
-            text = f"{seed} {kind} {'+'.join(names)} {size:.0f} N: {state}, {found}, {trial.before:.1f} -> {trial.after:.1f} N"
+            hidden, change = "+".join(trial.hidden), f"{trial.before:.1f} -> {trial.after:.1f} N"
+            text = f"{seed} {kind} {hidden} {size:.0f} N: {state}, {found}, {change}"
             print(text, trial.unexplained or "", file=sys.stderr, flush=True)
             if arguments.output:
                 with arguments.output.open("ab") as file:

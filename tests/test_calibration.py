@@ -394,6 +394,12 @@ def test_setup_lists_the_faults_of_all_files(tmp_path):
     ):
         assert expected in faults
     assert len(caught.value.faults) == 4
+    # A fault of the configuration itself hides none of theirs.
+    text = (tmp_path / "emb.yaml").read_text()
+    (tmp_path / "emb.yaml").write_text(text + "  RR: c.yaml\nlog_level: loud\n")
+    with pytest.raises(InputErrors) as again:
+        Setup(tmp_path / "emb.yaml")
+    assert set(again.value.faults) > set(caught.value.faults) and len(again.value.faults) == 6
 
 
 def test_configuration_faults(tmp_path):

@@ -128,7 +128,7 @@ def test_what_is_no_number_is_no_parameter(key):
         ({"motor.inertia_kg_m2": -1.0}, ["motor.inertia_kg_m2: -1.0 outside"]),
         ({"motor.inertia_kg_m2": math.nan, "contact.clearance_rad": -1.0}, ["motor.inertia", "contact.clearance_rad"]),
         ({"motor.inertia_kg_m2": math.inf}, ["motor.inertia_kg_m2: inf outside"]),
-        ({"effects.signal_delay.delay_s": 1.0}, ["effects.signal_delay.delay_s: 1.0 outside [-0.01, 0.01] s"]),
+        ({"effects.signal_delay.delay_s": 1.0}, ["effects.signal_delay.delay_s: 1.0 outside [-0.05, 0.05] s"]),
         ({"thermal.pad.inner_heat_share": 0.99}, ["their sum exceeds 1"]),
         ({"stiffness.curves[0].coefficients[0]": -1.0}, ["coefficients[0]: -1.0 outside"]),
     ],
@@ -177,6 +177,6 @@ def test_every_key_of_the_file_acts(key):
 def test_what_is_no_number_is_declared():
     """Fields that are neither parameters nor switches of adaptation: identity and documentation."""
     plain = {name.partition(".")[0].partition("[")[0] for name in _KEYS}
-    assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "provenance"}
+    assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "terms", "provenance"}
     assert {field for field in Adaptation.__struct_fields__ if f"adaptation.{field}" not in _KEYS} == {
         "enabled", "samples_per_range", "high_force_N"}  # fmt: skip

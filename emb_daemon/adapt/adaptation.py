@@ -17,10 +17,11 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import compile_fit, fit_training
-from emb_daemon.adapt.learned import CLEARANCE, Evaluation, with_learned
+from emb_daemon.adapt.learned import Evaluation, with_learned
 from emb_daemon.adapt.memory import Entry, Memory, Store, entry_of, with_entry
 from emb_daemon.adapt.snapshots import Snapshots
 from emb_daemon.adapt.training import answer_adapting
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import PARAMETERS, STATE, new_state

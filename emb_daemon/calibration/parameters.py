@@ -21,6 +21,11 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
 
+#: Keys of what more than one part of the program finds.
+TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
+LOAD_FRICTION, OFFSET_FRICTION = "friction.load_m_per_rad", "friction.offset_Nm"
+PRESLIDING_ANGLE, CLEARANCE = "friction.presliding_angle_rad", "contact.clearance_rad"
+
 #: Step of a numerical derivative over the size of what moves: errors of rounding and of curvature are both far below
 #: the residuals of a fit, and few samples cross a switch such as contact or a reversal.
 _STEP = 1e-3
@@ -142,7 +147,7 @@ def keys(calibration: Calibration) -> list[str]:
 
     def walk(value: Any, path: str) -> None:
         if isinstance(value, msgspec.Struct):
-            for name in value.__struct_fields__:
+            for name in (name for name in value.__struct_fields__ if path or name != "provenance"):
                 walk(getattr(value, name), f"{path}.{name}" if path else name)
         elif isinstance(value, tuple):
             for index, item in enumerate(value):
@@ -153,7 +158,7 @@ def keys(calibration: Calibration) -> list[str]:
         elif type(value) is float:
             found.append(path)
 
-    walk(msgspec.structs.replace(calibration, provenance=None), "")
+    walk(calibration, "")
     return found
 
 

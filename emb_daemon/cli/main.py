@@ -15,6 +15,7 @@ COMMANDS = {
     "run": "the daemon: estimates from a CAN bus, broadcast 250 times a second",
     "check": "validate configuration, calibrations and DBC; lists every fault",
     "replay": "the same estimator over logs, as fast as it goes",
+    "convert": "another rig's log as ours, by a mapping file",
     "identify": "calibration from a rig campaign, with its evidence",
     "diagnose": "find what the model lacks, add it, and show the error before and after",
     "simulate": "the simulated car on a bus",

@@ -30,8 +30,10 @@ def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
 
 
 def whole(bench: Bench) -> str:
-    """The path that all others serve."""
-    return "fused" if bench.has_reference else "innovation"
+    """The path that judges: what all others serve, or the only one there is."""
+    if not bench.has_reference:
+        return "innovation"
+    return "fused" if bench.has_current else "stiffness"
 
 
 def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict:

@@ -36,7 +36,7 @@ def confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, Ep
     before, main = errors(bench, bench.calibration), whole(bench)
     while True:
         after = left_out(selection)
-        worse = harm(before, after, {selection.channel_of(suspect) for suspect in selection.suspects})
+        worse = harm(before, after, main, {selection.channel_of(suspect) for suspect in selection.suspects})
         if worse and selection.suspects:
             rest = {suspect: left_out(selection, suspect).rmse(main) for suspect in selection.suspects}
             selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
@@ -86,13 +86,12 @@ def _refitted(selection: Selection, channel: str, without: str, kept: np.ndarray
     }  # fmt: skip
 
 
-def harm(before: EpisodeErrors, after: EpisodeErrors, paths: Iterable[str]) -> str:
-    """What got worse in words, or nothing. ``paths``: those that were meant to get better."""
+def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, paths: Iterable[str]) -> str:
+    """What got worse in words, or nothing. ``paths``: those that were meant to get better beside the ``main`` one."""
     for path in sorted(set(paths) & set(before.paths)):
         first, last = before.rmse(path), after.rmse(path)
         if last >= first:
             return f"the estimator's {path} error goes from {first:.4g} to {last:.4g} N"
-    main = "fused" if "fused" in before.paths else before.paths[0]
     first, last = before.rmse(main), after.rmse(main)
     return f"the {main} error goes from {first:.4g} to {last:.4g} N" if last > _HARM * first else ""
 
@@ -122,7 +121,7 @@ def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
         return worst, f"withdrawn: on the validation logs it adds {-gains[worst]:.3g} {UNITS[channel]} RMS to what it explains"
     bench, main = selection.model.bench, whole(judges)
     before = errors(judges, bench.calibration)
-    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), set())
+    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, set())
     if not worse or not gains:
         return None
     rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in gains}

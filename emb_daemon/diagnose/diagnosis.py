@@ -12,20 +12,23 @@ import msgspec
 import numpy as np
 
 from emb_daemon import __version__
+from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.parameters import parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirmed, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
+from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Candidate
-from emb_daemon.diagnose.selection import Progress, Selection, select
+from emb_daemon.diagnose.search import select
+from emb_daemon.diagnose.selection import Progress, Selection
 from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, dependences
-from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
 from emb_daemon.identify.steps.noise import force_error_levels, integral_time
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
@@ -99,6 +102,13 @@ class Diagnosis:
     def whole(self) -> str:
         return whole(self.judges)
 
+    @property
+    def stiffness_scale(self) -> float:
+        """Force of the mounted pads' curve over that of the calibration, where that is half of the largest."""
+        before, after = (curve_at(c.stiffness.curves, c.pad_thickness_mm) for c in (self.original, self.calibration))
+        travel = travel_at(0.5 * self.original.stiffness.maximum_force_N, before)
+        return float(characteristic_curve(travel, after)[0] / characteristic_curve(travel, before)[0])
+
     def figures(self) -> dict:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
@@ -130,7 +140,9 @@ def diagnose(
     progress("confirming with the running estimator", 0.8)
     selection, left_out = confirmed(selection, judges)
     applied = selection.applied()
-    augmented = _with_noise(bench.calibrated(applied), selection) if applied else calibration
+    augmented = (
+        _with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
+    )
     progress("judging", 0.9)
     judging = judges or bench
     before = errors(judging, calibration)
@@ -171,8 +183,9 @@ def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:
 
 
 def findings(selection: Selection) -> tuple[Candidate, ...]:
-    """What became of every effect, with values as they are applied; accepted ones first, each group by share explained."""
-    described = [_described(selection, selection.candidates[effect.name]) for effect in REGISTRY]
+    """What became of every effect and term, with values as they are applied; accepted ones first, each group by share
+    explained."""
+    described = [_described(selection, candidate) for candidate in selection.candidates.values()]
     return tuple(sorted(described, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained)))
 
 
@@ -183,7 +196,7 @@ def _described(selection: Selection, candidate: Candidate) -> Candidate:
         return candidate
     on = model.bench.calibration.effects.get(effect.name, {})
     applied = by_key({c: model.values[c] for c in own}, model.bench.middle)
-    values = {p.name: applied.get(f"effects.{effect.name}.{p.name}", on.get(p.name, 0.0)) for p in effect.parameters}
+    values = {p.name: on.get(p.name, 0.0) for p in effect.parameters} | {c.parameter: applied[c.name] for c in own}
     if not candidate.accepted and own[0].channel not in selection.touched:
         values = dict(on)
     sigmas = dict.fromkeys(values, 0.0) | _sigmas(model, effect, own)
@@ -197,7 +210,12 @@ def _described(selection: Selection, candidate: Candidate) -> Candidate:
         for r in (selection.screening.initial, model.residual, without.residual)
     )
     share = float(np.clip((bare - last) / first, 0.0, 1.0)) if first > 0.0 else 0.0
-    return replace(described, share_explained=share, reason=_why(candidate) + _tradeoffs(model, effect, own))
+    does = without.residual[candidate.channel] - model.residual[candidate.channel]
+    described = replace(described, share_explained=share, contribution=does)
+    if candidate.made:
+        [term] = (term for term in model.bench.calibrated(model.values).terms if term.name == effect.name)
+        return replace(described, effect=replace(effect, equation=equation(term)))
+    return replace(described, reason=_why(candidate) + _tradeoffs(model, effect, own))
 
 
 def _why(candidate: Candidate) -> str:
@@ -317,6 +335,21 @@ def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
     return msgspec.structs.replace(calibration, noise=levels)
 
 
+def _with_terms(calibration: Calibration, selection: Selection) -> Calibration:
+    """The calibration with the terms that are in use, each with its standard deviation and where it comes from."""
+    model, kept = selection.model, []
+    for term in calibration.terms:
+        if term.name not in selection.candidates:
+            kept.append(term)
+        elif selection.candidates[term.name].accepted:
+            own = [c for c in model.of_effect(term.name) if c.parameter in ("coefficient", "sine")]
+            sigma = float(np.max([model.fits[c.channel].sigmas.get(c, 0.0) for c in own]))
+            logs = ", ".join(trial.log.path.name for trial in model.bench.trials)
+            found = f"{datetime.now(UTC).date().isoformat()} in {logs}"
+            kept.append(msgspec.structs.replace(term, sigma=sigma if np.isfinite(sigma) else 0.0, provenance=found))
+    return msgspec.structs.replace(calibration, terms=tuple(kept))
+
+
 def _with_provenance(
     calibration: Calibration, selection: Selection, after: EpisodeErrors, validated: bool, logs: Sequence[Log]
 ) -> Calibration:
@@ -325,7 +358,7 @@ def _with_provenance(
     for c in selection.applied():
         sigma = selection.model.fits[c.channel].sigmas.get(c, np.inf)
         weight = next((abs(move.weight) for move in c.moves if move.key == c.name), 0.0)
-        if weight and np.isfinite(sigma):
+        if weight and np.isfinite(sigma) and not c.name.startswith("terms["):
             sigmas[c.name] = float(sigma * weight)
     judged_on = "validate" if validated else "left_out_episodes"
     figures |= {f"diagnose.{judged_on}.{path}_rmse_N": after.rmse(path) for path in after.paths}

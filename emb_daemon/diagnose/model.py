@@ -184,5 +184,7 @@ _SHAPES = {f"effects.{effect.name}.{parameter.name}" for effect in REGISTRY for 
 
 
 def is_shape(coordinate: Coordinate) -> bool:
-    """Whether a coordinate shapes an effect without switching it on."""
+    """Whether a coordinate shapes an effect, or a term, without switching it on."""
+    if coordinate.name.startswith("terms["):
+        return coordinate.parameter not in ("coefficient", "sine")
     return coordinate.name in _SHAPES

@@ -97,12 +97,12 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
         title(finding).capitalize(), f"{finding.effect.equation}, with {size(finding)}. {finding.reason}."
     )
     channel = finding.channel
-    signal = diagnosis.signals.get(finding.effect.signal)
+    signal = finding.over if finding.made else diagnosis.signals.get(finding.effect.signal)
     if channel not in FORCE_CHANNELS or signal is None:
         return
-    applied = diagnosis.signals["clamp_force"] > 150.0
+    applied = (diagnosis.signals["clamp_force"] > 150.0) & np.isfinite(signal)
     if channel != "stiffness" or not applied.any():
-        applied = np.ones(len(signal), bool)
+        applied = np.isfinite(signal)
     unit = UNITS[channel]
     traces = []
     for residual, name, style in (
@@ -110,6 +110,7 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
         (diagnosis.residual[channel], "after", MODEL),
     ):
         traces.append(Trace(name, *_binned(signal[applied], residual[applied]), style))
+    traces.append(Trace("what it does", *_binned(signal[applied], finding.contribution[applied]), MARKS))
     panels = [Panel(f"mean residual of the {NAMES[channel]}", unit, traces)]
     section.figure(xy_figure(panels, finding.effect.signal.replace("_", " ")), "Mean residual in bins of equal counts.")
     for text, share in finding.placebos.items():

@@ -26,6 +26,7 @@ def report(diagnosis: Diagnosis) -> dict:
         "reference": "clamp_force" if diagnosis.bench.has_reference else "innovation",
         "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],
         "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
+        "stiffness_scale": diagnosis.stiffness_scale,
         "noise": {
             name: {"before": getattr(diagnosis.original.noise, name), "after": getattr(diagnosis.calibration.noise, name)}
             for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
@@ -99,6 +100,12 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
         "reason": finding.reason,
         "in_calibration": finding.in_calibration,
     }
+    if finding.made:
+        entry |= {"made": True, "port": effect.hook, "signals": [effect.signal]}
+        terms = {term.name: term for term in diagnosis.calibration.terms}
+        if effect.name in terms:
+            term = terms[effect.name]
+            entry |= {"shape": term.shape, "memory": term.memory, "gate": term.gate, "range": [term.low, term.high]}
     if finding.placebos:
         entry |= {"placebo_share": max(finding.placebos.values()), "placebos": dict(finding.placebos)}
     if finding.confounded_with:

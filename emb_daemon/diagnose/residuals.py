@@ -16,6 +16,7 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Values, by_key
 from emb_daemon.diagnose.episodes import episodes
+from emb_daemon.diagnose.held_heat import record_heat, run_held
 from emb_daemon.errors import InputError
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_step
@@ -179,8 +180,14 @@ class Bench:
         return {channel: np.concatenate([part[channel] for part in parts]) for channel in self.channels}
 
     def _residual(self, trial: Trial, values: Values) -> dict[str, np.ndarray]:
+        return self._compared(trial, run_step(trial.log.samples, self._parameters(trial, values)))
+
+    def _parameters(self, trial: Trial, values: Values) -> np.void:
+        return held(to_parameters(self.calibrated(values, trial.index)))[0]
+
+    def _compared(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
+        """Residuals of a run (TRACE rows)."""
         samples, force = trial.log.samples, trial.force_N
-        trace = run_step(samples, held(to_parameters(self.calibrated(values, trial.index))))
         judged = force if self.has_reference else trace["force"]
         mean = judged.copy()
         mean[1:] = 0.5 * (judged[1:] + judged[:-1])
@@ -202,17 +209,33 @@ class Bench:
         return result
 
     def regressors(self, values: Values, probes: Sequence["Probe"], at: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """How the probed coordinates' own channels answer: minus the derivative of the residual."""
+        """How the probed coordinates' own channels answer: minus the derivative of the residual.
+
+        Pads and disc stay as warm as they are at ``values`` while a coordinate of a force path moves: what a hundredth of the
+        force does to its own heat is a hundredth of a hundredth of it."""
+        heat: list = []
+        if any(probe.coordinate.channel in FORCE_CHANNELS for probe in probes):
+            heat = list(self._pool.map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
 
         def answer(probe: Probe) -> np.ndarray:
             coordinate, tried = probe.coordinate, {**values, **dict(probe.shape)}
             now = tried.get(coordinate, coordinate.start)
             step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
             tried[coordinate] = now + step
-            residual = self._joined([self._residual(trial, tried) for trial in self.trials])[coordinate.channel]
-            return (at[coordinate.channel] - residual) / step
+            return (at[coordinate.channel] - self._probed(tried, coordinate.channel, heat)) / step
 
         return list(self._pool.map(answer, probes))
+
+    def _probed(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
+        """One channel's residual, a force path's with heat held."""
+        parts = []
+        for trial, known in zip(self.trials, heat or [None] * len(self.trials), strict=True):
+            if channel in FORCE_CHANNELS and known is not None:
+                trace = run_held(trial.log.samples, self._parameters(trial, values), known)
+                parts.append(self._compared(trial, trace)[channel])
+            else:
+                parts.append(self._residual(trial, values)[channel])
+        return np.concatenate(parts)
 
 
 @dataclass(frozen=True)

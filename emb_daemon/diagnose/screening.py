@@ -56,6 +56,8 @@ class Candidate:
         placebos: share of the gain that it reaches with what it rests on disturbed, by what is disturbed.
         reason: why it is not accepted, or what it rests on.
         values, sigmas: by parameter; before: as calibrated, for an effect that was.
+        contribution: what it takes from the channel's residual, at every sample.
+        over: its signal at every sample, for a term.
     """
 
     effect: Effect
@@ -77,6 +79,13 @@ class Candidate:
     before: Mapping[str, float] = field(default_factory=dict)
     confounded_with: str | None = None
     manoeuvre: str | None = None
+    contribution: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    over: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+
+    @property
+    def made(self) -> bool:
+        """Whether it is a term that no catalogue holds."""
+        return self.effect.name.startswith("term:")
 
 
 class Screening:

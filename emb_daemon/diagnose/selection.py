@@ -1,9 +1,8 @@
 """Selection: which effects of the catalogue do these logs prove?
 
-Stepwise: the base calibration is refitted, then every candidate is screened against what that leaves (`screening`). The best
-one of each channel is added and everything is refitted through the estimator, until none is left. Then each accepted effect
-is tested once more in the presence of the others. Stepwise selection alone would be greedy where two effects only work
-together (a slow branch without slip gains nothing), so effects that lost are tried again each round.
+The steps of a search (`search`): every candidate is screened against what the model leaves (`screening`), the best one of each
+channel is added and everything is refitted through the estimator; in the end each accepted effect is tested once more in the
+presence of the others.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -14,9 +13,9 @@ import numpy as np
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
 from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.model import Model, is_shape
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
-from emb_daemon.diagnose.unexplained import Dependence, dependences
+from emb_daemon.diagnose.unexplained import Dependence
 from emb_daemon.effects import REGISTRY
 
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
@@ -24,8 +23,8 @@ _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
 #: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
-#: before it is judged.
-_UNSURE, _LARGE = 0.05, 0.25
+#: before it is judged. Chance of a term, whose significance is judged over the whole grammar, on its own.
+UNSURE, _LARGE = 0.05, 0.25
 
 Progress = Callable[[str, float], None]
 
@@ -117,30 +116,7 @@ class Selection:
         return result
 
 
-def select(bench: Bench, progress: Progress) -> Selection:
-    """Recalibrate, accept effects until none is proven any more, and revise. ``progress``: what is being done, share done."""
-    progress("recalibrating", 0.1)
-    start = Model.of(bench)
-    model = start.refined(bench.channels)
-    screening = Screening(bench, start)
-    at_first = {
-        channel: dependences(channel, screening.dependence(model, channel), model.counted(channel), 0.0)
-        for channel in bench.channels
-        if channel in FORCE_CHANNELS
-    }
-    selection = Selection(model, screening, at_first=at_first)
-    selection = replace(selection, recalibrated=_recalibrated(selection, start))
-    for number in range(len(REGISTRY)):
-        progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
-        before = selection.accepted
-        selection = _round(selection)
-        if selection.accepted == before:
-            break
-    progress("refitting what is applied", 0.75)
-    return _changes(_revised(_settled_heat(selection)))
-
-
-def _settled_heat(selection: Selection) -> Selection:
+def settled_heat(selection: Selection) -> Selection:
     """Heat that is not applied goes back to the calibration, and what is applied is fitted to that.
 
     While searching, a friction or a heat capacity that is a little off must not pass for an effect; but growth and softening
@@ -151,7 +127,7 @@ def _settled_heat(selection: Selection) -> Selection:
     return replace(selection, model=model.entered(start, chosen=idle).refined(selection.touched))
 
 
-def _recalibrated(selection: Selection, start: Model) -> dict[str, float]:
+def recalibrated(selection: Selection, start: Model) -> dict[str, float]:
     """Channels in which refitting the base parameters gains on left-out episodes what matters."""
     model, result = selection.model, {}
     for channel in model.bench.channels:
@@ -167,7 +143,7 @@ def _recalibrated(selection: Selection, start: Model) -> dict[str, float]:
     return result
 
 
-def _round(selection: Selection) -> Selection:
+def one_round(selection: Selection) -> Selection:
     """One round: screen what is left, and accept the best of each channel, if any."""
     model, screening = selection.model, selection.screening
     gone = {*selection.accepted, *selection.dropped}
@@ -232,7 +208,7 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
         c
         for c in tested
         if c.channel in FORCE_CHANNELS
-        and c.p_value < _UNSURE
+        and c.p_value < UNSURE
         and c.q_value > Q_VALUE
         and c.gain**2 > _LARGE * model.noise(c.channel)
     ]
@@ -255,7 +231,7 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
     return entered.noted([sure])
 
 
-def _revised(selection: Selection) -> Selection:
+def revised(selection: Selection) -> Selection:
     """Each accepted effect tested once more with all others in place; what, or which order, no longer holds goes."""
     for name in selection.accepted:
         model, candidate = selection.model, selection.candidates[name]
@@ -263,7 +239,7 @@ def _revised(selection: Selection) -> Selection:
         gone = []
         for group in groups(candidate.effect, amplitudes):
             evidence = model.evidence_against(dict.fromkeys(group, 0.0))
-            if evidence.p_value > Q_VALUE or evidence.gain <= 0.0:
+            if evidence.p_value > (UNSURE if candidate.made else Q_VALUE) or evidence.gain <= 0.0:
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
@@ -272,7 +248,7 @@ def _revised(selection: Selection) -> Selection:
     return selection
 
 
-def _changes(selection: Selection) -> Selection:
+def changes(selection: Selection) -> Selection:
     """With what became of the effects that the calibration has already: one that is not as calibrated counts as found."""
     model, found = selection.model, []
     for effect in REGISTRY:

@@ -5,10 +5,20 @@ from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 
+#: Where a term acts, for people.
+_PORTS = {
+    "thickness": "the contact", "motor_angle": "the motor angle", "stiffness": "the stiffness", "force": "the clamp force",
+    "torque_constant": "the torque constant", "torque": "the motor torque", "gear_gain": "the gear's transmission",
+    "gear_friction": "the gear's friction", "pad_friction": "the pads' friction",
+}  # fmt: skip
+#: Base parameters that the verdict names.
+_TOLD = 3
+#: Change of the curve's force from which other pads are a better guess than wear of these: units scatter by less.
+_OTHER_PADS = 0.1
 #: Units at the end of parameters' keys, longest first.
 _UNIT_ENDINGS = (
-    "_um_per_MJ", "_um_per_K", "_Nms_per_rad", "_rad_per_s", "_per_turn", "_per_K", "_rad", "_um", "_Nm", "_m2", "_A", "_C",
-    "_s",
+    "_um_per_MJ", "_um_per_K", "_Nms_per_rad", "_Nm_per_A", "_m_per_rad", "_rad_per_s", "_per_turn", "_per_A2", "_kg_m2",
+    "_per_K", "_rad", "_um", "_Nm", "_m2", "_A", "_C", "_s",
 )  # fmt: skip
 NAMES = {
     "stiffness": "stiffness path",
@@ -27,6 +37,8 @@ def number(value: float, sigma: float = 0.0) -> str:
 
 
 def title(finding: Candidate) -> str:
+    if finding.made:
+        return f"a term of {finding.effect.signal.replace('_', ' ')} at {_PORTS.get(finding.effect.hook, finding.effect.hook)}"
     return finding.effect.name.replace("_", " ")
 
 
@@ -65,7 +77,7 @@ def verdict(diagnosis: Diagnosis) -> str:
     change = f"error {before:.1f} N → {after:.1f} N {where}"
     if not diagnosis.bench.has_current:
         change += "; no motor current was recorded, so the stiffness path alone was diagnosed"
-    found = [f"{title(f)} ({size(f)})" for f in diagnosis.accepted if not f.in_calibration]
+    found = [f"{title(f)} ({f.effect.equation if f.made else size(f)})" for f in diagnosis.accepted if not f.in_calibration]
     changed = [f"{title(f)} ({size(f)})" for f in diagnosis.accepted if f.in_calibration]
     sentences = [f"Found: {' and '.join(found)}"] if found else []
     if changed:
@@ -74,7 +86,26 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    return " ".join([text, *_unexplained(diagnosis)])
+    return " ".join([text, *_recalibration(diagnosis), *_unexplained(diagnosis)])
+
+
+def _recalibration(diagnosis: Diagnosis) -> list[str]:
+    """Base parameters that were off, before → after, the most telling first; the curve as a whole."""
+    curve = [r for key, r in diagnosis.recalibrated.items() if key.startswith("stiffness.curves")]
+    parts = []
+    if curve:
+        change = diagnosis.stiffness_scale - 1.0
+        guess = ": other pads?" if abs(change) > _OTHER_PADS else ""
+        parts.append((max(r.gain for r in curve), f"stiffness scale {100.0 * change:+.1f} %{guess}"))
+    for key, r in diagnosis.recalibrated.items():
+        if UNITS[r.channel] == "N" and not key.startswith("stiffness.curves"):
+            parts.append(
+                (r.gain, f"{_spoken(key.rpartition('.')[2])} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}")
+            )
+    if not parts:
+        return []
+    told = [f"{text.strip()} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]
+    return [f"Recalibrated: {', '.join(told)}."]
 
 
 def _unexplained(diagnosis: Diagnosis) -> list[str]:

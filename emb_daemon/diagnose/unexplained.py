@@ -79,7 +79,7 @@ class Left:
     @property
     def beyond(self) -> bool:
         """Whether the residual is clearly above what the calibration achieved."""
-        return self.rms > _CLEARLY * self.achieved
+        return is_beyond(self.rms, self.achieved)
 
     @property
     def present(self) -> bool:
@@ -88,6 +88,11 @@ class Left:
     @property
     def strongest(self) -> Dependence | None:
         return next(iter([*(d for d in self.dependences if d.matters), *self.dependences]), None)
+
+
+def is_beyond(rms: float, known: float) -> bool:
+    """Whether a residual is clearly above what the calibration achieved; not where it does not say."""
+    return rms > _CLEARLY * known
 
 
 def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
@@ -113,7 +118,7 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
     total = 0.0
     for path in paths:
         stated = [value for name, value in figures.items() if name.endswith(f"{path} rmse_N")]
-        total += max([*stated, float(np.sqrt(np.mean(own[path] ** 2)))]) ** 2
+        total += max([*stated, rmse(own[path])]) ** 2
     if channel == "temperature":
         stated = [value for name, value in figures.items() if name.endswith(" K") and "thesis" not in name]
         heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0

@@ -8,6 +8,7 @@ from importlib import import_module
 
 import numpy as np
 
+from emb_daemon.effects import terms
 from emb_daemon.effects.base import Effect
 
 #: Simpler causes first: of two that a log cannot tell apart, diagnose takes the one that stands first. Also the order in
@@ -17,6 +18,7 @@ _NAMES = (
     "disc_thermal_expansion",
     "pad_wear",
     "torque_constant_fade",
+    "motor_heat_fade",
     "current_offset",
     "viscous_friction",
     "stribeck_friction",
@@ -36,10 +38,11 @@ REGISTRY: tuple[Effect, ...] = tuple(import_module(f"{__name__}.{name}").EFFECT 
 
 
 def parameter_record(effects: tuple[Effect, ...]) -> np.dtype:
-    """Parameters of all effects, by name."""
-    return np.dtype([(effect.name, effect.parameter_record) for effect in effects], align=True)
+    """Parameters of all effects, by name, and of the terms that no catalogue holds."""
+    return np.dtype([*((effect.name, effect.parameter_record) for effect in effects), ("terms", terms.PARAMETERS)], align=True)
 
 
 def state_record(effects: tuple[Effect, ...]) -> np.dtype:
-    """States of all effects that have one, by name."""
-    return np.dtype([(effect.name, effect.state) for effect in effects if effect.state is not None], align=True)
+    """States of all effects that have one, by name, and of the terms."""
+    own = [(effect.name, effect.state) for effect in effects if effect.state is not None]
+    return np.dtype([*own, ("terms", terms.STATE)], align=True)

@@ -6,12 +6,13 @@ order of the registry, which compiled code then calls directly. numba keeps it o
 """
 
 from emb_daemon import effects
+from emb_daemon.effects import terms
 from emb_daemon.effects.base import HOOKS, Hook
 from emb_daemon.jit import njit
 
 
 def _source(name: str, hook: Hook) -> str:
-    """The hook as Python: the quantity it starts from, plus the term of each effect."""
+    """The hook as Python: the quantity it starts from, plus the term of each effect, plus what `terms.look` found."""
     value = "value, " if hook.start is None else ""
     lines = [f"def {name}({value}e, s, {', '.join(hook.arguments)}):"]
     if hook.start is not None:
@@ -20,6 +21,8 @@ def _source(name: str, hook: Hook) -> str:
         if effect.hook == name:
             own = {"p": f"e.{effect.name}", "s": f"s.{effect.name}"}
             lines.append(f"    value += {effect.name}({', '.join(own.get(a, a) for a in effect.arguments)})")
+    if name in terms.PORTS:
+        lines.append(f"    value += s.terms.added[{terms.PORTS.index(name)}]")
     return "\n".join([*lines, "    return value"])
 
 
@@ -30,6 +33,7 @@ def _compose(name: str):
     return njit(scope[name])
 
 
+look = terms.look
 thickness = _compose("thickness")
 motor_angle = _compose("motor_angle")
 stiffness = _compose("stiffness")

@@ -24,7 +24,7 @@ EFFECT = Effect(
     hook="force",
     term=term,
     parameters=(
-        Parameter("share", "1", -0.5, 0.5, 0.1, "share of the static force that follows slowly", drawn=(0.0, 0.5)),
+        Parameter("share", "1", 0.0, 0.5, 0.1, "share of the static force that follows slowly", drawn=(0.0, 0.5)),
         Parameter("time_constant_s", "s", 0.05, 60.0, 0.5, "its time constant", (0.3, 1.5, 8.0), drawn=(0.2, 5.0)),
     ),
     equation="F_r = w (v − F_s),  τ₂ dv/dt + v = F_s",

@@ -14,8 +14,8 @@ EFFECT = Effect(
     name="signal_delay",
     hook="motor_angle",
     term=term,
-    # A delay is undone to first order, which one longer than a cycle and a half outgrows.
-    parameters=(Parameter("delay_s", "s", -0.01, 0.01, 0.001, "age of the angle", drawn=(0.0, 0.006)),),
+    # Undone to first order: fifty milliseconds of a slow stroke, a cycle and a half of a fast one.
+    parameters=(Parameter("delay_s", "s", -0.05, 0.05, 0.001, "age of the angle", drawn=(0.0, 0.006)),),
     equation="θ → θ + d ω",
     source="first-order hold of a delayed sample",
     signal="motor_speed",

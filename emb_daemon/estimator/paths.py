@@ -28,6 +28,7 @@ _DOUBTFUL_RAD = 0.05
 def position(s, p, m):
     """Motor angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
+    effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
     return m.angle + effects.motor_angle(e, state, m, m.dt) + gained / p.gear_gain + grown - s.contact_angle
@@ -66,6 +67,15 @@ def rest(s, p, x, factor):
     """Bring the stiffness path to where it settles ``x`` rad past contact."""
     s.past_contact = x
     _deform(s, p, x, _LONG_S, factor)
+
+
+@njit
+def settle_paths(s, p, m, factor):
+    """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
+    s.started = True
+    s.angle, s.slid_angle, s.speed = m.angle, m.angle, m.speed
+    s.friction_state, s.friction_variance = 0.0, 1.0
+    rest(s, p, position(s, p, m), factor)
 
 
 @njit

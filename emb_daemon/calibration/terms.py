@@ -1,0 +1,104 @@
+"""Terms of a calibration that no catalogue holds: data, checked here, evaluated by `effects.terms`."""
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from emb_daemon.effects.base import HOOKS
+from emb_daemon.effects.terms import GATES, MEMORIES, MOST, PORTS, SHAPES, SIGNALS
+from emb_daemon.errors import InvalidValue
+
+Positive = Annotated[float, Meta(gt=0.0)]
+
+#: Most that a term may do at a port: what would leave nothing of the quantity that it changes. Angles and thickness: a
+#: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Force: as `Calibration` says of the largest.
+_MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf}
+_FACTOR = 0.9
+
+
+class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
+    """Coefficient × shape(memory(signal)) × gate, added at one port of the physics. u = (z − centre)/scale, where z is the
+    signal through its memory."""
+
+    #: Begins with ``term:``.
+    name: Annotated[str, Meta(pattern="^term:.+")]
+    #: Where it adds; the coefficient is in the port's unit (`effects.base.HOOKS`).
+    port: Literal[PORTS]
+    #: What it is a function of.
+    signal: Literal[tuple(SIGNALS)]
+    #: none; lag: z follows the signal with the time constant memory_scale, s; deficit: what of that is still to come; slip: a
+    #: Maxwell slip element of stretch memory_scale, in the signal's unit.
+    memory: Literal[MEMORIES] = "none"
+    #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
+    #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).
+    shape: Literal[SHAPES]
+    #: When it acts: always, closing, opening, turning, standing; load: in proportion to the clamp force over the largest.
+    gate: Literal[GATES] = "always"
+    #: In the port's unit.
+    coefficient: float
+    #: Second coefficient of a harmonic.
+    sine: float = 0.0
+    #: Standard deviation of the coefficient.
+    sigma: Annotated[float, Meta(ge=0.0)] = 0.0
+    #: In the signal's unit.
+    scale: Positive = 1.0
+    #: In the signal's unit.
+    centre: float = 0.0
+    #: Of a power.
+    exponent: Annotated[float, Meta(gt=0.0, le=4.0)] = 1.0
+    #: In s, or for a slip element in the signal's unit.
+    memory_scale: Positive = 1.0
+    #: Signal from which to which the term was found; outside it stays what it is at the edge, and sigma grows.
+    low: float
+    #: End of that range.
+    high: float
+    #: Date and logs.
+    provenance: str = ""
+
+    def __post_init__(self):
+        if not self.low < self.high:
+            raise InvalidValue("high: expected more than low")
+        if self.sine and self.shape != "harmonic":
+            raise InvalidValue("sine: only a harmonic has one")
+        most = _MOST_AT.get(self.port, _FACTOR)
+        if self.largest > most:
+            raise InvalidValue(f"coefficient: the term reaches {self.largest:.3g} {self.unit}, expected {most:g} at most")
+
+    @property
+    def unit(self) -> str:
+        """Of the coefficient."""
+        return HOOKS[self.port].unit
+
+    @property
+    def largest(self) -> float:
+        """Bound of what it adds inside its range, in the port's unit."""
+        ends = [self.low, self.high]
+        if self.memory == "slip":
+            ends = [-1.0, 1.0]
+        elif self.memory == "deficit":
+            ends = [self.low - self.high, self.high - self.low]
+        reach = max(abs(end - self.centre) for end in ends) / self.scale
+        grows = {"odd_power": reach**self.exponent, "even_power": reach**self.exponent, "onset": reach}
+        return float(np.hypot(self.coefficient, self.sine) * grows.get(self.shape, 1.0))
+
+
+def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
+    """Write terms into an `effects.terms.PARAMETERS` record."""
+    record["count"] = len(terms)
+    for row, term in zip(record["term"][: len(terms)], terms, strict=True):
+        row["port"], row["signal"] = PORTS.index(term.port), list(SIGNALS).index(term.signal)
+        row["memory"], row["shape"] = MEMORIES.index(term.memory), SHAPES.index(term.shape)
+        row["gate"] = GATES.index(term.gate)
+        for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
+            row[name] = getattr(term, name)
+
+
+def faults_of(terms: tuple[Term, ...]) -> list[str]:
+    """What is wrong with all of them together."""
+    names = [term.name for term in terms]
+    faults = [f"terms: {name} occurs twice" for name in sorted(set(names)) if names.count(name) > 1]
+    if len(terms) > MOST:
+        faults.append(f"terms: {len(terms)}, expected {MOST} at most")
+    return faults

@@ -1,0 +1,234 @@
+"""The grammar: every term that is looked for where no effect of the catalogue explains the rest, enumerated and typed.
+
+What may act where is physics, not taste: elastic ports follow states and work done, never the sign of motion alone, so that no
+term is a source of energy; friction is a factor on friction, which always opposes motion, or a torque odd in motor speed;
+lags are stable by construction. Sizes are shares of what the signals cover in these logs.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.calibration.terms import Term
+from emb_daemon.effects.base import HOOKS, Effect, Parameter
+from emb_daemon.effects.terms import PORTS, SIGNALS
+
+#: Temperature (degC) at which a term that follows one is nothing.
+_COLD_C = 20.0
+_TEMPERATURES = ("pad_temperature", "disc_temperature", "caliper_temperature")
+_SLOW = (*_TEMPERATURES, "disc_speed", "brake_torque", "energy", "time_clamped", "time_since_last_clamp")
+#: Signals by port: states at elastic ports, speeds where something slides.
+_TYPED: dict[str, tuple[str, ...]] = {
+    "thickness": (*_SLOW, "clamp_force"),
+    "motor_angle": ("motor_angle", "current"),
+    "stiffness": (*_SLOW, "travel", "clamp_force"),
+    "force": ("clamp_force",),
+    "torque_constant": ("current", "winding_heat", "housing_heat", *_TEMPERATURES),
+    "torque": ("motor_speed", "motor_angle"),
+    "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
+    "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", "winding_heat", "housing_heat", *_SLOW),
+}
+#: Ports at which there are forms.
+FORMED = tuple(_TYPED)
+_GATES: dict[str, tuple[str, ...]] = {
+    "thickness": ("always", "turning"),
+    "stiffness": ("always", "load", "turning"),
+    "torque": ("always", "load", "closing", "opening"),
+    "gear_friction": ("always", "load", "closing", "opening"),
+}
+#: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
+_EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
+_SMOOTHED_S = 0.05
+_CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
+#: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
+_WIDER, _SHAPE = 8.0, 0.5
+#: A small coefficient by port, in its unit; of a factor a thousandth.
+_STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4}
+
+
+@dataclass(frozen=True)
+class Form:
+    """Structure of a term, with its sizes as tried."""
+
+    port: str
+    signal: str
+    memory: str
+    shape: str
+    gate: str
+    scale: float
+    centre: float
+    exponent: float
+    memory_scale: float
+    low: float
+    high: float
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """Sizes that are fitted beside the coefficients."""
+        own = {
+            "odd_power": ("exponent",), "even_power": ("exponent",), "saturation": ("scale",), "decay": ("scale",),
+            "onset": ("centre",), "harmonic": ("scale",), "bump": ("centre", "scale"),
+        }.get(self.shape, ())  # fmt: skip
+        if self.memory == "none":
+            return own
+        return ("memory_scale",) if self.shape == "odd_power" else (*own, "memory_scale")
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers it takes to state it: coefficients, sizes, one for a gate, and where a count began: no brake's
+        physics starts at zero with the power."""
+        counted = self.signal in ("energy", "time_since_last_clamp")
+        return 1 + (self.shape == "harmonic") + len(self.fitted) + (self.gate != "always") + counted
+
+    @property
+    def step(self) -> float:
+        """A small coefficient, in the port's unit."""
+        return _STEPS.get(self.port, 1e-3)
+
+    def term(self, name: str = "term:tried", coefficient: float = 0.0, sine: float = 0.0) -> Term:
+        sizes = {key: getattr(self, key) for key in ("scale", "centre", "exponent", "memory_scale", "low", "high")}
+        return Term(
+            name=name, port=self.port, signal=self.signal, memory=self.memory, shape=self.shape, gate=self.gate,
+            coefficient=coefficient, sine=sine, **sizes,
+        )  # fmt: skip
+
+    def bounds(self, size: str) -> tuple[float, float, float]:
+        """(low, high, standard deviation) of a fitted size."""
+        tried = getattr(self, size)
+        if size == "centre":
+            return self.low, self.high, 0.25 * (self.high - self.low)
+        if size == "exponent":
+            return 0.25, 4.0, _SHAPE
+        if self.shape == "harmonic" and size == "scale":
+            return 0.8 * tried, 1.25 * tried, 0.02 * tried
+        return tried / _WIDER, tried * _WIDER, _SHAPE * tried
+
+
+def enumerate_forms(covered: Mapping[str, tuple[float, float]], ports: tuple[str, ...]) -> list[Form]:
+    """All terms at some ports but harmonics, whose orders are scanned. ``covered``: range of each signal that varies."""
+    found = []
+    for port in ports:
+        for signal in _TYPED.get(port, ()):
+            if signal not in covered:
+                continue
+            low, high = covered[signal]
+            for gate in _GATES.get(port, ("always",)):
+                for memory, shape, scale, centre, exponent, memory_scale in _shapes(port, signal, low, high):
+                    found.append(Form(port, signal, memory, shape, gate, scale, centre, exponent, memory_scale, low, high))
+    return found
+
+
+def harmonic(port: str, order: float, centre: float, covered: Mapping[str, tuple[float, float]]) -> Form:
+    """A ripple over the motor angle."""
+    low, high = covered["motor_angle"]
+    return Form(port, "motor_angle", "none", "harmonic", "always", 1.0 / order, centre, 1.0, 1.0, low, high)
+
+
+def rippling(ports: tuple[str, ...]) -> tuple[str, ...]:
+    """Ports that may ripple over the motor angle."""
+    return tuple(port for port in ports if "motor_angle" in _TYPED.get(port, ()))
+
+
+_Shape = tuple[str, str, float, float, float, float]
+
+
+def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]:
+    """(memory, shape, scale, centre, exponent, memory scale) of what a signal may do at a port."""
+    width, reach = high - low, max(abs(low), abs(high))
+    if signal == "motor_angle" or signal == "travel":
+        for place in np.linspace(low, high, _BUMPS)[1:-1]:
+            for share in (0.03, 0.1):
+                yield "none", "bump", share * width, float(place), 1.0, 1.0
+        return
+    if port == "torque_constant" and signal == "current":
+        # The residual of the torque path is itself current: without its noise, or it would be its own shadow.
+        for exponent in _EXPONENTS:
+            yield "lag", "even_power", reach, 0.0, exponent, _SMOOTHED_S
+        return
+    if port == "force":
+        for time in _CREEP_S:
+            yield "deficit", "odd_power", reach, 0.0, 1.0, time
+        return
+    if signal == "clamp_force" and port in ("thickness", "stiffness"):
+        # A curve is the calibration's own; what depends on the way there is not.
+        for share in _SLIPS:
+            yield "slip", "odd_power", 1.0, 0.0, 1.0, share * width
+        for time in _CREEP_S:
+            yield "lag", "odd_power", reach, 0.0, 1.0, time
+        return
+    centre = _COLD_C if signal in _TEMPERATURES else 0.0
+    signed = low < 0.0 and signal not in _TEMPERATURES
+    even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
+    for exponent in _EXPONENTS:
+        yield "none", "even_power" if even else "odd_power", max(abs(low - centre), abs(high - centre)), centre, exponent, 1.0
+    for share in _SCALES:
+        yield "none", "saturation" if signed and not even else "decay", share * reach, 0.0, 1.0, 1.0
+    if signed:
+        return
+    for place in _PLACES:
+        yield "none", "onset", width, low + place * width, 1.0, 1.0
+    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "clamp_force"):
+        for time in _TIMES_S:
+            yield "lag", "odd_power", max(abs(low - centre), abs(high - centre)), centre, 1.0, time
+
+
+def made_effect(form: Form, name: str) -> Effect:
+    """The term as an entry of the catalogue would be, for reports."""
+    unit, parameters = HOOKS[form.port].unit, [Parameter("coefficient", HOOKS[form.port].unit, -np.inf, np.inf, form.step, "")]
+    if form.shape == "harmonic":
+        parameters.append(Parameter("sine", unit, -np.inf, np.inf, form.step, ""))
+    own = SIGNALS[form.signal]
+    units = {"scale": own, "centre": own, "exponent": "1", "memory_scale": own if form.memory == "slip" else "s"}
+    for size in form.fitted:
+        low, high, _ = form.bounds(size)
+        parameters.append(Parameter(size, units[size], low, high, getattr(form, size), "", (getattr(form, size),)))
+    return Effect(
+        name=name,
+        hook=form.port,
+        term=lambda: 0.0,
+        parameters=tuple(parameters),
+        equation=equation(form.term()),
+        source="found in these logs; nobody has explained it yet",
+        signal=form.signal,
+    )
+
+
+_QUANTITY = {
+    "thickness": "pads and disc, m", "motor_angle": "θ", "stiffness": "stiffness", "force": "F", "torque_constant": "K_m",
+    "torque": "T_m", "gear_gain": "γ", "gear_friction": "T_f", "pad_friction": "μ",
+}  # fmt: skip
+
+
+def equation(term: Term) -> str:
+    """A term as an engineer writes it, with its numbers and units."""
+    own, quantity = SIGNALS[term.signal], _QUANTITY[term.port]
+    x = term.signal.replace("_", " ")
+    z = {
+        "none": x,
+        "lag": f"[{x} through a lag of {term.memory_scale:.3g} s]",
+        "deficit": f"[what of {x} is still to come with {term.memory_scale:.3g} s, negative]",
+        "slip": f"[slip of {x}, ±1 within {term.memory_scale:.3g} {own}]",
+    }[term.memory]
+    place = f" − {term.centre:.4g}" if term.centre and term.shape != "harmonic" else ""
+    u = f"({z}{place})/{term.scale:.3g}{'' if term.memory == 'slip' else ' ' + own}"
+    shaped = {
+        "constant": "1",
+        "odd_power": u if abs(term.exponent - 1.0) < 0.005 else f"[{u}]^{term.exponent:.2g}",
+        "even_power": f"|{u}|^{term.exponent:.2g}",
+        "saturation": f"u/(1 + |u|), u = {u}",
+        "decay": f"exp(−|{u}|)",
+        "onset": f"max({u}, 0)",
+        "harmonic": f"cos and sin of {1.0 / term.scale:.4g} × {x}",
+        "bump": f"exp(−[{u}]²)",
+    }[term.shape]
+    gate = {"always": "", "load": " × F/F_max"}.get(term.gate, f", {term.gate}")
+    size = f"{np.hypot(term.coefficient, term.sine):.3g}" if term.shape == "harmonic" else f"{term.coefficient:.3g}"
+    if not term.coefficient and not term.sine:
+        size = "c"
+    factor = HOOKS[term.port].unit == "1"
+    unit = "" if factor else f" {term.unit}"
+    return f"{quantity} × (1 + {size} · {shaped}{gate})" if factor else f"{quantity} + {size}{unit} · {shaped}{gate}"
+
+
+assert all(port in PORTS and signal in SIGNALS for port, own in _TYPED.items() for signal in own)

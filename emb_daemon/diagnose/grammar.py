@@ -1,0 +1,431 @@
+"""The last rung: when the catalogue is exhausted and something is left, make the term.
+
+Every form of the grammar (`forms`) is screened on episodes left out of its fit, beside all that the path's own parameters
+can do. The best few are run through the estimator and fitted; the one whose gain is worth its length (minimum description
+length, Rissanen, Automatica 14, 1978) is asked what every effect is asked, and more: chance over the *whole* grammar, by the
+best that all forms together do with their signals moved in time (maxima as Romano, Wolf, Econometrica 73, 2005), its own
+signal at another time, and whether resampled episodes would choose the same.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from emb_daemon.calibration.terms import Term, fill_terms
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.coordinates import Coordinate, Move
+from emb_daemon.diagnose.evidence import Evidence, leave_out
+from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, made_effect, rippling
+from emb_daemon.diagnose.held_heat import follow_signals, record_heat
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.orders import strongest_order
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.screening import Q_VALUE, Candidate
+from emb_daemon.diagnose.selection import UNSURE, Selection
+from emb_daemon.diagnose.unexplained import achieved, is_beyond
+from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
+from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
+from emb_daemon.errors import InvalidValue
+from emb_daemon.offline.run import held
+from emb_daemon.offline.score import rmse
+
+#: A term is made if a smooth function of some signal explains this share of the rest, less what of it differs from sample to
+#: sample; or if that much of the rest does not: what memories do is no function of any signal now. Of the torque path of
+#: brakes with nothing hidden 0.11 to 0.15 does not, because the noise of the current is coloured.
+_CEILING, _STRUCTURED = 0.2, 0.2
+#: Samples that are averaged for the screening: what a term does lasts longer than 16 ms, its noise does not. For chance, which
+#: asks all forms a hundred times, an eighth of a second.
+_AVERAGED, _COARSE = 4, 32
+#: Forms that are run through the estimator.
+_SHORTLIST = 10
+#: Shifts of all signals in time, and of the chosen one's; bootstraps.
+_CHANCES, _SHIFTS, _BOOTSTRAPS = 99, 5, 100
+#: Share of bootstraps that must choose the same port and signal; share of the gain with which another is as good.
+_STABLE, _AS_GOOD = 0.8, 0.95
+#: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
+_OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
+#: Orders of ripples that are scanned.
+_ORDERS = (0.05, 100.0)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What left-out episodes say of forms, one row each: with ``u`` = xᵀr and ``a`` = xᵀx of each episode, nuisances projected
+    out of the regressor x."""
+
+    u: np.ndarray
+    a: np.ndarray
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Fall of the squared error summed over left-out episodes."""
+        rest = self.a.sum(axis=1, keepdims=True) - self.a
+        without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=rest > 0.0)
+        return np.sum(2.0 * without * self.u - without**2 * self.a, axis=1)
+
+
+class Screen:
+    """One channel's residual, averaged, with its nuisances, against which forms are held."""
+
+    def __init__(self, model: Model, channel: str, averaged: int = _AVERAGED):
+        self.model, self.channel, bench = model, channel, model.bench
+        episode = bench.episode[channel]
+        index = np.arange(len(episode))
+        begins = np.flatnonzero(np.diff(episode, prepend=-1))
+        within = index - begins[np.searchsorted(begins, index, side="right") - 1]
+        self._starts = np.flatnonzero(within % averaged == 0)
+        self._counts = np.diff(np.append(self._starts, len(episode)))
+        weight = np.sqrt(self._counts)
+        self._weight = weight / self._counts
+        #: What makes a plain mean of an averaged column.
+        self.per_mean = 1.0 / weight
+        at = episode[self._starts]
+        self._bounds = np.searchsorted(at, np.arange(bench.episodes + 1))
+        own = model.own(channel)
+        table = np.column_stack([model.columns[c] for c in own]) if own else np.zeros((len(episode), 0))
+        self.nuisances = self.averaged(table)
+        penalty = model.penalty(own, channel) if own else np.zeros(0)
+        self._normal = self.nuisances.T @ self.nuisances + np.diag(penalty + 1e-12)
+        residual = self.averaged(model.residual[channel][:, None])
+        self.residual = residual - self.nuisances @ self._solve(self.nuisances.T @ residual)
+        self.keep = model.residual[channel] != 0.0
+
+    def averaged(self, columns: np.ndarray) -> np.ndarray:
+        """Means over a few samples, weighted as so many; columns (N, k)."""
+        return np.add.reduceat(columns, self._starts, axis=0) * self._weight[:, None]
+
+    def _solve(self, right: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(self._normal, right, rcond=1e-12)[0] if len(self._normal) else right
+
+    def scores(self, columns: np.ndarray) -> Scores:
+        """Of regressors (N, k)."""
+        return self.scores_of(self.averaged(columns * self.keep[:, None]))
+
+    def scores_of(self, averaged: np.ndarray) -> Scores:
+        """Of regressors that are averaged already."""
+        averaged = averaged - self.nuisances @ self._solve(self.nuisances.T @ averaged)
+        episodes = len(self._bounds) - 1
+        u, a = np.zeros((averaged.shape[1], episodes)), np.zeros((averaged.shape[1], episodes))
+        for number in range(episodes):
+            part = slice(self._bounds[number], self._bounds[number + 1])
+            u[:, number] = averaged[part].T @ self.residual[part, 0]
+            a[:, number] = np.einsum("nk,nk->k", averaged[part], averaged[part])
+        return Scores(u, a)
+
+
+def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
+    """Terms made for what the catalogue leaves, one after the other until none is proven."""
+    for channel in (channel for channel in selection.model.bench.channels if channel in FORCE_CHANNELS):
+        while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
+            progress(f"making a term for the {channel} residual")
+            before, selection = selection, _one_more(selection, channel)
+            if selection.accepted == before.accepted:
+                break
+    return selection
+
+
+def _wanted(selection: Selection, channel: str) -> bool:
+    """Whether enough is left, and enough of it looks explicable, for a term to be made up."""
+    model, screening = selection.model, selection.screening
+    residual, square = model.residual[channel], model.noise(channel)
+    known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
+    noise = 0.5 * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) ** 2
+    if is_beyond(np.sqrt(square), known) or square - noise > _STRUCTURED * square:
+        return True
+    ceiling = model.rms(screening.rival(model, channel, {})[0], channel)
+    return ceiling >= screening.floor(model, channel) and ceiling**2 > _CEILING * (square - noise)
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """A form with its regressors, by the estimator itself, and what left-out episodes say of them."""
+
+    form: Form
+    columns: list[np.ndarray]
+    evidence: Evidence
+
+    def is_of(self, other: "Prospect") -> bool:
+        """Whether it says the same of port and signal."""
+        return (self.form.port, self.form.signal) == (other.form.port, other.form.signal)
+
+
+def _one_more(selection: Selection, channel: str) -> Selection:
+    """With the best term for one channel, accepted if it is proven, else with what speaks against it."""
+    model, screening = selection.model, selection.screening
+    signals = _signals(model)
+    if signals is None:
+        return selection
+    search = _Search(model, channel, signals)
+    prospects = search.prospects()
+    if not prospects or model.rms(prospects[0].evidence.gain, channel) < screening.floor(model, channel):
+        return selection
+    best, *others = prospects
+    alike, stable = _as_good(best, others), _stability(search.screen, prospects)
+    chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
+    made_of = f"same port and signal in {100 * stable:.0f} % of bootstraps"
+    if alike:
+        made_of += f"; as good on these logs: {', '.join(alike)}"
+    ceiling, rival = screening.rival(model, channel, {})
+    objections = {
+        f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
+        f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
+        < _OF_MODEL_FREE * ceiling,
+        f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
+        made_of: stable < _STABLE and not alike,
+    }
+    against = next((text for text, holds in objections.items() if holds), "")
+    candidate = Candidate(
+        made_effect(best.form, _name(best.form, selection)), channel, evidence=best.evidence, p_value=best.evidence.p_value,
+        q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
+        placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
+        confounded_with=alike[0] if alike else None, over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
+    )  # fmt: skip
+    return selection.noted([candidate]) if against else _entered(selection, candidate, best.form)
+
+
+def _signals(model: Model) -> list[np.ndarray] | None:
+    """What terms see, by log; None where an angle lost its zero."""
+    result = []
+    for trial in model.bench.trials:
+        parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
+        heat = record_heat(trial.log.samples, parameters)
+        if heat is None:
+            return None
+        result.append(follow_signals(trial.log.samples, parameters, heat))
+    return result
+
+
+class _Search:
+    """All forms at the ports of one channel."""
+
+    def __init__(self, model: Model, channel: str, signals: list[np.ndarray]):
+        self.model, self.channel, self.signals = model, channel, signals
+        self.random = np.random.default_rng(0)
+        self.covered = _covered(np.concatenate(signals))
+        self.ports = tuple(
+            port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
+        )  # fmt: skip
+        self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
+        self.screen = Screen(model, channel)
+        self.forms = enumerate_forms(self.covered, self.ports)
+        self.scores = _screened(self.screen, self.forms, self.sensitivities, signals)
+
+    def prospects(self) -> list[Prospect]:
+        """The best forms, through the estimator, those worth their length first."""
+        model, own = self.model, self.model.own(self.channel)
+        best = [*_shortlisted(self.forms, self.scores), *_ripples(self)]
+        exact = [_probed(model, self.channel, form) for form in best]
+        found = [Prospect(form, own, model.evidence(self.channel, own)) for form, own in zip(best, exact, strict=True)]
+        moments = model.moments(self.channel, [model.columns[c] for c in own])
+        alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
+        kept = [p for p in found if p.evidence.p_value < UNSURE and p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+    def chance(self, best: Prospect) -> float:
+        """That of the best among all forms; a ripple's is that of its order among as many."""
+        if best.form.shape == "harmonic":
+            return min(1.0, best.evidence.p_value * len(self.forms))
+        return _chance(self)
+
+    def at_another_time(self, form: Form) -> float:
+        """Largest gain of a term with its signal moved in time, as if the log were a circle; none for a ripple."""
+        if form.shape == "harmonic":
+            return 0.0
+        values = _values(self.model.bench, form, self.signals)
+        shifts = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
+        columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in shifts])
+        return float(self.screen.scores(columns).gain.max())
+
+
+def _covered(signals: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Range of each signal that varies."""
+    result = {}
+    for index, name in enumerate(SIGNALS):
+        known = signals[np.isfinite(signals[:, index]), index]
+        if len(known) and np.ptp(known) > 1e-9 * max(abs(known.max()), 1e-12):
+            result[name] = float(known.min()), float(known.max())
+    return result
+
+
+def _sensitivity(model: Model, channel: str, port: str) -> np.ndarray:
+    """What one unit at a port does to a channel, minus the derivative of the residual."""
+    constant = Form(port, "motor_speed", "none", "constant", "always", 1.0, 0.0, 1.0, 1.0, -1e9, 1e9)
+    return _probed(model, channel, constant)[0]
+
+
+def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
+    """A form's regressors, by the estimator itself."""
+    index = len(model.bench.calibration.terms)
+    bench = _with_term(model.bench, form.term())
+    own = [_coordinate(index, channel, form, "coefficient", "")]
+    if form.shape == "harmonic":
+        own.append(_coordinate(index, channel, form, "sine", ""))
+    return bench.regressors(model.values, [Probe(c) for c in own], model.residual)
+
+
+def _with_term(bench: Bench, term: Term) -> Bench:
+    return bench.under(msgspec.structs.replace(bench.calibration, terms=(*bench.calibration.terms, term)))
+
+
+def _coordinate(index: int, channel: str, form: Form, field: str, effect: str) -> Coordinate:
+    key = f"terms[{index}].{field}"
+    if field in ("coefficient", "sine"):
+        moves = (Move(key, 1.0, -np.inf, np.inf),)
+        return Coordinate(
+            key, channel, 0.0, form.step, np.inf, moves, unit=HOOKS[form.port].unit, effect=effect, parameter=field
+        )
+    low, high, prior = form.bounds(field)
+    start = getattr(form, field)
+    return Coordinate(
+        key, channel, start, 1e-3 * prior, prior, (Move(key, 1.0, low, high),), low, high, effect=effect, parameter=field
+    )  # fmt: skip
+
+
+# -- screening --------------------------------------------------------------------------------------------------------
+
+
+def _screened(
+    screen: Screen, forms: Sequence[Form], sensitivities: Mapping[str, np.ndarray], signals: list[np.ndarray]
+) -> Scores:
+    """All forms, each as what its port does times what its shape makes of its signal."""
+    shapes: dict[Form, list[int]] = {}
+    for index, form in enumerate(forms):
+        shapes.setdefault(replace(form, port=""), []).append(index)
+    episodes = screen.model.bench.episodes
+    u, a = np.zeros((len(forms), episodes)), np.zeros((len(forms), episodes))
+    for members in shapes.values():
+        values = _values(screen.model.bench, forms[members[0]], signals)
+        columns = np.column_stack([sensitivities[forms[index].port] * values for index in members])
+        part = screen.scores(columns)
+        u[members], a[members] = part.u, part.a
+    return Scores(u, a)
+
+
+def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
+    """What a form of coefficient one makes of its signal, at every sample."""
+    record = _record_of(replace(form, port=form.port or PORTS[0]))
+    largest = bench.calibration.stiffness.maximum_force_N
+    parts = zip(bench.trials, signals, strict=True)
+    return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])
+
+
+def _record_of(form: Form) -> np.void:
+    record = np.zeros(1, PARAMETERS)[0]
+    fill_terms(record, (form.term(),))
+    record["term"][0]["coefficient"] = 1.0
+    return record["term"][0]
+
+
+def _chance(search: _Search) -> float:
+    """Chance that the best of all forms gains as much with their signals moved in time."""
+    screen = Screen(search.model, search.channel, _COARSE)
+    shapes = list(dict.fromkeys(replace(form, port="") for form in search.forms))
+    row = {shape: index for index, shape in enumerate(shapes)}
+    every = [screen.averaged(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
+    values = np.column_stack(every) * screen.per_mean[:, None]
+    by_port = []
+    for port, column in search.sensitivities.items():
+        rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
+        if rows:
+            by_port.append((screen.averaged((column * screen.keep)[:, None]), rows))
+    best, gain = [], search.scores.gain.max()
+    for _ in range(_CHANCES):
+        moved = np.roll(values, int(len(values) * search.random.uniform(0.1, 0.9)), axis=0)
+        best.append(max(float(screen.scores_of(own * moved[:, rows]).gain.max()) for own, rows in by_port))
+    return (1.0 + np.count_nonzero(np.array(best) >= gain)) / (1.0 + _CHANCES)
+
+
+def _shortlisted(forms: Sequence[Form], scores: Scores) -> list[Form]:
+    """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
+    gains = scores.gain
+    chosen: list[Form] = []
+    for index in np.argsort(-gains):
+        form = forms[index]
+        relatives = [f for f in chosen if (f.port, f.signal, f.memory) == (form.port, form.signal, form.memory)]
+        if gains[index] > 0.0 and len(relatives) < 2:
+            chosen.append(form)
+        if len(chosen) == _SHORTLIST:
+            break
+    return chosen
+
+
+def _ripples(search: _Search) -> list[Form]:
+    """The strongest ripple over the motor angle at each port that may have one."""
+    found = []
+    for port in rippling(search.ports) if "motor_angle" in search.covered else ():
+        effect = Effect(
+            name=port, hook=port, term=lambda: 0.0, equation="", source="",
+            parameters=(Parameter("o", "1", *_ORDERS, 1.0, "", _ORDERS),),
+            harmonic=Harmonic("o", "c", "s", grows_with="port"),
+        )  # fmt: skip
+        order, _ = strongest_order(search.model, effect, search.channel, {"port": search.sensitivities[port]})
+        if order:
+            found.append(harmonic(port, order, search.model.bench.middle, search.covered))
+    return found
+
+
+# -- judging ----------------------------------------------------------------------------------------------------------
+
+
+def _stays_in_bounds(prospect: Prospect) -> bool:
+    """Whether a calibration may hold the term at the size found."""
+    try:
+        prospect.form.term(coefficient=float(np.hypot.reduce(prospect.evidence.values)))
+    except InvalidValue:
+        return False
+    return True
+
+
+def _length(prospect: Prospect, alone: float, episodes: int) -> float:
+    """Description length of what is left and of the term, in nats; an episode counts as one observation.
+
+    ``alone``: squared error of left-out episodes without the term."""
+    left = max(1.0 - prospect.evidence.gain / max(alone, 1e-300), 1e-3)
+    return 0.5 * episodes * np.log(left) + 0.5 * prospect.form.numbers * np.log(episodes)
+
+
+def _as_good(best: Prospect, others: Sequence[Prospect]) -> list[str]:
+    """Other ports and signals whose best form gains nearly as much."""
+    alike = [p.form for p in others if not p.is_of(best) and p.evidence.gain >= _AS_GOOD * best.evidence.gain]
+    return list(dict.fromkeys(f"{form.port} over {form.signal}".replace("_", " ") for form in alike))
+
+
+def _stability(screen: Screen, prospects: Sequence[Prospect]) -> float:
+    """Share of resampled episodes in which the same port and signal would be chosen; equal ones count as the same."""
+    scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
+    episodes = scores[0].u.shape[1]
+    weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
+    gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
+    own = gains[[prospect.is_of(prospects[0]) for prospect in prospects]].max(axis=0)
+    return float(np.mean(own >= _AS_GOOD * gains.max(axis=0)))
+
+
+# -- accepting --------------------------------------------------------------------------------------------------------
+
+
+def _name(form: Form, selection: Selection) -> str:
+    name = f"term:{form.port}:{form.signal}"
+    taken = {term.name for term in selection.model.bench.calibration.terms}
+    return name if name not in taken else next(f"{name}:{n}" for n in range(2, MOST + 2) if f"{name}:{n}" not in taken)
+
+
+def _entered(selection: Selection, candidate: Candidate, form: Form) -> Selection:
+    """With a term, fitted with everything else; without it again if it then proves nothing."""
+    before, channel, name = selection.model, candidate.channel, candidate.effect.name
+    index = len(before.bench.calibration.terms)
+    bench = _with_term(before.bench, form.term(name))
+    fields = ["coefficient", *(["sine"] if form.shape == "harmonic" else [])]
+    amplitudes = [_coordinate(index, channel, form, field, name) for field in fields]
+    sizes = {_coordinate(index, channel, form, field, name): getattr(form, field) for field in form.fitted}
+    values = dict(zip(amplitudes, map(float, candidate.evidence.values), strict=True)) | sizes
+    model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
+    evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0))
+    gain = model.rms(evidence.gain, channel)
+    worse = model.noise(channel) >= before.noise(channel)
+    if worse or evidence.p_value > UNSURE or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
+        return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+    candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
+    explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
+    return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])

@@ -1,0 +1,43 @@
+"""The whole search: from a calibration and logs to what these prove.
+
+Stepwise: the base calibration is refitted, then the catalogue is asked round by round until none of it is proven any more
+(`selection`), then the grammar makes what it lacks (`grammar`), and everything is revised. Stepwise selection alone would be
+greedy where two effects only work together (a slow branch without slip gains nothing), so effects that lost are tried again
+each round.
+"""
+
+from dataclasses import replace
+
+from emb_daemon.diagnose.grammar import made
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
+from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.selection import Progress, Selection, changes, one_round, recalibrated, revised, settled_heat
+from emb_daemon.diagnose.unexplained import dependences
+from emb_daemon.effects import REGISTRY
+
+
+def select(bench: Bench, progress: Progress) -> Selection:
+    """Recalibrate, accept effects until none is proven any more, make terms for what is left, and revise.
+
+    ``progress``: what is being done, share done."""
+    progress("recalibrating", 0.1)
+    start = Model.of(bench)
+    model = start.refined(bench.channels)
+    screening = Screening(bench, start)
+    at_first = {
+        channel: dependences(channel, screening.dependence(model, channel), model.counted(channel), 0.0)
+        for channel in bench.channels
+        if channel in FORCE_CHANNELS
+    }
+    selection = Selection(model, screening, at_first=at_first)
+    selection = replace(selection, recalibrated=recalibrated(selection, start))
+    for number in range(len(REGISTRY)):
+        progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
+        before = selection.accepted
+        selection = one_round(selection)
+        if selection.accepted == before:
+            break
+    selection = made(selection, lambda text: progress(text, 0.72))
+    progress("refitting what is applied", 0.75)
+    return changes(revised(settled_heat(selection)))

@@ -1,0 +1,223 @@
+"""Terms that no catalogue holds: data in a calibration, evaluated by this one bounded kernel in the same step as all else.
+
+A term is coefficient × shape(memory(signal)) × gate at one port of the physics. `emb_daemon.diagnose.grammar` makes them;
+`Calibration.terms` holds them, checked when the file is loaded. Nothing executable comes from a file. Without terms the kernel
+returns at once.
+"""
+
+from math import cos, exp, hypot, sin, sqrt
+
+import numpy as np
+
+from emb_daemon.jit import njit
+
+#: Most terms of one calibration.
+MOST = 4
+
+#: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
+PORTS = (
+    "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction", "pad_friction"
+)  # fmt: skip
+#: Signals and their units. Forces are those of the stiffness path, temperatures and brake torque the models' own; heat of the
+#: motor is that of the estimator's winding and housing, as a share of what the largest force's current leaves for ever.
+SIGNALS = {
+    "motor_angle": "rad",
+    "travel": "rad",
+    "motor_speed": "rad/s",
+    "clamp_force": "N",
+    "force_rate": "N/s",
+    "current": "A",
+    "pad_temperature": "°C",
+    "disc_temperature": "°C",
+    "caliper_temperature": "°C",
+    "disc_speed": "rad/s",
+    "brake_torque": "N·m",
+    "energy": "J",
+    "time_clamped": "s",
+    "time_since_last_clamp": "s",
+    "winding_heat": "1",
+    "housing_heat": "1",
+}
+#: What a term remembers of its signal x: nothing; z of τ dz/dt + z = x; z − x, what is still to come; a Maxwell slip element
+#: of stretch ``memory_scale``, z in [-1, 1].
+MEMORIES = ("none", "lag", "deficit", "slip")
+#: Of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
+SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset", "harmonic", "bump")
+#: When a term acts; ``load`` multiplies it by the clamp force over the largest.
+GATES = ("always", "load", "closing", "opening", "turning", "standing")
+
+(_ANGLE, _TRAVEL, _SPEED, _FORCE, _RATE, _CURRENT, _PADS, _DISC, _CALIPER, _WHEEL, _BRAKE, _ENERGY, _CLAMPED, _RELEASED,
+ _WINDING, _HOUSING) = range(len(SIGNALS))  # fmt: skip
+_NONE, _LAG, _DEFICIT, _SLIP = range(len(MEMORIES))
+_CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
+_ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
+_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE = range(4)
+
+#: Clamp force (N) from which the brake counts as clamped, and disc speed (rad/s) from which the disc turns.
+CLAMPED_N, TURNING_RAD_PER_S = 150.0, 0.5
+
+TERM = np.dtype(
+    [
+        ("port", "i8"),
+        ("signal", "i8"),
+        ("memory", "i8"),
+        ("shape", "i8"),
+        ("gate", "i8"),
+        ("coefficient", "f8"),
+        ("sine", "f8"),
+        ("sigma", "f8"),
+        ("scale", "f8"),
+        ("centre", "f8"),
+        ("exponent", "f8"),
+        ("memory_scale", "f8"),
+        ("low", "f8"),
+        ("high", "f8"),
+    ],
+    align=True,
+)
+PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
+#: ``added`` by port; ``doubt``: standard deviation (N) of the static force by what terms add outside their range.
+STATE = np.dtype(
+    [
+        ("signal", "f8", (len(SIGNALS),)),
+        ("added", "f8", (len(PORTS),)),
+        ("doubt", "f8"),
+        ("begun", "i8", (MOST,)),
+        ("memory", "f8", (MOST,)),
+        ("before", "f8", (MOST,)),
+    ],
+    align=True,
+)
+
+
+@njit
+def _follow(signal, s, m):
+    """Signals at this sample, before the force is known: the last one, moved along the curve."""
+    turned = m.angle - s.angle
+    signal[_ANGLE], signal[_TRAVEL], signal[_SPEED] = m.angle, max(s.past_contact + turned, 0.0), m.speed
+    force = max(s.force + s.slope * turned, 0.0)
+    signal[_FORCE], signal[_RATE] = force, s.slope * m.speed
+    signal[_CURRENT] = m.current_q if m.has_current else np.nan
+    signal[_PADS] = 0.5 * (s.mean[0] + s.mean[1]) if s.temperature_known else np.nan
+    signal[_DISC] = s.disc if s.temperature_known else np.nan
+    signal[_CALIPER] = m.caliper if m.has_thermocouple else np.nan
+    wheel = m.wheel_speed if m.has_wheel_speed else 0.0
+    signal[_WHEEL] = wheel
+    signal[_BRAKE] = s.power / wheel if wheel > TURNING_RAD_PER_S else 0.0
+    signal[_ENERGY] += s.power * m.dt
+    clamped = force > CLAMPED_N
+    signal[_CLAMPED] = signal[_CLAMPED] + m.dt if clamped else 0.0
+    signal[_RELEASED] = 0.0 if clamped else signal[_RELEASED] + m.dt
+    signal[_WINDING], signal[_HOUSING] = s.winding, s.housing
+
+
+@njit
+def _remembered(q, t, k, x, dt):
+    """What term ``k`` makes of its signal's history."""
+    if q.memory == _NONE:
+        return x
+    if t.begun[k] == 0:
+        t.begun[k] = 1
+        t.memory[k], t.before[k] = (0.0 if q.memory == _SLIP else x), x
+    if q.memory == _SLIP:
+        t.memory[k] = min(max(t.memory[k] + (x - t.before[k]) / q.memory_scale, -1.0), 1.0)
+    else:
+        t.memory[k] += (1.0 - exp(-dt / q.memory_scale)) * (x - t.memory[k])
+    t.before[k] = x
+    return t.memory[k] - x if q.memory == _DEFICIT else t.memory[k]
+
+
+@njit
+def _shaped(q, z):
+    """The term over its coefficient; a harmonic with its coefficients."""
+    u = (z - q.centre) / q.scale
+    if q.shape == _ODD:
+        return abs(u) ** q.exponent * (1.0 if u >= 0.0 else -1.0)
+    if q.shape == _EVEN:
+        return abs(u) ** q.exponent
+    if q.shape == _SATURATION:
+        return u / (1.0 + abs(u))
+    if q.shape == _DECAY:
+        return exp(-abs(u))
+    if q.shape == _ONSET:
+        return max(u, 0.0)
+    if q.shape == _HARMONIC:
+        return q.coefficient * cos(u) + q.sine * sin(u)
+    if q.shape == _BUMP:
+        return exp(-u * u)
+    return 1.0
+
+
+@njit
+def _gate(q, signal, maximum_force):
+    if q.gate == _LOAD:
+        return signal[_FORCE] / maximum_force
+    if q.gate == _CLOSING:
+        return 1.0 if signal[_SPEED] > 0.0 else 0.0
+    if q.gate == _OPENING:
+        return 1.0 if signal[_SPEED] < 0.0 else 0.0
+    if q.gate == _TURNING:
+        return 1.0 if signal[_WHEEL] > TURNING_RAD_PER_S else 0.0
+    if q.gate == _STANDING:
+        return 1.0 if signal[_WHEEL] <= TURNING_RAD_PER_S else 0.0
+    return 1.0
+
+
+@njit
+def _value(q, t, k, dt, maximum_force):
+    """What term ``k`` adds at its port, in the port's unit; outside its range what it adds at the edge."""
+    x = t.signal[q.signal]
+    if not np.isfinite(x):
+        return 0.0
+    z = _remembered(q, t, k, min(max(x, q.low), q.high), dt)
+    shaped = _shaped(q, z) * _gate(q, t.signal, maximum_force)
+    return shaped if q.shape == _HARMONIC else q.coefficient * shaped
+
+
+@njit
+def _doubt(q, x, added, s):
+    """Standard deviation (N) of the static force: of the coefficient, and the term's own size for each width of its range that
+    the signal is outside."""
+    outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
+    if not outside > 0.0:
+        return 0.0
+    size = hypot(q.sigma, outside * max(abs(added), q.sigma))
+    if q.port == _STIFFNESS:
+        return size * s.force
+    if q.port == _STATIC_FORCE:
+        return size
+    return size * s.slope
+
+
+@njit
+def look(e, s, p, m):
+    """All terms at this sample. ``e`` PARAMETERS, ``s`` the estimator's state, ``p`` its parameters, ``m`` the sample."""
+    if e.count == 0:
+        return
+    t = s.effects.terms
+    _follow(t.signal, s, m)
+    for port in range(len(t.added)):
+        t.added[port] = 0.0
+    variance = 0.0
+    for k in range(e.count):
+        q = e.term[k]
+        value = _value(q, t, k, m.dt, p.maximum_force)
+        t.added[q.port] += value
+        if q.port <= _STATIC_FORCE:
+            doubt = _doubt(q, t.signal[q.signal], value, s)
+            variance += doubt * doubt
+    t.doubt = sqrt(variance)
+
+
+@njit
+def _follow_all(e, t, signals, dt, maximum_force, values):
+    for row in range(len(signals)):
+        t.signal[:] = signals[row]
+        values[row] = _value(e, t, 0, dt[row], maximum_force)
+
+
+def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
+    """What a term (TERM) adds at its port over signals, shape (n, signals), ``dt`` s apart, in the port's unit."""
+    values = np.zeros(len(signals))
+    _follow_all(term, np.zeros(1, STATE)[0], signals, dt, maximum_force_N, values)
+    return values

@@ -1,0 +1,237 @@
+"""Terms that no catalogue holds: what they do at their ports, and what of them a calibration may say."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_daemon.calibration.files import dump_calibration, load_calibration
+from emb_daemon.calibration.strict_yaml import load_yaml
+from emb_daemon.calibration.terms import Term, fill_terms
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.effects import terms
+from emb_daemon.errors import InputErrors, InvalidValue
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.offline import estimate
+from emb_daemon.offline.run import held, run_step
+from emb_daemon.resources import resource
+
+DT = 0.004
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """The shipped one without effects, whose terms would add up with those here."""
+    return msgspec.structs.replace(load_calibration(resource("config/calibration.yaml")), effects={})
+
+
+def constant(port, coefficient, **more):
+    """Acts always and everywhere."""
+    return Term(
+        name="term:x", port=port, signal="motor_speed", shape="constant", coefficient=coefficient, low=-1e4, high=1e4, **more
+    )
+
+
+def drive(seconds=8.0):
+    """A clamp to about 10 kN with a slow stroke on top, its current fair."""
+    time = DT * np.arange(round(seconds / DT))
+    samples = np.zeros(len(time), SAMPLE)
+    samples["dt"] = np.where(time == 0.0, 0.0, DT)
+    samples["angle"] = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * time) * (time > 2.0)
+    samples["speed"] = np.gradient(samples["angle"], DT)
+    samples["current_q"], samples["has_current"] = 10.0, True
+    samples["brake_torque"] = np.nan
+    return samples
+
+
+def traced(calibration, *more):
+    return run_step(drive(), held(to_parameters(msgspec.structs.replace(calibration, terms=more))))
+
+
+@pytest.mark.parametrize(
+    ("port", "size", "change"),
+    [
+        ("stiffness", 0.02, lambda p: p["curve"].__imul__(1.02)),
+        ("thickness", 2e-6, lambda p: p.__setitem__("clearance", p["clearance"] - 2e-6 / p["gear_gain"])),
+        ("motor_angle", 0.1, lambda p: p.__setitem__("clearance", p["clearance"] - 0.1)),
+        ("torque_constant", 0.05, lambda p: p.__setitem__("torque_constant", 1.05 * p["torque_constant"])),
+        ("gear_gain", 0.05, None),
+        ("gear_friction", 0.1, lambda p: (p.__setitem__("load_friction", 1.1 * p["load_friction"]),
+                                          p.__setitem__("offset_friction", 1.1 * p["offset_friction"]))),
+    ],
+)  # fmt: skip
+def test_a_constant_at_a_port_is_what_its_base_parameter_does(calibration, port, size, change):
+    """Ports are where they say, in their units: a constant there is another value of the parameter beside it."""
+    found = traced(calibration, constant(port, size))
+    p = held(to_parameters(calibration))
+    if change is None:
+        assert np.allclose(found["leverage"] - traced(calibration)["leverage"], size * p["gear_gain"][0])
+        return
+    change(p[0])
+    expected = run_step(drive(), p)
+    for name in ("force", "torque", "leverage"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, atol=1e-9)
+
+
+def test_torque_and_force_add_in_their_units(calibration):
+    plain = traced(calibration)
+    more = traced(calibration, constant("torque", 0.01))
+    np.testing.assert_allclose((more["torque"] - plain["torque"])[1:], 0.01, atol=1e-12)
+    late = slice(1500, None)
+    np.testing.assert_allclose((traced(calibration, constant("force", 50.0))["force"] - plain["force"])[late], 50.0, atol=1e-3)
+
+
+def test_without_terms_no_bit_changes_and_a_term_of_size_zero_is_none(calibration):
+    assert traced(calibration).tobytes() == traced(calibration, constant("stiffness", 0.0)).tobytes()
+
+
+# -- the kernel -------------------------------------------------------------------------------------------------------
+
+
+def record(term):
+    parameters = np.zeros(1, terms.PARAMETERS)[0]
+    fill_terms(parameters, (term,))
+    return parameters["term"][0]
+
+
+def over(term, x, **others):
+    """The term over a signal."""
+    signals = np.zeros((len(x), len(terms.SIGNALS)))
+    for name, column in {term.signal: x, **others}.items():
+        signals[:, list(terms.SIGNALS).index(name)] = column
+    return terms.evaluate(record(term), signals, np.full(len(x), DT), 20000.0)
+
+
+_SHAPES = {
+    "constant": lambda u, n: np.ones_like(u),
+    "odd_power": lambda u, n: np.sign(u) * np.abs(u) ** n,
+    "even_power": lambda u, n: np.abs(u) ** n,
+    "saturation": lambda u, n: u / (1.0 + np.abs(u)),
+    "decay": lambda u, n: np.exp(-np.abs(u)),
+    "onset": lambda u, n: np.maximum(u, 0.0),
+    "bump": lambda u, n: np.exp(-(u**2)),
+}
+_size = st.floats(0.1, 10.0)
+
+
+@given(st.sampled_from(sorted(_SHAPES)), _size, st.floats(-20.0, 20.0), st.floats(0.3, 3.0))
+def test_shapes_are_what_they_are_called(shape, scale, centre, exponent):
+    x = np.linspace(-60.0, 60.0, 41)
+    term = Term(
+        name="term:x", port="force", signal="motor_speed", shape=shape, coefficient=7.0, scale=scale, centre=centre,
+        exponent=exponent, low=-50.0, high=50.0,
+    )  # fmt: skip
+    # Outside of its range a term stays what it is at the edge.
+    u = (np.clip(x, -50.0, 50.0) - centre) / scale
+    np.testing.assert_allclose(over(term, x), 7.0 * _SHAPES[shape](u, exponent), rtol=1e-12, atol=1e-12)
+
+
+def test_a_harmonic_has_two_coefficients_and_turns_about_its_centre():
+    term = Term(
+        name="term:x", port="motor_angle", signal="motor_angle", shape="harmonic", coefficient=0.1, sine=-0.2, scale=0.5,
+        centre=3.0, low=-10.0, high=10.0,
+    )  # fmt: skip
+    x = np.linspace(-9.0, 9.0, 50)
+    u = (x - 3.0) / 0.5
+    np.testing.assert_allclose(over(term, x), 0.1 * np.cos(u) - 0.2 * np.sin(u), rtol=1e-12)
+
+
+def test_memories_lag_and_slip():
+    base = {"name": "term:x", "port": "stiffness", "signal": "brake_torque", "shape": "odd_power", "coefficient": 0.5}
+    x = np.where(np.arange(2000) < 10, 0.0, 1.0)
+    passed = DT * np.arange(2000 - 10)
+    lag = over(Term(**base, memory="lag", memory_scale=2.0, low=0.0, high=1.0), x)[10:]
+    np.testing.assert_allclose(lag, 0.5 * (1.0 - np.exp(-(passed + DT) / 2.0)), rtol=1e-9)
+    deficit = over(Term(**base, memory="deficit", memory_scale=2.0, low=0.0, high=1.0), x)[10:]
+    np.testing.assert_allclose(deficit, lag - 0.5, rtol=1e-9)
+    there_and_back = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)])
+    slip = over(Term(**base, memory="slip", memory_scale=0.2, low=0.0, high=1.0), there_and_back)
+    assert slip[100] == pytest.approx(0.5) and slip[-1] == pytest.approx(-0.5) and slip[121] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_gates():
+    base = {
+        "name": "term:x",
+        "port": "torque",
+        "signal": "motor_angle",
+        "shape": "constant",
+        "coefficient": 0.5,
+        "low": -1.0,
+        "high": 1.0,
+    }
+    speed, wheel, force = np.array([1.0, -1.0, 0.0]), np.array([0.0, 3.0, 3.0]), np.array([0.0, 10000.0, 20000.0])
+    signals = {"motor_speed": speed, "disc_speed": wheel, "clamp_force": force}
+    expected = {
+        "always": [1, 1, 1], "closing": [1, 0, 0], "opening": [0, 1, 0], "turning": [0, 1, 1], "standing": [1, 0, 0],
+        "load": [0, 0.5, 1],
+    }  # fmt: skip
+    assert set(expected) == set(terms.GATES)
+    for gate, acts in expected.items():
+        np.testing.assert_allclose(over(Term(**base, gate=gate), np.zeros(3), **signals), 0.5 * np.array(acts))
+
+
+def test_a_signal_that_is_not_known_adds_nothing():
+    term = Term(name="term:x", port="force", signal="pad_temperature", shape="constant", coefficient=7.0, low=0.0, high=1.0)
+    assert over(term, np.array([np.nan])) == 0.0
+
+
+def test_sigma_grows_outside_of_the_range(calibration):
+    """What nobody has measured is held at the edge, and doubted by its size for each width of the range beyond."""
+    term = Term(
+        name="term:x",
+        port="stiffness",
+        signal="clamp_force",
+        shape="odd_power",
+        coefficient=0.05,
+        scale=2000.0,
+        low=0.0,
+        high=2000.0,
+    )
+    inside = msgspec.structs.replace(term, high=20000.0, scale=20000.0)
+    sigma = [
+        estimate(drive(), to_parameters(msgspec.structs.replace(calibration, terms=own)))["stiffness_sigma"].max()
+        for own in ((), (inside,), (term,))
+    ]
+    assert sigma[1] < 1.1 * sigma[0] and sigma[2] > 3.0 * sigma[0]
+
+
+# -- what a calibration may say ---------------------------------------------------------------------------------------
+
+_GOOD = {
+    "name": "term:x", "port": "stiffness", "signal": "brake_torque", "shape": "odd_power", "coefficient": 0.1, "low": 0.0,
+    "high": 9.0, "scale": 9.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"port": "gearbox"}, "Invalid enum value 'gearbox'"),
+        ({"signal": "clamp_force_ref"}, "Invalid enum value 'clamp_force_ref'"),
+        ({"name": "x"}, "matching regex"),
+        ({"low": 9.0}, "expected more than low"),
+        ({"coefficient": 1.5}, "0.9 at most"),
+        ({"coefficient": 0.5, "scale": 1.0}, "reaches 4.5"),
+        ({"sine": 0.1}, "only a harmonic"),
+        ({"scale": 0.0}, "> 0.0"),
+        ({"shape": "exec"}, "Invalid enum value"),
+    ],
+)
+def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed, said):
+    text = dump_calibration(calibration)
+    good = msgspec.structs.replace(calibration, terms=(Term(**_GOOD),))
+    assert load_yaml(tmp_path / "c.yaml", Calibration, dump_calibration(good)) == good
+    broken = "".join(f"\n  {key}: {value}" for key, value in ({**_GOOD, **changed}).items()).replace("\n  ", "\n- ", 1)
+    with pytest.raises(InputErrors, match="terms") as raised:
+        load_yaml(tmp_path / "c.yaml", Calibration, f"{text}\nterms:{broken}\n")
+    assert said in str(raised.value)
+
+
+def test_terms_are_few_and_have_names_of_their_own(calibration):
+    term = Term(**_GOOD)
+    many = tuple(msgspec.structs.replace(term, name=f"term:{n}") for n in range(terms.MOST + 1))
+    for own, said in (((term, term), "occurs twice"), (many, f"expected {terms.MOST} at most")):
+        fields = {name: getattr(calibration, name) for name in calibration.__struct_fields__} | {"terms": own}
+        with pytest.raises(InvalidValue, match=said):
+            Calibration(**fields)
