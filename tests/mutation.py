@@ -27,7 +27,11 @@ _KEPT = [
     "tests/test_snapshots.py::test_a_file_that_cannot_be_set_aside_stops_nothing",
     "tests/test_snapshots.py::test_a_file_of_another_format_is_set_aside",
 ]
-_RUNTIME = ["tests/test_faults_loop.py", "tests/test_daemon.py::TestPacer"]
+_RUNTIME = [
+    "tests/test_faults_loop.py",
+    "tests/test_daemon.py::TestPacer",
+    "tests/test_daemon.py::test_the_service_manager_hears_ready_watchdog_and_stopping",
+]
 SCOPE = {
     "emb_daemon/wire/e2e.py": ["tests/test_wire.py"],
     "emb_daemon/wire/receive.py": [

@@ -216,6 +216,8 @@ def test_what_is_no_file_holds_nobody_up(tmp_path):
     for path in (tmp_path / "calibration.yaml", Path("/dev/zero")):
         with pytest.raises(InputErrors, match="not a regular file"):
             load_calibration(path)
+        with pytest.raises(InputErrors, match="not a regular file"):
+            Setup(path)
 
 
 @given(st.text(max_size=200))

@@ -95,7 +95,7 @@ def _reasons(estimates):
     return np.unique(estimates["reasons"]).tolist()
 
 
-def test_bus_off_and_recovery(driven):
+def test_bus_off_and_recovery(driven, caplog):
     """An error frame of the controller: Bus disturbed for a second, the force goes on."""
     off = np.zeros(1, FRAME)
     off["time_ns"], off["can_id"], off["flags"], off["length"] = driven.cycle * CYCLE_NS, 0x40, ERROR, 8
@@ -103,6 +103,7 @@ def test_bus_off_and_recovery(driven):
     during = driven.run(_SHOWN_CYCLES)
     assert np.all(during["reasons"][1:] == r.BUS_DISTURBED) and np.all(during["mode"][1:] == r.DEGRADED)
     assert np.all(during["source"] == r.FUSED)
+    assert "corner FL: degraded (bus or loop)" in caplog.text and "bus disturbed" in caplog.text
     assert _reasons(driven.run(50)[2:]) == [0]
 
 

@@ -140,6 +140,14 @@ def test_what_is_too_large_or_no_file_is_not_read(tmp_path, monkeypatch):
         read_frames(pipe)
 
 
+def test_a_time_that_no_clock_shows_is_refused(tmp_path):
+    path = tmp_path / "late.trc"
+    header = ";$FILEVERSION=2.1\n;$STARTTIME=43000.5\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
+    path.write_text(header + " 1 1e30 DT 1 0100 Rx - 8 00 00 00 00 00 00 00 00\n")
+    with pytest.raises(InputError, match="not readable by python-can's TRCReader"):
+        read_frames(path)
+
+
 def test_a_gzipped_log_that_is_cut_off_is_read_up_to_the_cut(tmp_path, capsys):
     rows = "".join(f"(1{row:09d}.000000) can0 123#{row % 251:02X}{row * 7919 % 65521:06X}\n" for row in range(20_000))
     packed = gzip.compress(rows.encode())

@@ -98,11 +98,11 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
             flags |= FD * message.is_fd | TRANSMITTED * (not message.is_rx)
             data = int.from_bytes(message.data[:8], "little")
             rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
+        return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
     except ImportError as error:
         raise InputError(f"{path}: reading this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
     except Exception as error:
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {error}") from None
-    return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
 
 
 def read_frames(path: str | Path) -> np.ndarray:
