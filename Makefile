@@ -46,7 +46,7 @@ SOAK_SECONDS ?= 1800
 soak: $(READY)
 	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
 
-# Mutants of E2E check, reception, plausibility and fusion, drawn with a fixed seed.
+# Mutants of E2E check, reception, plausibility, fusion, monitor, state files and runtime, drawn with a fixed seed.
 MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
@@ -70,6 +70,8 @@ format: $(READY)
 lock:
 	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra docs --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
+	$(VENV)/bin/pip install --quiet --require-hashes -r requirements.lock
+	$(VENV)/bin/python tools/lock_box.py
 
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist site

@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay identify diagnose simulate monitor bench adaptation --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose simulate monitor bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -15,9 +15,10 @@ _emb_daemon() {
         demo) options="--corners --seconds --picture" ;;
         run) options="--config -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         check) options="--config" ;;
-        replay) options="--calibration --mapping --corner --pad-thickness --measured-torque --state --output --report --json" ;;
-        identify) options="--output --report" ;;
-        diagnose) options="--calibration --validate --output --corner" ;;
+        replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --output --report --json" ;;
+        convert) options="--mapping --output" ;;
+        identify) options="--mapping --output --report --example" ;;
+        diagnose) options="--calibration --validate --output --mapping --corner" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         bench) options="--seconds --corners --json" ;;

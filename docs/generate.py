@@ -16,6 +16,8 @@ import msgspec
 from emb_daemon.calibration import configuration, types
 from emb_daemon.effects import REGISTRY
 from emb_daemon.estimator import status
+from emb_daemon.identify import campaign
+from emb_daemon.logs import mapping
 from emb_daemon.wire import contract
 
 _HERE = Path(__file__).parent
@@ -93,7 +95,9 @@ def _struct(kind: type, path: str, out: list[str]) -> None:
     for field in msgspec.structs.fields(kind):
         text, struct = _describe(field.type)
         what = ", ".join(filter(None, (text, _default(field))))
-        meaning = comments[kind.__name__][field.name]
+        meaning = next(
+            comments[owner.__name__][field.name] for owner in kind.__mro__ if field.name in comments[owner.__name__]
+        )
         if struct and not meaning:
             meaning = (inspect.getdoc(struct) or "").splitlines()[0]
         out.append(f"| `{field.encode_name}` | {what} | {_cell(meaning)} |")
@@ -165,6 +169,18 @@ def pages() -> dict[str, str]:
             "python-can's `CAN_*` variables come before what stands here.",
             configuration.Configuration,
         ),
+        "mapping.md": _structs(
+            "Mapping file",
+            "Where our signals come from in the logs of another rig: `--mapping FILE` of the commands that read logs. "
+            "[How it is used](formats.md#another-rigs-signals); [an example](own_actuator.md).",
+            mapping.MappingFile, mapping,
+        ),
+        "campaign.md": _structs(
+            "Campaign and datasheet",
+            "What `emb-daemon identify` reads: which log plays which part, and what the supplier states. "
+            "[What to record, and why](own_actuator.md).",
+            campaign.CampaignFile, campaign,
+        ) + "\n# Datasheet\n\n" + _structs("", "", campaign.Datasheet, campaign).split("\n", 4)[4],
         "catalogue.md": _catalogue(),
         "safety.md": _safety(),
     }  # fmt: skip

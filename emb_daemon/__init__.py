@@ -1,6 +1,7 @@
 """Virtual clamp force sensor for electro-mechanical brakes.
 
-For Python programs: `load_log`, `run`, `Estimator`, `Mapping`, `load_calibration` and more; see `emb_daemon.api`.
+For Python programs: `load_log`, `log_of_arrays`, `run`, `Estimator`, `Mapping`, `load_calibration` and more; see
+`emb_daemon.api`.
 """
 
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
         Mapping,
         load_calibration,
         load_log,
+        log_of_arrays,
         run,
         shipped_calibration,
     )
@@ -28,6 +30,7 @@ __all__ = [
     "Mapping",
     "load_calibration",
     "load_log",
+    "log_of_arrays",
     "run",
     "shipped_calibration",
 ]
@@ -40,3 +43,7 @@ def __getattr__(name: str):
 
         return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

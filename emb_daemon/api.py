@@ -15,10 +15,12 @@ import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.errors import InputError
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping as Mapping
-from emb_daemon.offline import Log, estimate
+from emb_daemon.logs.resample import Series, completed, frames_of
+from emb_daemon.offline import Log, corner_index, estimate, log_of
 from emb_daemon.offline import load_log as load_log
 from emb_daemon.resources import resource
 from emb_daemon.wire import contract
@@ -66,6 +68,77 @@ def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.nda
         InputErrors: the calibration file is faulty.
     """
     return estimate(log.samples, to_parameters(_calibration(calibration)))
+
+
+#: Arguments of `log_of_arrays`: message and signal of ours.
+_ARRAYS = {
+    "angle_rad": ("EMB_{}_Resolver", "MotorAngle"),
+    "speed_rad_per_s": ("EMB_{}_Resolver", "MotorSpeed"),
+    "current_A": ("EMB_{}_Current", "CurrentQ"),
+    "inner_backplate_C": ("EMB_{}_Thermocouple", "InnerBackplateTemp"),
+    "outer_backplate_C": ("EMB_{}_Thermocouple", "OuterBackplateTemp"),
+    "caliper_C": ("EMB_{}_Thermocouple", "CaliperTemp"),
+    "wheel_speed_rad_per_s": ("VEH_WheelSpeed", "WheelSpeed{}"),
+    "wheel_pulse": ("VEH_WheelPulse", "WheelPulse{}"),
+    "force_N": ("RIG_{}_Force", "ClampForceRef"),
+    "brake_torque_Nm": ("RIG_{}_Force", "BrakeTorqueRef"),
+}
+
+
+def log_of_arrays(
+    time_s: np.ndarray,
+    angle_rad: np.ndarray | None = None,
+    speed_rad_per_s: np.ndarray | None = None,
+    current_A: np.ndarray | None = None,
+    *,
+    current_mean_s: float | None = None,
+    ambient_C: float = 20.0,
+    corner: str = "FL",
+    **columns: np.ndarray | float,
+) -> Log:
+    """Measurements of any sampling rate as a log for `run`, brought to the daemon's rate as a mapping file's are.
+
+    Args:
+        time_s: of each sample, ascending, shape (n,).
+        angle_rad: motor angle, multi-turn, any zero; without one it is the speed added up.
+        speed_rad_per_s: motor speed; without one it is the angle's change.
+        current_A: torque-producing current; None if it was not measured.
+        current_mean_s: time before its sample over which the current is a mean; None is the sampling period, 0 a current of
+            the moment.
+        ambient_C: as in `Estimator.step`; the park brake is taken to be released.
+        columns: ``inner_backplate_C``, ``outer_backplate_C``, ``caliper_C``, ``wheel_speed_rad_per_s``, ``wheel_pulse``, and
+            of reference instruments ``force_N``, ``brake_torque_Nm``; arrays of shape (n,), with NaN where nothing was
+            measured, or constants. One backing plate stands for both.
+
+    Raises:
+        InputError: neither angle nor speed, an unknown column, another number of values than times, no backing plate.
+    """
+    corner_index(corner)
+    columns |= {"angle_rad": angle_rad, "speed_rad_per_s": speed_rad_per_s, "current_A": current_A}
+    stamps = np.rint(1e9 * np.asarray(time_s, float)).astype(np.int64)
+    messages = {"VEH_Status": {"AmbientTemp": ambient_C, "ParkBrake": 0.0, "BrakeRequest": 0.0, "VehicleSpeed": 0.0}}
+    for name, values in columns.items():
+        if name not in _ARRAYS:
+            raise InputError(f"{name}: no such column; expected one of {', '.join(_ARRAYS)}")
+        if values is None:
+            continue
+        message, signal = (part.format(corner) for part in _ARRAYS[name])
+        source = float(values) if np.ndim(values) == 0 else _series(name, stamps, np.asarray(values, float))
+        if name == "current_A" and isinstance(source, Series):
+            source = source.averaged(None if current_mean_s is None else 1e9 * current_mean_s)
+        messages.setdefault(message, {})[signal] = source
+    if not isinstance(angle_rad if angle_rad is not None else speed_rad_per_s, np.ndarray | list | tuple):
+        raise InputError("angle_rad, speed_rad_per_s: expected one of them at least")
+    thermocouple = messages.get(f"EMB_{corner}_Thermocouple", {})
+    if set(thermocouple) == {"CaliperTemp"}:
+        raise InputError("caliper_C: expected inner_backplate_C or outer_backplate_C beside it")
+    return log_of(frames_of({name: completed(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
+
+
+def _series(name: str, time_ns: np.ndarray, values: np.ndarray) -> Series:
+    if values.shape != time_ns.shape:
+        raise InputError(f"{name}: expected as many values as times, found shape {values.shape} beside {time_ns.shape}")
+    return Series.of(time_ns, values)
 
 
 def _calibration(given: Calibration | str | Path | None) -> Calibration:

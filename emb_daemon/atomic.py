@@ -1,24 +1,28 @@
 """Files that are whole at every moment."""
 
 import contextlib
+import errno
 import os
 import tempfile
 from pathlib import Path
 
 
-def write_atomically(path: Path, content: bytes, mode: int = 0o644) -> None:
+def write_atomically(path: Path, content: bytes) -> None:
     """Replace ``path`` by ``content``: a reader, or a kill at any moment, finds the old file or the new one.
 
     Raises:
-        OSError: the folder cannot be written; the old file is untouched.
+        OSError: the folder cannot be written, or ``path`` is a folder, device or pipe, which a file would replace; what was
+            there is untouched.
     """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "expected a regular file or none", str(path))
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, mode)
+        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):

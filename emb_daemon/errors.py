@@ -4,13 +4,17 @@
 class InputError(Exception):
     """Unusable input (file, key, frame or argument). The command line prints it and ends with exit status 2."""
 
+    @property
+    def faults(self) -> list[str]:
+        """What is wrong, one line each."""
+        return str(self).splitlines()
+
 
 class InputErrors(InputError):
     """Several faults found in one pass over the same input, one per line."""
 
     def __init__(self, faults: list[str]):
         super().__init__("\n".join(faults))
-        self.faults = faults
 
 
 class InvalidValue(InputError, ValueError):

@@ -9,6 +9,7 @@ With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same re
 import functools
 import hashlib
 import os
+import stat
 import sys
 import tempfile
 import threading
@@ -40,21 +41,37 @@ def _cache_root() -> Path:
 
 
 def _cache_folder() -> Path:
-    """A writable folder for compiled code: the chosen one or, where that cannot be written, one for this process alone."""
+    """A writable folder for compiled code: the chosen one or, where that cannot be written or anybody could write to it, one
+    for this process alone."""
     folder = _cache_root() / _source_digest(Path(__file__).parent)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return folder
+            trouble = _foreign(folder)
     except OSError as error:
-        global _private
-        _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
-        print(
-            f"emb_daemon: cannot keep compiled code in {folder} ({error.strerror}), compiling anew at every start; "
-            "set NUMBA_CACHE_DIR to a writable folder",
-            file=sys.stderr,
-        )
-        return Path(_private.name)
+        trouble = error.strerror
+    if not trouble:
+        return folder
+    global _private
+    _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
+    print(
+        f"emb_daemon: cannot keep compiled code in {folder} ({trouble}), compiling anew at every start; "
+        "set NUMBA_CACHE_DIR to a writable folder of your own",
+        file=sys.stderr,
+    )
+    return Path(_private.name)
+
+
+def _foreign(folder: Path) -> str:
+    """Who else could have put something into the folder, or its parent: what is found there is executed. Root may use what it
+    likes, nobody else what is not his own."""
+    for path in (folder, folder.parent):
+        status = path.stat()
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            return f"{path} is writable by anybody"
+        if os.geteuid() not in (0, status.st_uid) and path == folder:
+            return f"{path} belongs to somebody else"
+    return ""
 
 
 class _Record(np.void):
@@ -141,3 +158,8 @@ def depend_on(source: Path) -> None:
     folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     config.CACHE_DIR = str(folder)
+
+
+def fields(kind: str, names: str) -> list[tuple[str, str]]:
+    """Fields of a record that compiled code reads: several of one ``kind`` (``f8``, ``i8``, ``?``), names apart by a blank."""
+    return [(name, kind) for name in names.split()]

@@ -276,7 +276,10 @@ def _complete(b, index, count):
     row.dt = cycles * CYCLE_S
     row.angle = corner.pending_angle
     row.speed = corner.pending_speed
-    row.has_current = _paired(b, index)
+    # How wrong a value is whose sender calls it degraded, nobody says. The force has another source than the current; where
+    # the resolver is degraded too, or any other signal, there is no choice.
+    doubted = b.receptions[base + wire.CURRENT].degraded and not b.receptions[base + wire.RESOLVER].degraded
+    row.has_current = _paired(b, index) and not doubted
     row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
     thermocouple = b.receptions[base + wire.THERMOCOUPLE]
     row.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
@@ -338,10 +341,14 @@ def _head(b, row, index, age):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
-        if now - b.receptions[slot].refused_ns < _SHOWN_NS:
+        doubted = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < _SHOWN_NS
+        if doubted or now - b.receptions[slot].refused_ns < _SHOWN_NS:
             reasons |= contract.E2E_ERROR
         if now - b.receptions[slot].range_ns < _SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE
+    for slot in (base + wire.RESOLVER, base + wire.CURRENT):
+        if now - b.receptions[slot].contested_ns < _SHOWN_NS:
+            reasons |= contract.CONTESTED
     if now - corner.second_sender_ns < _SHOWN_NS:
         reasons |= contract.SECOND_SENDER
     row.reasons = reasons
@@ -359,7 +366,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             period = wires.sent_cycle_ns[kind] // CYCLE_NS
             if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
                 continue
-            usable = e.source != contract.INVALID and e.mode != contract.INIT
+            usable = e.mode != contract.INIT and e.mode != contract.FAULT
             if e.mode == contract.INIT:
                 status = contract.STATUS_NOT_AVAILABLE
             elif not usable:
@@ -381,7 +388,7 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
                 values[0] = e.mode
                 values[1] = e.stiffness_factor
                 values[2] = e.contact_angle
-                values[3] = e.reasons
+                values[3] = e.reasons & 0xFFFF
             else:
                 asked = limits[e.corner]
                 values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result

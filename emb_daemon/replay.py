@@ -1,6 +1,6 @@
 """Logs through the daemon's pipeline, one after the other as one drive."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from emb_daemon.offline import corner_index, estimate
 from emb_daemon.offline.log import CAPACITY, collect, make_log
 from emb_daemon.offline.score import force_figures, temperature_figures
 from emb_daemon.pipeline import Pipeline
+from emb_daemon.wire.contract import INVALID, REASONS
 from emb_daemon.wire.layout import CORNERS
 
 #: Stands for every corner in a log.
@@ -39,6 +40,24 @@ class Result:
     reference: References
     force_N: np.ndarray
 
+    def reasons(self) -> dict[str, float]:
+        """Share of the samples that each reason stands beside, the most frequent first."""
+        bits = self.estimates["reasons"]
+        shares = {word: float(np.mean(bits >> bit & 1)) for bit, word in enumerate(REASONS)}
+        return dict(sorted(((word, share) for word, share in shares.items() if share), key=lambda item: -item[1]))
+
+    def since(self, time_ns: int) -> "Result":
+        """What came at ``time_ns`` on the log's clock or later.
+
+        Raises:
+            InputError: nothing did.
+        """
+        rows = self.time_ns >= time_ns
+        if not rows.any():
+            raise InputError(f"{self.path}: ends before --from")
+        names = ("time_ns", "estimates", "samples", "force_N")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     def figures(self) -> dict:
         """Error figures against the log's reference instruments, as far as it has any."""
         return {
@@ -46,6 +65,8 @@ class Result:
             "corner": CORNERS[self.samples["corner"][0]],
             "samples": len(self.estimates),
             "seconds": 1e-9 * float(self.time_ns[-1] - self.time_ns[0]),
+            "reasons": self.reasons(),
+            "invalid": float(np.mean(self.estimates["source"] == INVALID)),
             "force_N": force_figures(self.samples, self.estimates, self.force_N),
             "temperature_K": temperature_figures(self.estimates["time_ns"], self.estimates, self.reference),
         }
@@ -61,6 +82,8 @@ class Replay:
         state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
+        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation begins with the
+            log, or the contact angle would be unknown.
 
     Attributes:
         corners: that are estimated; of ``all`` known with the first log.
@@ -74,8 +97,11 @@ class Replay:
         measured_torque: bool = False,
         state: Path | None = None,
         read=read_frames,
+        start_s: float = 0.0,
+        end_s: float = float("inf"),
     ):
-        self._calibration, self._measured_torque, self._read = calibration, measured_torque, read
+        self._calibration, self._measured_torque, self._read_whole = calibration, measured_torque, read
+        self._start_s, self._end_s = start_s, end_s
         self._memory = Memory(state) if state else None
         self._end_ns: int | None = None
         self._pipeline: Pipeline | None = None
@@ -90,6 +116,15 @@ class Replay:
         calibrations = dict.fromkeys(corners, self._calibration)
         self.adaptation = Adaptation(calibrations, self._memory, int) if self._memory else None
         self._pipeline = Pipeline(parameters, corners, capacity=CAPACITY, adaptation=self.adaptation)
+
+    def _read(self, path: Path) -> np.ndarray:
+        frames = self._read_whole(path)
+        seconds = 1e-9 * (frames["time_ns"] - frames["time_ns"][0])
+        # Some loggers write a bus's frames a little out of order.
+        return frames[seconds <= self._end_s] if self._end_s < seconds.max() else frames
+
+    def _start_ns(self, frames: np.ndarray) -> int:
+        return int(frames["time_ns"][0]) + round(1e9 * self._start_s)
 
     def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
         """Put a log's times on the drive's clock, in place; returns what was added."""
@@ -109,10 +144,11 @@ class Replay:
         """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
         frames = self._read(path)
         self._on_the_drive(frames, path)
-        start = 0
+        start, since = 0, self._start_ns(frames)
         while start < len(frames):
             start, count = self._pipeline.consume(frames, start)
-            yield self._pipeline.broadcast(count).copy()
+            sent = self._pipeline.broadcast(count)
+            yield sent[sent["time_ns"] >= since]
 
     def run(self, path: Path) -> Result:
         """Replay one log; of several corners, the first's result.
@@ -134,10 +170,11 @@ class Replay:
             for corner, log in logs.items():
                 samples["brake_torque"][mine[corner]] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
         estimates = estimate(samples, pipeline.parameters, pipeline.states, self.adaptation)
-        return [
+        results = [
             Result(log.path, log.time_ns - shift, estimates[mine[corner]], samples[mine[corner]], log.reference, log.force_N)
             for corner, log in logs.items()
         ]
+        return [result.since(self._start_ns(frames) - shift) for result in results] if self._start_s > 0.0 else results
 
 
 def _corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
+from emb_daemon.offline.score import rmse
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
@@ -107,7 +108,7 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
                 judged = round(10.0 / CYCLE_S)
                 error = estimates["force"][-judged:] - truth["force"][:, 0][-judged:]
                 row[name] = {
-                    "rmse_N": float(np.sqrt(np.mean(error**2))),
+                    "rmse_N": rmse(error),
                     "inside_two_sigma": float(np.mean(np.abs(error) < 2.0 * estimates["sigma"][-judged:])),
                 }
                 if learner:
@@ -142,17 +143,21 @@ def specimen(number: int) -> Store:
     return Store(format=2, corner="FL", actuator="specimen", calibration=str(number), current=entry, history=(entry,) * 50)
 
 
-def _write_for_ever(memory: Memory, number: int) -> None:
+def _write_for_ever(memory: Memory, number: int, begun: int) -> None:
+    memory.save(specimen(number))
+    os.write(begun, b".")
     while True:
         number += 1
         memory.save(specimen(number))
 
 
 def kills(count: int = 500, seed: int = 1) -> dict:
-    """Kill a process that writes without pause, ``count`` times at random moments, and read what it left."""
+    """Kill a process that writes without pause, ``count`` times at random moments from its second file on, and read what it
+    left."""
     rng = np.random.default_rng(seed)
     whole = changed = 0
     newest = 1
+    waiting, begun = os.pipe()
     with tempfile.TemporaryDirectory() as folder:
         memory = Memory(Path(folder))
         memory.save(specimen(newest))
@@ -160,9 +165,10 @@ def kills(count: int = 500, seed: int = 1) -> dict:
             writer = os.fork()
             if writer == 0:
                 try:
-                    _write_for_ever(memory, newest)
+                    _write_for_ever(memory, newest + 1, begun)
                 finally:
                     os._exit(1)
+            os.read(waiting, 1)
             time.sleep(rng.uniform(0.0, 0.02))
             os.kill(writer, signal.SIGKILL)
             os.waitpid(writer, 0)
@@ -174,6 +180,8 @@ def kills(count: int = 500, seed: int = 1) -> dict:
             whole += store == specimen(found)
             changed += found != newest
             newest = found
+    for end in (waiting, begun):
+        os.close(end)
     return {"kills": count, "whole": whole, "newer_set_found": changed}
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import ADAPTING, FUSED, INIT, INVALID, RUNNING
 
 #: Noise of the reference force sensor, N, that a stated sigma need not cover.
@@ -86,10 +87,8 @@ def judge(
         # Not a number is beyond everything.
         beyond = ~(error <= 3.0 * np.hypot(estimates["sigma"], REFERENCE_SIGMA_N))
         large = ~(error <= LARGE_N) & silent
-        rmse = [
-            float(np.sqrt(np.mean((estimates[path] - reference_N)[usable] ** 2))) if usable.any() else np.nan
-            for path in ("force", "stiffness_force", "torque_force")
-        ]
+        errors = [(estimates[path] - reference_N)[usable] for path in ("force", "stiffness_force", "torque_force")]
+        fused_N, *paths_N = (rmse(path) if np.isfinite(path).all() else np.nan for path in errors)
     figures = {
         "silent": float(silent.mean()) if len(silent) else 0.0,
         "silent_beyond": _share(beyond, silent),
@@ -98,9 +97,9 @@ def judge(
         "longest_large_s": _longest(large, time_s),
         "worst_silent_N": float(error[silent].max()) if silent.any() else 0.0,
         "useful": _share((estimates["mode"] == RUNNING) & (estimates["sigma"] <= USEFUL_SIGMA_N), np.ones_like(silent)),
-        "rmse_N": rmse[0],
+        "rmse_N": fused_N,
         "sigma_N": float(np.median(estimates["sigma"][usable])) if usable.any() else np.nan,
-        "better_path_N": float(np.fmin(*rmse[1:])),
+        "better_path_N": float(np.fmin(*paths_N)),
     }
     criteria = {
         "silent beyond 3 sigma": figures["silent_beyond"] <= SILENT_BEYOND,

@@ -16,20 +16,21 @@ import numpy as np
 from msgspec.structs import replace
 from scipy.optimize import least_squares, minimize_scalar
 
-from emb_daemon.calibration.types import Calibration, Curve, to_parameters
+from emb_daemon.calibration.curves import curve_at
+from emb_daemon.calibration.parameters import CLEARANCE, INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT, moved
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.identify.calibration import assemble
 from emb_daemon.identify.campaign import Campaign, Datasheet, load_campaign
-from emb_daemon.identify.dynamics import EPISODE, Pads, clearance_guess, powers, simulate
+from emb_daemon.identify.dynamics import EPISODE, RELAXATION, TERMS, Pads, clearance_guess, curve_keys, powers, simulate
 from emb_daemon.identify.judge import Judged, at_thickness, judge
 from emb_daemon.identify.recording import Recording, recording
 from emb_daemon.identify.run import Identification, identify
-from emb_daemon.identify.steps import noise, torque
+from emb_daemon.identify.steps import noise
+from emb_daemon.identify.steps.heat import thermal_parameters
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.softening import cold_bursts
-from emb_daemon.identify.steps.thickness import predict_curve
-from emb_daemon.identify.steps.torque import NAMES, TorqueFit, Unexplained
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, TorqueStep, Unexplained
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.score import rmse
@@ -59,11 +60,12 @@ class Form:
     coefficients: np.ndarray
     damping_s: float | None
 
-    def curve(self) -> Curve:
+    def values(self, calibration: Calibration) -> dict[str, float]:
+        """The curve by the calibration's keys."""
         coefficients = self.coefficients.copy()
         # The estimator wants a force that rises from contact; a line of best fit may start flat.
         coefficients[0] = max(coefficients[0], 1e-3 * float(np.max(np.abs(coefficients))))
-        return Curve(pad_thickness_mm=self.thickness_mm, coefficients=tuple(float(c) for c in coefficients))
+        return dict(zip(curve_keys(calibration, self.thickness_mm), coefficients, strict=True))
 
 
 def _travel(log: Log) -> np.ndarray:
@@ -130,8 +132,8 @@ def _regressors(log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def unexplained(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
     """Current that the thesis's form leaves on a log."""
     rows, columns, current = _regressors(log)
-    coefficients = np.array([gear_gain, *(found.values[name] for name in NAMES[1:4])])
-    residual = current - columns @ coefficients / found.values[NAMES[0]]
+    coefficients = np.array([gear_gain, *(found.values[key] for key in (INERTIA, OFFSET_FRICTION, LOAD_FRICTION))])
+    residual = current - columns @ coefficients / found.values[TORQUE_CONSTANT]
     return Unexplained(found, rows, residual, columns[:, 2], columns[:, 0])
 
 
@@ -152,7 +154,7 @@ def regress_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
     change[:4] = np.diag([-constant / solution[0], constant, constant, constant])
     change[1:4, 0] = -solution[1:] * constant / solution[0]
     covariance = change @ jackknife(np.array(normals), np.array(scores)) @ change.T
-    return TorqueFit(dict(zip(NAMES, [constant, *(solution[1:] * constant), SIGN], strict=True)), covariance, residuals)
+    return TorqueFit(dict(zip(KEYS, [constant, *(solution[1:] * constant), SIGN], strict=True)), covariance, residuals)
 
 
 class Thesis:
@@ -161,6 +163,8 @@ class Thesis:
     def __init__(self, result: Identification):
         self.result = result
         self.sheet = result.campaign.datasheet
+        #: Ours without the effects that the thesis does not know.
+        self.plain = replace(result.calibration, effects={})
         self.forms = [form_of(pads) for pads in result.stiffness.pads]
         self.damping_s = self._damping([])
         self.torque = regress_torque([log for pads in result.stiffness.pads for log in pads.logs], self.sheet)
@@ -170,7 +174,7 @@ class Thesis:
             for entry in result.campaign.file.gear_wear
             if (log := result.campaign.load(entry.training, "gear_wear", "training")) is not None
         ]
-        self.torque_step = replace_step(result.torque, torque.sections(self.torque, self.sheet), self.torque, gears)
+        self.torque_step = TorqueStep(values=self.torque.physical(), fit=self.torque, log=result.torque.log, gears=gears)
 
     def _damping(self, without: list[float]) -> float:
         known = [form.damping_s for form in self.forms if form.damping_s and form.thickness_mm not in without]
@@ -183,17 +187,16 @@ class Thesis:
         form, damping = self.form(fold.pads.thickness_mm), self._damping([fold.pads.thickness_mm])
         others = [p for p in self.result.stiffness.pads if p is not fold.pads]
         found = regress_torque([log for pads in others for log in pads.logs], self.sheet)
-        stiffness = replace(fold.values["stiffness"], curves=(form.curve(),), relaxation_time_s=damping)
+        stiffness = form.values(self.plain) | {RELAXATION: damping}
         errors: list[Errors] = []
         for log in fold.judged:
             known = np.isfinite(log.force_N)
-            force = simulate(log, {"relaxation_time_s": damping}, form.coefficients, form.clearance)
+            force = simulate(log, moved(self.plain, stiffness), form.thickness_mm, form.clearance)
             errors.append(((force - log.force_N)[known], log.force_N[known]))
-        values = {"stiffness": stiffness, "effects": {}} | torque.sections(found, self.sheet)
+        here = {"pad_thickness_mm": form.thickness_mm, CLEARANCE: max(form.clearance, 0.0)}
         return Fold(
-            values=values,
+            values=stiffness | here | found.physical(),
             pads=fold.pads,
-            clearance_rad=form.clearance,
             judged=fold.judged,
             errors=errors,
             unexplained=[unexplained(log, found, self.sheet.actuator.gear_gain_m_per_rad) for log in fold.judged],
@@ -205,25 +208,16 @@ class Thesis:
 
     def calibration(self) -> Calibration:
         """The estimator with the thesis's models: no effects, friction by sign, curves through the loops."""
-        result, pads_mm = self.result, self.result.campaign.pad_thickness_mm
-        stiffness = replace(
-            result.calibration.stiffness,
-            curves=tuple(form.curve() for form in self.forms),
-            relaxation_time_s=self.damping_s,
-        )
-        steps = (self.torque_step, self._noise(self.folds, pads_mm), result.contact, result.thermal)
-        base = assemble(result.campaign, result.stiffness, *steps)
+        values = self.torque_step.values | self._noise(self.folds, self.result.campaign.pad_thickness_mm).values
+        for form in self.forms:
+            values |= form.values(self.plain)
         clearance = max(float(np.mean([form.clearance for form in self.forms])), 0.0)
-        return replace(base, stiffness=stiffness, effects={}, contact=replace(base.contact, clearance_rad=clearance))
+        return moved(self.plain, values | {RELAXATION: self.damping_s, CLEARANCE: clearance})
 
     def of_fold(self, fold: Fold) -> Calibration:
         """What the thesis's forms know of one thickness without its random logs."""
-        result = self.result
         others = [other for other in self.folds if other is not fold] or [fold]
-        levels = self._noise(others, result.campaign.pad_thickness_mm)
-        steps = (fold, result.contact, levels, result.thermal)
-        base = assemble(result.campaign, *steps, pad_thickness_mm=fold.pads.thickness_mm)
-        return replace(base, contact=replace(base.contact, clearance_rad=max(fold.clearance_rad, 0.0)))
+        return moved(self.plain, self._noise(others, self.result.campaign.pad_thickness_mm).values | fold.values)
 
     def judge(self) -> dict[str, Judged]:
         """By name, the same logs as ours."""
@@ -239,13 +233,9 @@ class Thesis:
             if name not in found:
                 there = at_thickness(whole, self.result.thickness, one.calibration.pad_thickness_mm)
                 if one.kind == "gear":
-                    there = replace(there, friction=gears[worn[one.log.path.name]].friction())
+                    there = moved(there, gears[worn[one.log.path.name]].friction())
                 found[name] = judge(name, one.kind, one.log, there)
         return found
-
-
-def replace_step(step: torque.TorqueStep, values: dict, fit: TorqueFit, gears: list) -> torque.TorqueStep:
-    return torque.TorqueStep(values=values, fit=fit, log=step.log, gears=gears)
 
 
 # -- heat -----------------------------------------------------------------------------------------------------------------
@@ -296,9 +286,9 @@ def moving_window(rise: np.ndarray, step_s: float, width_s: float) -> np.ndarray
     return total[row] - total[np.maximum(row - max(round(width_s / step_s), 1), 0)]
 
 
-def softening_rmse_N(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.ndarray) -> float:
+def softening_rmse_N(log: Log, heat: Recording, calibration: Calibration) -> float:
     """RMSE over bursts that fitted nothing, of a static line with the moving window; arguments as in `fit_softening`."""
-    bursts = cold_bursts(log, heat, thermal, stiffness)
+    bursts = cold_bursts(log, heat, calibration)
     force = [bursts.force_N(index) for index in range(len(bursts.rows))]
     x = [log.samples["angle"][rows] - bursts.contact for rows in bursts.rows]
     known = [np.isfinite(f) for f in force]
@@ -395,14 +385,14 @@ def thermal_lines(result: Identification) -> list[Line]:
     name = "validate: pads, torque known, K"
     if step.law and "tune" in step.fitted and name in step.figures:
         validate = recording(campaign.load(campaign.file.thermal.validate, "thermal.validate", "thermocouples"))
-        his = rmse(fit_pad(step.fitted["tune"], step.heat.parameters, step.law)(validate) - validate.measured[:8])
+        pad = fit_pad(step.fitted["tune"], thermal_parameters(result.calibration), step.law)
+        his = rmse(pad(validate) - validate.measured[:8])
         known, car = step.figures[name], step.figures["validate: pads, no torque, estimated force, K"]
         lines.append(Line("pad temperatures, validate, brake torque known", "K", "3.7", [his], [known], "≤ 2", known <= 2.0))
         lines.append(Line("the same without brake torque (as in a car)", "K", "–", [], [car], "≤ 6", car <= 6.0))
     if step.softening:
         log = campaign.load(campaign.file.thermal.pad_cooling, "thermal.pad_cooling", "bursts")
-        cold = np.array([to_parameters(result.calibration)])
-        his = softening_rmse_N(log, step.fitted["pad_cooling"], step.heat.parameters, cold)
+        his = softening_rmse_N(log, step.fitted["pad_cooling"], result.calibration)
         ours = step.softening.ours_N
         name = "curves through the cooling of the pads (bursts that fitted nothing)"
         lines.append(Line(name, "kN", "1", [1e-3 * his], [1e-3 * ours], "≤ 0.3", ours <= 300.0))
@@ -411,17 +401,17 @@ def thermal_lines(result: Identification) -> list[Line]:
 
 def frequency_lines(result: Identification) -> list[str]:
     """First-order frequency response, and what the identified dynamics make of logs that they never saw."""
-    campaign, trials = result.campaign, []
-    clearance = result.contact.values["contact"].clearance_rad
+    campaign, fit, trials = result.campaign, result.stiffness.fit, []
+    clearance = result.calibration.contact.clearance_rad
     for entry in campaign.file.frequency_response:
         log = campaign.load(entry.log, "frequency_response", "a sinusoid in contact")
         try:
-            coefficients = predict_curve(result.stiffness.fit.curves, campaign.thickness(entry))
+            coefficients = curve_at(fit.calibration.stiffness.curves, campaign.thickness(entry))[:TERMS]
         except InputError:
             continue
         if log is not None:
             static = powers(_travel(log) - clearance) @ coefficients
-            model = simulate(log, result.stiffness.fit.values, coefficients, clearance)
+            model = simulate(log, fit.calibration, campaign.thickness(entry), clearance, fit.delay_s)
             trials.append((log, entry.frequency_Hz, static, model))
     found, faults = response(trials) if trials else (None, [])
     if found is None:

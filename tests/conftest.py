@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+import collections
+import contextlib
 import os
 from pathlib import Path
 
@@ -26,6 +28,27 @@ def shared() -> Path:
 def rig(shared: Path) -> Path:
     """Logs of the simulated rig."""
     return shared / "rig"
+
+
+@pytest.fixture(scope="session")
+def counted_reads():
+    """A context that counts how often each log file is read, by name."""
+
+    @contextlib.contextmanager
+    def count():
+        from emb_daemon.logs import read
+
+        reads, plain = collections.Counter(), read.read_file
+
+        def counted(path):
+            reads[path.name] += 1
+            return plain(path)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(read, "read_file", counted)
+            yield reads
+
+    return count
 
 
 @pytest.fixture

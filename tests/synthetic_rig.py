@@ -6,12 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.campaign import Actuator, Datasheet, DiscNominal, PadNominal, Resolver
-from emb_daemon.identify.dynamics import Pads, with_dynamics
+from emb_daemon.identify.dynamics import RELAXATION, Pads, curve_keys, simulate
+from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, PRESLIDING, TORQUE_CONSTANT
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
-from emb_daemon.offline.run import stiffness_force
 from emb_daemon.wire.contract import CYCLE_S
 
 GEAR_GAIN = 4e-5
@@ -20,13 +23,18 @@ COUNT_RAD = 2.0 * np.pi / 4096
 
 @dataclass(frozen=True)
 class Truth:
-    """Parameters of one actuator, as identification names them."""
+    """Parameters of one actuator, by the calibration's keys where it has one."""
 
     dynamics: dict[str, float]
+    delay_s: float
     torque: dict[str, float]
     curves: dict[float, np.ndarray]
     clearance: float
     reference_noise_N: float
+
+    def nominal(self) -> Calibration:
+        """What identification starts from."""
+        return nominal(datasheet(0.05, 1e-4), "rig", next(iter(self.curves)), list(self.curves))
 
 
 def draw(rng: np.random.Generator, thicknesses=(4.0, 9.0)) -> Truth:
@@ -41,19 +49,19 @@ def draw(rng: np.random.Generator, thicknesses=(4.0, 9.0)) -> Truth:
     relaxation = rng.uniform(0.012, 0.05)
     return Truth(
         dynamics={
-            "relaxation_time_s": relaxation,
-            "second_relaxation.share": rng.uniform(0.03, 0.25),
-            "second_relaxation.time_constant_s": relaxation * rng.uniform(6.0, 20.0),
-            "stiffness_hysteresis.share": rng.uniform(0.008, 0.05),
-            "stiffness_hysteresis.slip_angle_rad": rng.uniform(0.4, 2.0),
-            "signal_delay.delay_s": rng.uniform(-5e-4, 1e-3),
+            RELAXATION: relaxation,
+            "effects.second_relaxation.share": rng.uniform(0.03, 0.25),
+            "effects.second_relaxation.time_constant_s": relaxation * rng.uniform(6.0, 20.0),
+            "effects.stiffness_hysteresis.share": rng.uniform(0.008, 0.05),
+            "effects.stiffness_hysteresis.slip_angle_rad": rng.uniform(0.4, 2.0),
         },
+        delay_s=rng.uniform(-5e-4, 1e-3),
         torque={
-            "torque_constant_Nm_per_A": rng.uniform(0.03, 0.08),
-            "inertia_kg_m2": rng.uniform(0.6e-4, 2e-4),
-            "offset_Nm": rng.uniform(0.015, 0.05),
-            "load_m_per_rad": rng.uniform(0.05, 0.3) * GEAR_GAIN,
-            "presliding_angle_rad": rng.uniform(0.015, 0.1),
+            TORQUE_CONSTANT: rng.uniform(0.03, 0.08),
+            INERTIA: rng.uniform(0.6e-4, 2e-4),
+            OFFSET: rng.uniform(0.015, 0.05),
+            LOAD: rng.uniform(0.05, 0.3) * GEAR_GAIN,
+            PRESLIDING: rng.uniform(0.015, 0.1),
         },
         curves=curves,
         clearance=rng.uniform(3.0, 9.0),
@@ -124,27 +132,27 @@ def _log(truth: Truth, thickness: float, path: np.ndarray, name: str, rng: np.ra
     samples["angle"], samples["speed"] = path, speed
     samples["has_current"] = True
     samples["brake_torque"] = samples["ambient"] = np.nan
-    parameters = with_dynamics(truth.dynamics)
-    parameters["curve"][0, :3] = truth.curves[thickness]
-    parameters["clearance"] = truth.clearance
-    force = stiffness_force(samples, parameters)
+    log = Log(Path(name), "FL", samples, np.arange(len(path)) * 4_000_000, SimpleNamespace(), np.zeros(len(path)))
+    known = truth.nominal()
+    curve = dict(zip(curve_keys(known, thickness), truth.curves[thickness], strict=True))
+    force = simulate(log, moved(known, truth.dynamics | curve), thickness, truth.clearance, truth.delay_s)
     t = truth.torque
     mean, state = np.zeros(len(path)), 0.0
     for row, travel in enumerate(np.diff(path), 1):
-        state, mean[row], _ = friction_state(state, 0.0, travel, t["presliding_angle_rad"], 0.0, CYCLE_S)
+        state, mean[row], _ = friction_state(state, 0.0, travel, t[PRESLIDING], 0.0, CYCLE_S)
     half = np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     # What the estimator sees of force: without the delay of the reference's clock, a detail of half a millisecond.
-    torque = GEAR_GAIN * half + t["inertia_kg_m2"] * np.r_[0.0, np.diff(speed)] / CYCLE_S
-    torque += (t["offset_Nm"] + t["load_m_per_rad"] * half) * mean
+    torque = GEAR_GAIN * half + t[INERTIA] * np.r_[0.0, np.diff(speed)] / CYCLE_S
+    torque += (t[OFFSET] + t[LOAD] * half) * mean
     coloured = np.zeros(len(path))
     drive = rng.normal(size=len(path))
     for row in range(1, len(path)):
         coloured[row] = 0.5 * coloured[row - 1] + 0.3 * np.sqrt(1.0 - 0.25) * drive[row]
-    samples["current_q"] = torque / t["torque_constant_Nm_per_A"] + coloured
+    samples["current_q"] = torque / t[TORQUE_CONSTANT] + coloured
     samples["angle"] = np.round(path / COUNT_RAD) * COUNT_RAD
     samples["speed"] = speed + rng.normal(0.0, 0.3, len(path))
-    measured = force + rng.normal(0.0, truth.reference_noise_N, len(path))
-    return Log(Path(name), "FL", samples, np.arange(len(path)) * 4_000_000, SimpleNamespace(), measured)
+    log.force_N[:] = force + rng.normal(0.0, truth.reference_noise_N, len(path))
+    return log
 
 
 def pads(truth: Truth, rng: np.random.Generator) -> list[Pads]:

@@ -52,8 +52,18 @@ def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_mode_and_missing_folder(tmp_path):
-    write_atomically(tmp_path / "a", b"x", 0o640)
-    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+def test_everybody_may_read_and_a_folder_must_be_there(tmp_path):
+    write_atomically(tmp_path / "a", b"x")
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
     with pytest.raises(OSError):
         write_atomically(tmp_path / "none" / "a", b"x")
+
+
+def test_a_device_a_pipe_or_a_folder_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "pipe", tmp_path / "folder", Path("/dev/null")):
+        before = os.stat(path).st_ino
+        with pytest.raises(OSError, match="expected a regular file or none") as caught:
+            write_atomically(path, b"x")
+        assert caught.value.filename == str(path) and os.stat(path).st_ino == before

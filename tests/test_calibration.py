@@ -1,6 +1,8 @@
 """Calibration and configuration files: every fault found at once, with its line; what is saved is what is loaded."""
 
+import os
 import re
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -191,8 +193,13 @@ def test_shapes_and_relations(tmp_path, pattern, value, expected):
         (b"format: [1\nmotor: {", "not YAML"),
         (b"a: 1\n---\nb: 2\n", "not YAML"),
         (b"\xff\xfe\x00", "not a readable text file"),
-        (b"a: &x [*x]\n", "unknown key"),
+        (b"a: &x [*x]\n", ":1: anchors and aliases"),
+        (b"format: &a 1\nname: *a\n", ":1: anchors and aliases"),
         (b"\t- a", "not YAML"),
+        (b"[" * 100_000, ":1: nested more than 50 levels"),
+        (b"format: " + b"9" * 5000, ":1: format: a number of 5000 characters"),
+        (b"format: 1." + b"9" * 5000, ":1: format: a number of 5002 characters"),
+        (b"#" * 4_000_001, "larger than 4000000 bytes"),
     ],
 )
 def test_what_is_no_calibration_at_all(tmp_path, content, expected):
@@ -201,6 +208,14 @@ def test_what_is_no_calibration_at_all(tmp_path, content, expected):
     with pytest.raises(InputErrors) as caught:
         load_calibration(path)
     assert any(expected in fault for fault in caught.value.faults)
+
+
+def test_what_is_no_file_holds_nobody_up(tmp_path):
+    """A pipe, to which nobody writes; a device that never ends."""
+    os.mkfifo(tmp_path / "calibration.yaml")
+    for path in (tmp_path / "calibration.yaml", Path("/dev/zero")):
+        with pytest.raises(InputErrors, match="not a regular file"):
+            load_calibration(path)
 
 
 @given(st.text(max_size=200))
@@ -379,6 +394,12 @@ def test_setup_lists_the_faults_of_all_files(tmp_path):
     ):
         assert expected in faults
     assert len(caught.value.faults) == 4
+    # A fault of the configuration itself hides none of theirs.
+    text = (tmp_path / "emb.yaml").read_text()
+    (tmp_path / "emb.yaml").write_text(text + "  RR: c.yaml\nlog_level: loud\n")
+    with pytest.raises(InputErrors) as again:
+        Setup(tmp_path / "emb.yaml")
+    assert set(again.value.faults) > set(caught.value.faults) and len(again.value.faults) == 6
 
 
 def test_configuration_faults(tmp_path):

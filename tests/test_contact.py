@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.records import CONTACT_UNCERTAIN, FUSED, TORQUE_ONLY
 from emb_daemon.offline import estimate, load_log
+from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED, TORQUE_ONLY
 from studies.adaptation import false_alarms
 
 #: Where the reference force starts to rise on the simulated rig's logs, rad past the released position; the stroke is the

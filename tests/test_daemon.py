@@ -1,5 +1,6 @@
 """The loop on a bus inside this process: what goes in comes out, whatever the machine does to it."""
 
+import itertools
 import os
 import shutil
 import socket
@@ -12,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_daemon.adapt import files
+from emb_daemon.adapt.snapshots import Snapshot
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.pipeline import Pipeline
@@ -38,20 +41,21 @@ def setup(tmp_path: Path) -> Setup:
 
 
 @pytest.fixture(scope="module")
-def drive() -> tuple[np.ndarray, np.ndarray]:
-    """Two seconds of the simulated car, one corner: frames, and the index of each tick's first frame."""
+def drive() -> list[np.ndarray]:
+    """Two seconds of the simulated car, one corner: the frames of each cycle."""
     plant = np.array([plant_from_calibration(load_calibration(CONFIG / "calibration.yaml"), 0)])
-    schedule = city_drive().first(2.0)
-    frames, _ = Car(plant, ("FL",), start_ns=1_000_000_000).run(commands_of(schedule, ("FL",)), schedule.drives)
-    return frames, np.flatnonzero(frames["can_id"] == 0x100)
+    schedule, start_ns = city_drive().first(2.0), 1_000_000_000
+    frames, _ = Car(plant, ("FL",), start_ns=start_ns).run(commands_of(schedule, ("FL",)), schedule.drives)
+    cycle = (frames["time_ns"] - start_ns) // CYCLE_NS
+    return np.split(frames, np.flatnonzero(np.diff(cycle)) + 1)
 
 
 class Running:
     """A daemon in a thread, and the other end of its bus."""
 
-    def __init__(self, setup: Setup, manager: ServiceManager | None = None):
+    def __init__(self, setup: Setup, manager: ServiceManager | None = None, state: Path | None = None):
         self.bus, theirs = socket_pair()
-        self.daemon = Daemon(setup, theirs, manager)
+        self.daemon = Daemon(setup, theirs, manager, state)
         self.daemon.warm_up()
         self.heard: list[np.ndarray] = []
         self._thread = threading.Thread(target=self.daemon.run)
@@ -66,6 +70,13 @@ class Running:
         assert not self._thread.is_alive(), "the loop did not end"
         self.listen()
         self.bus.close()
+
+    def send(self, frames: np.ndarray) -> np.ndarray:
+        """Put frames on the bus; returns them as a log of the bus has them."""
+        self.bus.send(frames)
+        logged = frames.copy()
+        logged["time_ns"] = self.bus._sent.raw["time_ns"][: len(frames)]
+        return logged
 
     def listen(self) -> np.ndarray:
         self.heard.append(self.bus.drain().copy())
@@ -93,21 +104,25 @@ def status_of(frames: np.ndarray) -> set[int]:
     return set(((mine >> np.uint64(12)) & np.uint64(15)).tolist())
 
 
-def test_every_sample_is_answered_as_the_pipeline_answers_it(setup: Setup, drive):
-    frames, samples = drive
-    frames, samples = frames[samples[0] :], samples - samples[0]
-    pipeline = Pipeline(setup.parameters.copy(), ("FL",))
-    pipeline.begin(int(frames["time_ns"][0]))
-    _, count = pipeline.consume(frames)
-    expected = answers(pipeline.broadcast(count).copy())
+def test_every_sample_is_answered_as_replay_answers_the_log_of_the_bus(setup: Setup, drive, monkeypatch):
+    """Whatever holds up senders and loop meanwhile, all payloads from the first sample on."""
     with Running(setup) as running:
-        for first, last in zip(samples, [*samples[1:], len(frames)], strict=True):
-            running.bus.send(frames[first:last])
+        answer, calls, log = running.daemon.pipeline.answer, itertools.count(), []
+
+        def held_up(count):
+            time.sleep(0.03 if next(calls) % 100 == 99 else 0.0)
+            answer(count)
+
+        monkeypatch.setattr(running.daemon.pipeline, "answer", held_up)
+        for cycle, frames in enumerate(drive):
+            log.append(running.send(frames))
             running.listen()
-            time.sleep(0.004)
-        heard = running.wait_for(lambda frames: len(answers(frames)) >= len(expected))
-    # In the first tenth of a second nothing is known; how little, the torque's first samples say.
-    np.testing.assert_array_equal(answers(heard)[25:], expected[25:])
+            time.sleep(0.025 if cycle % 70 == 69 else 0.004)
+        heard = running.wait_for(lambda frames: len(answers(frames)) >= len(drive))
+    pipeline, log = Pipeline(setup.parameters.copy(), ("FL",)), np.concatenate(log)
+    pipeline.begin(int(log["time_ns"][0]))
+    _, count = pipeline.consume(log)
+    np.testing.assert_array_equal(answers(heard), answers(pipeline.broadcast(count)))
 
 
 def test_silence_is_told_from_the_first_tick(setup: Setup):
@@ -162,16 +177,25 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
         assert messages[-1] == b"STOPPING=1"
 
 
+def test_a_stop_keeps_what_is_known_at_that_moment(setup: Setup, drive, tmp_path: Path):
+    with Running(setup, state=tmp_path) as running:
+        for frames in drive[:200]:
+            running.send(frames)
+            time.sleep(0.004)
+        answered = running.wait_for(lambda frames: len(answers(frames)) >= 200)
+        stopped_ns = time.time_ns()
+    kept = files.decode((tmp_path / "restart-FL.json").read_bytes(), Snapshot)
+    assert len(answered) and abs(kept.time_ns - stopped_ns) < 2_000_000_000
+    pipeline = running.daemon.pipeline
+    assert kept.state["covariance"] == pipeline.states[0]["covariance"].tolist(), "of the last sample"
+
+
 def test_an_estimate_that_is_no_number_is_a_fault_and_not_pinged(setup: Setup, drive):
     setup.parameters["relaxation_time"] = np.nan
-    frames, samples = drive
     with Running(setup) as running:
-        running.bus.send(frames[: samples[50]])
+        running.send(np.concatenate(drive[:50]))
         running.wait_for(lambda frames: FAULT in status_of(frames))
-        pings = []
-        running.daemon._manager.notify = lambda *assignments: pings.extend(assignments)
-        running.daemon._ping()
-    assert "WATCHDOG=1" not in pings
+        assert not running.daemon._ping()
 
 
 def test_frames_beyond_one_batch_are_all_sent_or_counted():

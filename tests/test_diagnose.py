@@ -201,14 +201,16 @@ def _logs(calibration, seed, effects, reference=True, stops=6):
 
 
 @pytest.fixture(scope="module")
-def uneven_disc(calibration, tmp_path_factory):
+def uneven_disc(calibration, tmp_path_factory, counted_reads):
     """The command run on a brake whose disc is uneven; (folder, report)."""
     folder = tmp_path_factory.mktemp("diagnose")
     hidden = {"disc_thickness_variation": {"order_1_cosine_um": 9.0, "order_1_sine_um": -8.0, "order_2_sine_um": 5.0}}
     for name, frames in zip(("fit", "val"), _logs(calibration, 11, hidden), strict=True):
         (folder / f"{name}.log").write_text(format_candump(frames))
     arguments = ["diagnose", str(folder / "fit.log"), "--calibration", str(resource("config/calibration.yaml"))]
-    assert main([*arguments, "--validate", str(folder / "val.log"), "--output", str(folder / "out")]) == 0
+    with counted_reads() as reads:
+        assert main([*arguments, "--validate", str(folder / "val.log"), "--output", str(folder / "out")]) == 0
+    assert reads == {"fit.log": 1, "val.log": 1}, "each log is read once"
     return folder, json.loads((folder / "out" / "report.json").read_text())
 
 

@@ -318,6 +318,40 @@ def test_sender_that_says_it_is_faulty_is_not_used(car):  # noqa: F811
     assert _at(estimates, _BEFORE + _DURING, sample=True)["source"] in (r.FUSED, r.STIFFNESS_ONLY)
 
 
+def test_a_current_whose_sender_says_it_is_degraded_is_not_relied_upon(car):  # noqa: F811
+    """Half of what flows, by a sender that has its doubts: the stiffness goes on alone, and says why."""
+
+    def degraded(frame, cycle):
+        if frame["can_id"][0] != 0x110:
+            return [frame]
+        return [_again(frame, Status=1, CurrentQ=0.5 * wirekit.decode(frame[0])[1]["CurrentQ"])]
+
+    estimates, _ = _fault(car, degraded)
+    good, _ = _fault(car, lambda frame, cycle: [frame])
+    during = estimates["cycle"] - _BEFORE
+    doubted = (during >= 0) & (during < _DURING)
+    assert np.all(estimates["reasons"][doubted] & r.E2E_ERROR) and np.all(np.isnan(estimates["torque_force"][doubted]))
+    settled = (during >= 20) & (during < _DURING)
+    assert np.all(estimates["source"][settled] == r.STIFFNESS_ONLY) and np.all(estimates["mode"][settled] == r.DEGRADED)
+    assert np.all(np.abs(estimates["force"] - good["force"])[doubted] < 3.0 * estimates["sigma"][doubted])
+    assert estimates["reasons"][-1] == 0 and estimates["source"][-1] == r.FUSED
+
+
+@pytest.mark.parametrize(
+    "message", ["EMB_FL_Resolver", "EMB_FL_Thermocouple", "VEH_WheelSpeed", "VEH_WheelPulse", "VEH_Status"]
+)
+def test_any_other_degraded_sender_is_told(car, message):  # noqa: F811
+    """There is no other source of these: used, and said."""
+
+    def degraded(frame, cycle):
+        return [_again(frame, Status=1) if wirekit.decode(frame[0])[0] == message else frame]
+
+    estimates, _ = _fault(car, degraded)
+    doubted = (estimates["cycle"] >= _BEFORE + 25) & (estimates["cycle"] < _BEFORE + _DURING)
+    assert np.all(estimates["reasons"][doubted] == r.E2E_ERROR) and np.all(estimates["source"][doubted] == r.FUSED)
+    assert estimates["reasons"][-1] == 0
+
+
 def test_restarted_controller(car):  # noqa: F811
     """Counters that begin anew cost one sample."""
     frames = _sliding(100) + [

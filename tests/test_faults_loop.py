@@ -19,6 +19,8 @@ from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.errors import Unavailable
+from emb_daemon.runtime import rawcan
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
 from emb_daemon.wire import contract as r
@@ -35,7 +37,7 @@ class Bus:
     def __init__(self):
         self.waiting: list[np.ndarray] = []
         self.dropped = self.unsent = 0
-        self.down = False
+        self.down = self.full = False
 
     def drain(self):
         frames = np.concatenate(self.waiting) if self.waiting and not self.down else np.zeros(0, FRAME)
@@ -54,6 +56,7 @@ class Driven:
         self.bus = Bus()
         self.daemon = Daemon(Setup(CONFIG), self.bus)
         self.daemon.pipeline.corners["active"] = [True, False, False, False]
+        self.daemon._active = 1
         self.daemon.pipeline.begin(0)
         self.pacer = Pacer(0)
         self.cycle = 0
@@ -144,6 +147,33 @@ def test_process_stall(driven, stall_ms):
     assert after["reasons"][5] == r.DEADLINE_MISSED and after["reasons"][-1] == 0 and np.all(after["source"] == r.FUSED)
 
 
+def test_a_current_that_is_queued_late_still_belongs_to_its_sample(driven):
+    """Stamped in time, and in the queue only after the loop has looked: replay of the bus's log pairs them, and so does the
+    loop."""
+    frames = driven._drive[driven.cycle]
+    late = [frame for frame in frames if frame["can_id"][0] == 0x110]
+    driven.bus.waiting += [frame for frame in frames if frame["can_id"][0] != 0x110]
+    looked, before = int(late[0]["time_ns"][0]) + 2_500_000, len(driven.estimates)
+    driven.daemon.tick(looked, driven.pacer)
+    driven.bus.waiting += late
+    driven.daemon.tick(looked + 500_000, driven.pacer)
+    assert len(late) == 1 and len(driven.estimates) == before + 1 and np.isfinite(driven.estimates[-1]["torque_force"])
+
+
+def test_what_a_full_batch_leaves_in_the_queue_is_not_missed(driven):
+    """After half a second's stall more is waiting than one look takes: what is still to come was not lost."""
+    stalled, smooth = driven, Driven()
+    smooth.run(150)
+    expected = smooth.run(60)
+    frames = np.concatenate([frame for cycle in range(150, 210) for frame in stalled._drive[cycle]])
+    before = len(stalled.estimates)
+    for batch in (frames[:51], frames[51:]):
+        stalled.bus.waiting, stalled.bus.full = [batch], len(batch) == 51
+        stalled.daemon.tick(210 * CYCLE_NS, stalled.pacer)
+    answered = np.array(stalled.estimates[before:])
+    assert np.all(answered["is_sample"]) and answered["force"].tobytes() == expected["force"].tobytes()
+
+
 def test_step_of_the_real_time_clock(monkeypatch):
     """Kernel stamps are of CLOCK_REALTIME. Stepped by an hour either way while frames wait, none comes from the past or the
     future, and order is kept."""
@@ -181,20 +211,40 @@ def test_a_hold_up_between_reading_two_clocks_moves_no_stamp(monkeypatch):
         assert abs(bus._offset_ns - before) < 2_000_000
 
 
-def test_a_stamp_before_the_last_drain_or_after_now_is_held_between_them():
+def test_a_stamp_that_cannot_be_is_held_between_what_was_heard_before_and_now():
     near, far = socket_pair()
-    far.drain()
-    earliest = far._last_drain_ns
     for wrong in (-(10**12), 10**12):
         batch = far._received
-        batch.raw["time_ns"][:1] = earliest + wrong
-        batch.headers["length"][:1] = 24
-        batch.headers["control_length"][:1] = 0
+        batch.raw["time_ns"][:1] = far._latest_ns + wrong
+        batch.headers["length"][:1], batch.headers["control_length"][:1] = 24, 0
         now = time.monotonic_ns()
         assert far._take(1, now)[0] == 1
-        assert earliest <= far._frames["time_ns"][0] <= now
+        assert far._latest_ns <= far._frames["time_ns"][0] <= now
     near.close()
     far.close()
+
+
+def test_a_frame_that_comes_while_the_loop_is_held_up_keeps_its_stamp(monkeypatch):
+    """Held up between looking into the queue and at the clock: what comes meanwhile is stamped before that. A log of the bus
+    has the stamp, and the estimate is to be made with it too."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs:
+        ours.bind(("127.0.0.1", 0))
+        ours.setsockopt(socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, 1)
+        theirs.connect(ours.getsockname())
+        bus, clock, sent = RawCanSocket(ours), time.monotonic_ns, []
+
+        def take(*arguments):
+            theirs.send(bytes(16))
+            sent.append(clock())
+            time.sleep(0.005)
+            return real_take(arguments[0], clock())
+
+        theirs.send(bytes(16))
+        real_take = bus._take
+        monkeypatch.setattr(bus, "_take", take)
+        assert len(bus.drain()) == 1
+        monkeypatch.undo()
+        assert bus.drain()["time_ns"][0] <= sent[0]
 
 
 def test_a_peer_that_is_gone_sends_nothing():
@@ -233,6 +283,70 @@ def test_full_disk_under_the_state_directory(tmp_path, monkeypatch, caplog, code
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation-FL.json"], "nothing half written is left"
     assert isinstance(memory_.read("FL"), Store)
     assert loop.adaptation.current("FL") is not None, "what was learned is in use all the same"
+
+
+def _pinged(daemon):
+    said = []
+    daemon._manager.notify = lambda *assignments: said.extend(assignments)
+    assert daemon._ping() == ("WATCHDOG=1" in said)
+    return "WATCHDOG=1" in said
+
+
+def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(driven):
+    """Resolver stuck, no current: Invalid, and a restart would mend nothing. A state that is no number is another matter."""
+    estimate = driven.daemon.pipeline.estimates[0]
+    for name, value in (("is_sample", True), ("source", r.INVALID), ("corner", 0)):
+        estimate[name] = value
+    driven.daemon._follow(1, driven.pacer)
+    assert _pinged(driven.daemon)
+    driven.daemon.pipeline.states[0]["alternatives"][1]["error"][2] = np.nan
+    driven.daemon._follow(1, driven.pacer)
+    assert not _pinged(driven.daemon)
+
+
+def test_a_loop_that_misses_most_of_its_ticks_is_not_well(driven, caplog):
+    driven.run(20)
+    assert _pinged(driven.daemon)
+    driven.run(100, ticks=20)
+    assert not _pinged(driven.daemon) and "80 of 100 periods missed" in caplog.text
+    driven.run(20)
+    assert _pinged(driven.daemon), "it recovered"
+
+
+def test_a_loop_that_answers_for_no_corner_is_not_well(driven, caplog):
+    assert _pinged(driven.daemon)
+    driven.daemon.ticks += 100
+    assert not _pinged(driven.daemon) and "corner FL: no estimate" in caplog.text
+
+
+def test_an_interface_that_is_down_is_no_reason_to_restart(driven):
+    driven.bus.down = True
+    driven.run(60)
+    assert _pinged(driven.daemon)
+
+
+def test_an_interface_that_was_deleted_and_added_again_is_bound_again():
+    """The old socket says once that its interface is gone, and nothing any more; another is tried for until it is there."""
+    (old, _), (new, theirs) = socket_pair(), socket_pair()
+    found = [Unavailable("no such interface"), new._socket]
+
+    def reopen():
+        result = found.pop(0)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    bus = RawCanSocket(old._socket, stamped=True, reopen=reopen)
+    bus._failed(errno.ENODEV)
+    assert len(bus.drain()) == 0 and bus.down and len(found) == 1
+    frames = np.zeros(1, FRAME)
+    frames["can_id"], frames["length"] = 0x100, 8
+    theirs.send(frames)
+    assert len(bus.drain()) == 0 and len(found) == 1, "not at every tick"
+    bus._reopen_ns -= rawcan._REOPEN_NS
+    assert bus.drain()["can_id"].tolist() == [0x100] and not bus.down and bus._reopen_ns is None
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        bus._failed(errno.EBADF)
 
 
 def test_calibration_replaced_while_clamped(driven):

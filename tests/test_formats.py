@@ -142,7 +142,7 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, factor: 3.0}", "unknown key"),
         ("EMB_FL_Resolver.MotorAngle", "EMB_FL_ClampForce.ClampForce", "expected Message.Signal of what the daemon receives"),
         ("EMB_FL_Resolver.MotorAngle", "EMB_FL_Resolver.Angle", "no such signal to map"),
-        ("  EMB_FL_Resolver.MotorSpeed: {signal: Actuator.Speed}\n", "", "MotorSpeed: missing"),
+        ("VEH_WheelSpeed.WheelSpeedFL: {value: 0.0}", "VEH_Status.AmbientTemp: {value: 20.0}", "ParkBrake: missing"),
         ("dbc: their.dbc", "dbc: none.dbc", "no such file"),
     ],
 )
@@ -158,13 +158,14 @@ def test_a_faulty_mapping_is_refused_with_its_key(tmp_path, old, new, expected):
 def test_a_log_without_the_mapped_frames_is_named(log, tmp_path):
     (tmp_path / "their.dbc").write_text(_THEIR_DBC)
     (tmp_path / "mapping.yaml").write_text(_MAPPING)
-    with pytest.raises(InputError, match="no frame of Actuator"):
+    with pytest.raises(InputError, match=r"no value of Actuator\.Position"):
         Mapping(tmp_path / "mapping.yaml").read(log)
 
 
 def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path):
     """402 s of a standing truck's J1939 bus (extended ids) as its logger wrote them. Nothing on it is a brake: a 16-bit signal
-    of 10 Hz, whatever it means, is taken for our motor angle to see it arrive."""
+    of 10 Hz, whatever it means, is taken for our motor angle to see it arrive, sample by sample: nothing is invented between
+    samples so far apart."""
     pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
     path = shared / "measured" / "road_can" / "truck_mf4" / "truck_j1939_402s.MF4"
     frames = read_frames(path)
@@ -181,9 +182,9 @@ def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path):
     words = (mine["data"] >> np.uint64(32) & np.uint64(0xFFFF)) * 0.01 - 5.0
     assert len(mine) == 3992 and np.ptp(words) > 50.0
     mapping = Mapping(tmp_path / "mapping.yaml")
-    samples = load_log(path, read=lambda _: mapping.translate(frames)).samples
+    samples = load_log(path, read=mapping.read).samples
     expected = np.interp(samples["time_ns"], mine["time_ns"], words)
-    assert len(samples) > 95_000 and np.abs(samples["angle"] - expected).max() < 2e-3
+    assert len(samples) >= len(mine) - 1 and np.abs(samples["angle"] - expected).max() < 2e-3
 
 
 @pytest.mark.parametrize("ending", [".log", ".asc", ".blf", ".trc", ".mf4"])
@@ -234,4 +235,5 @@ def test_a_measurement_has_units_comments_and_texts(log, tmp_path):
                 np.testing.assert_array_equal(signal.samples, expected)
             else:
                 assert [text.decode() for text in signal.samples] == list(expected)
-            np.testing.assert_array_equal(signal.timestamps, columns["time_s"].to_numpy())
+            stamps = file.header.start_time.timestamp() + signal.timestamps
+            np.testing.assert_allclose(stamps, columns["time_s"].to_numpy(), rtol=0.0, atol=1e-6)

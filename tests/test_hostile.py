@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import wirekit
+from fuzz import promises
 from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
@@ -59,6 +60,33 @@ def test_spoofed_frames_with_the_next_counter_come_too_early(car, undisturbed, a
     _undisturbed_by(car, strangers, undisturbed)
 
 
+@pytest.mark.parametrize("message", ["EMB_FL_Resolver", "EMB_FL_Current"])
+@pytest.mark.parametrize("ahead_ms", [0.05, 1.0, 1.9])
+def test_who_contradicts_a_sender_at_the_right_time_makes_the_force_a_fault(car, message, ahead_ms):  # noqa: F811
+    """The forged frame comes first and is taken, the genuine one is refused: which is which nobody can tell, and that is
+    said, until a second after the last."""
+    signals = {"MotorAngle": 99.0} if "Resolver" in message else {"CurrentQ": 30.0}
+    forged = [wirekit.frame(message, c * CYCLE_NS - round(ahead_ms * MS), c % 15, **signals) for c in range(150, 170)]
+    estimates, sent = _run(car, _merged(_good(500), *forged))
+    contested = (estimates["cycle"] > 151) & (estimates["cycle"] < 170 + 240)
+    assert np.all(estimates["mode"][contested] == r.FAULT) and np.all(estimates["reasons"][contested] & r.E2E_ERROR)
+    assert np.all(estimates["mode"][estimates["cycle"] > 170 + 255] != r.FAULT)
+    forces = [wirekit.decode(frame)[1] for frame in sent if frame["can_id"] == 0x200]
+    status = [frame["Status"] for frame, estimate in zip(forces, estimates, strict=True) if estimate["mode"] == r.FAULT]
+    assert set(status) == {r.STATUS_FAULT} and np.all(estimates["mode"][:150] != r.FAULT)
+    told = [wirekit.decode(frame)[1] for frame in sent if frame["can_id"] == 0x220]
+    assert max(frame["DegradedReasons"] for frame in told) < 1 << 16 and {frame["Mode"] for frame in told} >= {r.FAULT}
+
+
+def test_a_frame_that_comes_twice_contradicts_nobody(car, undisturbed):  # noqa: F811
+    """A gateway repeats what it hears: refused, and no doubt about the first."""
+    again = _merged(_good())
+    again = again[np.isin(again["can_id"], [0x100, 0x110]) & (again["time_ns"] > _KNOWN.start * CYCLE_NS)].copy()
+    again["time_ns"] += MS // 2
+    estimates = _undisturbed_by(car, [again], undisturbed)
+    assert np.all(estimates["mode"] != r.FAULT)
+
+
 @pytest.mark.parametrize("jump", range(3, 15))
 def test_counter_jumps(car, undisturbed, jump):  # noqa: F811
     _undisturbed_by(car, [_spoof(cycle, 3 * MS, cycle + jump) for cycle in _KNOWN], undisturbed)
@@ -99,6 +127,13 @@ def test_flood_with_valid_protection(car, undisturbed):  # noqa: F811
     counters = itertools.count()
     strangers = [_spoof(c, delay, next(counters)) for c in _KNOWN for delay in (300_000, 700_000, 1_100_000, 1_500_000)]
     _undisturbed_by(car, strangers, undisturbed)
+
+
+@pytest.mark.parametrize("promise", [promises.noise, promises.hostile])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_promises_among_thousands_of_random_frames(promise, seed):
+    """A short form of tests/fuzz/promises.py."""
+    assert promise(np.random.default_rng(seed), 20.0, 5000) > 15_000
 
 
 def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811

@@ -6,17 +6,22 @@ import numpy as np
 import pytest
 from synthetic_rig import datasheet, draw, pads
 
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
 from emb_daemon.identify.campaign import Campaign, CampaignFile, Datasheet
-from emb_daemon.identify.dynamics import CurveFit, fit_dynamics, regress_free, with_dynamics
+from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
 from emb_daemon.identify.steps import noise
-from emb_daemon.identify.steps.thickness import predict_curve, thickness_laws
+from emb_daemon.identify.steps.thickness import left_out_errors
 from emb_daemon.identify.steps.torque import fit_torque
 
 
 def _datasheet_of(truth, rng) -> Datasheet:
     """What a supplier would state of a rig, each value off by its tolerance's standard deviation."""
-    constant, inertia = (truth.torque[name] for name in ("torque_constant_Nm_per_A", "inertia_kg_m2"))
-    return datasheet(constant * (1.0 + 0.15 * rng.normal()), inertia * (1.0 + 0.15 * rng.normal()))
+    constant, inertia = (truth.torque[key] * (1.0 + 0.15 * rng.normal()) for key in (TORQUE_CONSTANT, INERTIA))
+    return datasheet(constant, inertia)
+
+
+def _fit(truth, groups) -> DynamicsFit:
+    return fit_dynamics(groups, starting_point(groups, truth.nominal()), search=True)
 
 
 def _deviations(seed):
@@ -24,9 +29,9 @@ def _deviations(seed):
     rng = np.random.default_rng(seed)
     truth = draw(rng)
     groups = pads(truth, rng)
-    fit = fit_dynamics(groups)
-    torque = fit_torque([log for group in groups for log in group.logs], _datasheet_of(truth, rng))
-    found = [(fit.values[name] - value) / fit.sigmas[name] for name, value in truth.dynamics.items()]
+    fit = _fit(truth, groups)
+    torque = fit_torque([log for group in groups for log in group.logs], truth.nominal(), _datasheet_of(truth, rng))
+    found = [(fit.value(key) - value) / fit.sigmas[key] for key, value in (truth.dynamics | {DELAY: truth.delay_s}).items()]
     found += [(torque.values[name] - value) / torque.sigmas[name] for name, value in truth.torque.items()]
     for curve in fit.curves:
         x = np.linspace(0.3, 0.95, 3) * curve.travel_rad
@@ -40,16 +45,16 @@ def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_t
     rng = np.random.default_rng(31)
     truth = draw(rng)
     logs = [log for group in pads(truth, rng) for log in group.logs]
-    constant, inertia = truth.torque["torque_constant_Nm_per_A"], truth.torque["inertia_kg_m2"]
-    certain = fit_torque(logs, datasheet(1.02 * constant, inertia, tolerance=1e-6))
-    assert certain.values["torque_constant_Nm_per_A"] == pytest.approx(1.02 * constant, rel=1e-5)
-    assert certain.sigmas["torque_constant_Nm_per_A"] < 1e-6 * constant
+    constant, inertia = truth.torque[TORQUE_CONSTANT], truth.torque[INERTIA]
+    certain = fit_torque(logs, truth.nominal(), datasheet(1.02 * constant, inertia, tolerance=1e-6))
+    assert certain.values[TORQUE_CONSTANT] == pytest.approx(1.02 * constant, rel=1e-5)
+    assert certain.sigmas[TORQUE_CONSTANT] < 1e-6 * constant
     sheet = datasheet(1.2 * constant, inertia, tolerance=0.15)
-    found = fit_torque(logs, sheet)
-    assert found.values["torque_constant_Nm_per_A"] == pytest.approx(constant, rel=0.01)
+    found = fit_torque(logs, truth.nominal(), sheet)
+    assert found.values[TORQUE_CONSTANT] == pytest.approx(constant, rel=0.01)
     campaign = Campaign(Path("campaign.yaml"), CampaignFile(rig="X", datasheet="datasheet.yaml"), sheet)
-    campaign.compare_with_datasheet("motor.torque_constant_Nm_per_A", found.values["torque_constant_Nm_per_A"])
-    campaign.compare_with_datasheet("motor.inertia_kg_m2", inertia)
+    campaign.compare_with_datasheet(TORQUE_CONSTANT, found.values[TORQUE_CONSTANT])
+    campaign.compare_with_datasheet(INERTIA, inertia)
     (fault,) = campaign.faults
     assert fault.startswith("motor.torque_constant_Nm_per_A: identified") and "within 15 %" in fault
 
@@ -64,18 +69,18 @@ def test_parameters_of_other_actuators_are_recovered_within_three_sigma():
 def test_fit_reaches_the_noise_of_the_reference():
     rng = np.random.default_rng(3)
     truth = draw(rng)
-    fit = fit_dynamics(pads(truth, rng))
+    fit = _fit(truth, pads(truth, rng))
     assert fit.rms == pytest.approx(truth.reference_noise_N, rel=0.03)
 
 
-@pytest.mark.parametrize("effect", ["second_relaxation", "stiffness_hysteresis"])
+@pytest.mark.parametrize("effect", [effect.name for effect in OPTIONAL])
 def test_an_effect_that_is_not_there_is_not_clear_of_zero(effect):
     rng = np.random.default_rng(5)
     truth = draw(rng)
-    truth.dynamics[f"{effect}.share"] = 0.0
-    fit = fit_dynamics(pads(truth, rng))
-    share = f"{effect}.share"
-    assert fit.values[share] < 3.0 * fit.sigmas[share] or fit.values[share] < 1e-3
+    share = f"effects.{effect}.share"
+    truth.dynamics[share] = 0.0
+    fit = _fit(truth, pads(truth, rng))
+    assert fit.value(share) < 3.0 * fit.sigmas[share] or fit.value(share) < 1e-3
 
 
 def test_the_free_regression_is_exact_on_data_of_its_form():
@@ -131,12 +136,5 @@ def test_curves_whose_compliance_grows_straight_are_predicted_exactly():
         CurveFit(t, base / (1.0 + np.array([0.04, 0.06, 0.1]) * t), np.eye(3), np.zeros(1), np.ones(1), 18.0)
         for t in (1.0, 4.0, 6.0, 11.0)
     ]
-    errors = next(iter(thickness_laws(curves).values()))
+    errors = left_out_errors(curves)
     assert errors.shape == (2,) and np.all(errors < 1e-9)
-    assert predict_curve(curves, 8.0) == pytest.approx(base / (1.0 + np.array([0.04, 0.06, 0.1]) * 8.0))
-
-
-def test_dynamics_without_effects_are_the_thesis_lag():
-    parameters = with_dynamics({"relaxation_time_s": 0.03})
-    assert parameters["effects"]["second_relaxation"]["share"][0] == 0.0
-    assert parameters["effects"]["stiffness_hysteresis"]["share"][0] == 0.0

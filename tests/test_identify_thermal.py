@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 from synthetic_rig import datasheet
 
-from emb_daemon.calibration.types import Thermal, fill_thermal
+from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import PARAMETERS, SAMPLE, THERMAL
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.steps.cooling import cooling_law
-from emb_daemon.identify.steps.friction import constant_friction, fit_friction
-from emb_daemon.identify.steps.heat import (
-    UNKNOWNS,
-    check_excitation,
-    fit_heat,
-    nominal_thermal,
-    thermal_parameters,
-    value_of,
-    with_values,
-)
+from emb_daemon.identify.steps.friction import fit_friction
+from emb_daemon.identify.steps.heat import UNKNOWNS, check_excitation, fit_heat, thermal_parameters
 from emb_daemon.identify.steps.softening import fit_softening
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import friction_power
@@ -29,9 +23,8 @@ from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
 
 SHEET = datasheet(0.05, 1e-4)
-THICKNESS_MM = 10.0
 RADIUS_M = SHEET.disc.effective_radius_m
-START = nominal_thermal(SHEET)
+START = nominal(SHEET, "rig", 10.0, [10.0])
 STEP_S = 0.2
 AMBIENT_C = 22.0
 CELLS = 60
@@ -122,40 +115,41 @@ def _draw(rng, **fixed):
     for key, unknown in UNKNOWNS.items():
         spread = 0.07 if unknown.spread < 0.1 else 0.35
         values[key] = value_of(START, key) * np.exp(rng.uniform(-spread, spread))
-    return with_values(START, values | fixed)
+    return moved(START, values | fixed)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_pads_and_disc_are_found_within_three_sigma(seed):
     rng = np.random.default_rng(seed)
     brake = _draw(rng)
-    truth = thermal_parameters(brake, THICKNESS_MM)
-    fit = fit_heat(_campaign(truth, rng), START, THICKNESS_MM)
-    off = {key: (value_of(fit.thermal, key) - value_of(brake, key)) / fit.sigmas[key] for key in UNKNOWNS}
+    truth = thermal_parameters(brake)
+    fit = fit_heat(_campaign(truth, rng), START)
+    off = {key: (fit.values[key] - value_of(brake, key)) / fit.sigmas[key] for key in UNKNOWNS}
     assert max(map(abs, off.values())) < 3.0, off
     # An honest sigma is small where the logs speak: the disc is weighed to a per cent.
-    assert fit.sigmas["disc.heat_capacity_J_per_K"] < 0.02 * brake.disc.heat_capacity_J_per_K
+    assert fit.sigmas["thermal.disc.heat_capacity_J_per_K"] < 0.02 * brake.thermal.disc.heat_capacity_J_per_K
     # What both models say of a log that fitted nothing.
     r, _ = run_plant(truth, *_cooling(12.0, 200.0, 200.0))
-    assert rmse(simulate(fit.parameters, r)[:, :8] - r.measured[:8].T) < 0.3
+    assert rmse(simulate(thermal_parameters(moved(START, fit.values)), r)[:, :8] - r.measured[:8].T) < 0.3
 
 
 def test_no_radiation_is_found_where_there_is_none():
     rng = np.random.default_rng(3)
-    truth = thermal_parameters(_draw(rng, **{"disc.radiating_area_m2": 0.0}), THICKNESS_MM)
-    fit = fit_heat(_campaign(truth, rng), START, THICKNESS_MM)
-    area = fit.thermal.disc.radiating_area_m2
-    assert 0.0 <= area < 3.0 * fit.sigmas["disc.radiating_area_m2"] + 1e-9
+    key = "thermal.disc.radiating_area_m2"
+    fit = fit_heat(_campaign(thermal_parameters(_draw(rng, **{key: 0.0})), rng), START)
+    area = fit.values[key]
+    assert 0.0 <= area < 3.0 * fit.sigmas[key] + 1e-9
     assert area < 0.1 * SHEET.disc.cooling_area_m2
 
 
 def test_the_disc_cools_faster_the_faster_it_turns():
     """Rate over speed of a disc that only loses heat to the air: loss over heat capacity, pads lending a little."""
     rng = np.random.default_rng(12)
-    brake = _draw(rng, **{"disc.radiating_area_m2": 0.0})
-    truth = thermal_parameters(brake, THICKNESS_MM)
+    brake = _draw(rng, **{"thermal.disc.radiating_area_m2": 0.0})
+    truth = thermal_parameters(brake)
     law = cooling_law([run_plant(truth, *_cooling(speed))[0] for speed in (6.0, 18.0, 36.0)], SHEET.disc)
-    expected = brake.disc.cooling_per_speed_J_per_rad_K / brake.disc.heat_capacity_J_per_K
+    disc = brake.thermal.disc
+    expected = disc.cooling_per_speed_J_per_rad_K / disc.heat_capacity_J_per_K
     assert law.per_speed == pytest.approx(expected, rel=0.15)
     assert np.all(law.biot < 0.1) and "lumped" in law.note()
     assert cooling_law([run_plant(truth, *_cooling(6.0))[0]], SHEET.disc) is None
@@ -164,15 +158,15 @@ def test_the_disc_cools_faster_the_faster_it_turns():
 def test_logs_without_a_release_say_so():
     """What only a release can tell stays where it started, and is named."""
     rng = np.random.default_rng(4)
-    fit = fit_heat([run_plant(thermal_parameters(_draw(rng), THICKNESS_MM), *_drag(300.0), 0.25, rng)[0]], START, THICKNESS_MM)
-    assert "pad.gap_conductance_W_per_m2K" in fit.unexcited
-    assert "disc.heat_capacity_J_per_K" not in fit.unexcited
+    fit = fit_heat([run_plant(thermal_parameters(_draw(rng)), *_drag(300.0), 0.25, rng)[0]], START)
+    assert "thermal.pad.gap_conductance_W_per_m2K" in fit.unexcited
+    assert "thermal.disc.heat_capacity_J_per_K" not in fit.unexcited
 
 
 def test_a_cold_log_is_named_with_what_was_needed():
     rows = 500
     still = np.zeros(rows)
-    r, _ = run_plant(thermal_parameters(START, THICKNESS_MM), still, still > 0, still, name="cold.log")
+    r, _ = run_plant(thermal_parameters(START), still, still > 0, still, name="cold.log")
     with pytest.raises(InputError, match=r"cold\.log: pads rise by 0 K; at least 30 K by braking"):
         check_excitation(r)
 
@@ -198,20 +192,19 @@ def test_friction_table_reproduces_the_law_it_was_made_with(bend):
     def law(force, speed, surface):
         return 0.42 - 4e-6 * force - 7e-4 * speed - 2e-4 * (surface - 150.0) - bend * (surface - 150.0) ** 2
 
-    truth = thermal_parameters(START, THICKNESS_MM)
+    truth = thermal_parameters(START)
     fit = fit_friction([_friction_recording(law, truth)], truth)
-    truth["friction_force"], truth["friction_speed"] = fit.table.force_N, fit.table.disc_speed_rad_per_s
-    truth["friction_temperature"], truth["friction_coefficient"] = fit.table.surface_temperature_C, fit.table.coefficient
+    found = thermal_parameters(moved(START, fit.values))[0]
     for quantile in (0.1, 0.5, 0.9):
         force, speed = np.quantile(fit.force_N, quantile), np.quantile(fit.speed_rad_per_s, 1.0 - quantile)
         surface = np.quantile(fit.temperature_C, quantile)
         expected = 2.0 * law(force, speed, surface) * RADIUS_M * force * speed
-        assert friction_power(truth[0], force, speed, surface) == pytest.approx(expected, rel=0.01)
+        assert friction_power(found, force, speed, surface) == pytest.approx(expected, rel=0.01)
 
 
 def test_noise_of_the_force_is_not_taken_for_friction():
     """At one force its noise appears on both sides of torque over force; the slope over force must stay physical."""
-    truth = thermal_parameters(START, THICKNESS_MM)
+    truth = thermal_parameters(START)
     rng = np.random.default_rng(5)
     power, touching, speed = _drag(420.0)
     speed = np.maximum(speed, 0.1)
@@ -220,11 +213,11 @@ def test_noise_of_the_force_is_not_taken_for_friction():
     r, _ = run_plant(truth, power, touching, speed)
     noisy = force + 40.0 * rng.standard_normal(len(force))
     r = Recording(r.name, STEP_S, r.inner, r.outer, r.ambient, power, touching, speed, noisy, r.measured, dense=True)
-    table = fit_friction([r], truth).table
-    assert np.ptp(np.array(table.coefficient)[:, 2, 4]) < 0.08
+    found = moved(START, fit_friction([r], truth).values)
+    assert np.ptp(np.array(found.thermal.friction.coefficient)[:, 2, 4]) < 0.08
 
 
-def _softening_log(bursts_s, mean_C, law, parameters, rng, duration_s):
+def _softening_log(bursts_s, mean_C, law, calibration, rng, duration_s):
     """(log, factors) of 5 s bursts of clamps on pads whose mean temperature is ``mean_C`` every STEP_S."""
     reference = mean_C[0]
     per_K, history_per_K, time_constant = law
@@ -244,24 +237,21 @@ def _softening_log(bursts_s, mean_C, law, parameters, rng, duration_s):
         rows = (times >= start) & (times < start + 10.0)
         samples["angle"][rows] = 9.0 - 9.0 * np.cos(2.0 * np.pi * 0.2 * (times[rows] - start))
     samples["wheel_speed"] = 0.0
-    forces = stiffness_force(samples, parameters, np.interp(times, grid, factor))
+    forces = stiffness_force(samples, to_parameters(calibration), np.interp(times, grid, factor))
     forces += 25.0 * rng.standard_normal(len(forces))
     return Log(Path("bursts.log"), "FL", samples, np.round(1e9 * times).astype(np.int64), None, forces)
 
 
-def _stiffness_parameters():
-    p = np.zeros(1, PARAMETERS)
-    p["gear_gain"] = 4e-5
-    p["curve"][0, :3] = 230.0, 27.0, 0.45
-    p["relaxation_time"] = 0.028
-    p["clearance"] = 5.0
-    return p
+def _stiff():
+    """Pads of which `_softening_log` takes the stiffness."""
+    curve = {f"stiffness.curves[0].coefficients[{n}]": value for n, value in enumerate((230.0, 27.0, 0.45))}
+    return moved(START, curve | {"stiffness.relaxation_time_s": 0.028, "contact.clearance_rad": 5.0})
 
 
 @pytest.fixture(scope="module")
 def cooled():
     """Braked for three minutes, then parked for two hours: (recording, mean temperature)."""
-    truth = thermal_parameters(START, THICKNESS_MM)
+    truth = thermal_parameters(START)
     power, touching, speed = _cooling(0.0, 180.0, 7000.0)
     start = round(30.0 / STEP_S)
     rest = np.zeros(start)
@@ -273,76 +263,35 @@ def cooled():
 @pytest.mark.parametrize(("law", "seed"), [((5e-4, 1.2e-3, 1500.0), 6), ((3e-4, 8e-4, 3000.0), 7)])
 def test_softening_and_its_history_are_found(cooled, law, seed):
     r, mean_C = cooled
-    p = _stiffness_parameters()
+    p = _stiff()
     bursts = [5.0, *np.arange(240.0, 7000.0, 400.0)]
     log = _softening_log(bursts, mean_C, law, p, np.random.default_rng(seed), r.time_s[-1])
-    fit = fit_softening(log, r, thermal_parameters(START, THICKNESS_MM), p)
-    found = (fit.softening.per_K, fit.softening.history_per_K, fit.softening.history_time_s)
-    for value, expected, sigma in zip(found, law, fit.sigmas.values(), strict=True):
-        assert abs(value - expected) < 3.0 * sigma, (found, law, fit.sigmas)
+    fit = fit_softening(log, r, p)
+    for (key, sigma), expected in zip(fit.sigmas.items(), law, strict=True):
+        assert abs(fit.values[key] - expected) < 3.0 * sigma, key
     # 25 N is the sensor.
     assert fit.ours_N < 27.0 < 0.2 * fit.uncorrected_N
 
 
 def test_softening_without_history_gets_none(cooled):
     r, mean_C = cooled
-    p = _stiffness_parameters()
+    p = _stiff()
     bursts = [5.0, *np.arange(240.0, 7000.0, 400.0)]
     log = _softening_log(bursts, mean_C, (6e-4, 0.0, 1000.0), p, np.random.default_rng(8), r.time_s[-1])
-    fit = fit_softening(log, r, thermal_parameters(START, THICKNESS_MM), p)
-    assert fit.softening.per_K == pytest.approx(6e-4, rel=0.02)
-    assert abs(fit.softening.history_per_K) * np.ptp(fit.rise_K) < 2e-3
+    fit = fit_softening(log, r, p)
+    assert fit.values["thermal.softening.per_K"] == pytest.approx(6e-4, rel=0.02)
+    assert abs(fit.values["thermal.softening.history_per_K"]) * np.ptp(fit.rise_K) < 2e-3
 
 
 def test_too_few_bursts_are_named():
-    r, mean_C = run_plant(thermal_parameters(START, THICKNESS_MM), *_cooling(0.0, 100.0, 100.0))
-    log = _softening_log([5.0, 120.0], mean_C, (5e-4, 0.0, 1000.0), _stiffness_parameters(), np.random.default_rng(9), 199.0)
+    r, mean_C = run_plant(thermal_parameters(START), *_cooling(0.0, 100.0, 100.0))
+    log = _softening_log([5.0, 120.0], mean_C, (5e-4, 0.0, 1000.0), _stiff(), np.random.default_rng(9), 199.0)
     with pytest.raises(InputError, match=r"bursts\.log: 2 bursts of clamps; at least"):
-        fit_softening(log, r, thermal_parameters(START, THICKNESS_MM), _stiffness_parameters())
-
-
-def test_calibration_of_an_unknown_brake_is_complete():
-    """Every value that the record holds has a place in the calibration, and comes back from it."""
-    p = np.zeros(1, THERMAL)
-    fill_thermal(p[0], _some_thermal(), 0.010)
-    for name in THERMAL.names:
-        assert np.all(np.isfinite(p[name])), name
-    assert p["surface_cooling_per_speed"][0] == 0.2
-    assert p["reference"][0] == 25.0
-
-
-def _some_thermal():
-    import msgspec
-
-    return msgspec.convert(
-        {
-            "pad": {
-                "area_m2": 0.0046,
-                "density_kg_per_m3": 2450.0,
-                "conductivity_W_per_mK": 1.2,
-                "specific_heat_J_per_kgK": 1200.0,
-                "inner_heat_share": 0.04,
-                "outer_heat_share": 0.04,
-                "contact_conductance_W_per_m2K": 1500.0,
-                "gap_conductance_W_per_m2K": 300.0,
-                "surface_cooling_per_speed_J_per_rad_m2K": 0.2,
-                "backplate_conductance_W_per_m2K": 5000.0,
-            },
-            "disc": {
-                "heat_capacity_J_per_K": 2700.0,
-                "effective_radius_m": 0.131,
-                "cooling_W_per_K": 1.7,
-                "cooling_per_speed_J_per_rad_K": 0.4,
-            },
-            "friction": msgspec.to_builtins(constant_friction(0.4)),
-            "softening": {"reference_C": 25.0},
-        },
-        Thermal,
-    )
+        fit_softening(log, r, _stiff())
 
 
 def test_datasheet_start_is_the_datasheet():
-    p = thermal_parameters(START, THICKNESS_MM)
+    p = thermal_parameters(START)
     assert float(p["disc_heat_capacity"][0]) == pytest.approx(5.6 * 480.0)
     assert float(p["specific_heat"][0]) == 1200.0
     assert p["node_position"][0, -1] == pytest.approx(0.010)

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import emb_daemon
 from emb_daemon.jit import _source_digest
 
@@ -51,6 +53,19 @@ def test_compiled_code_goes_where_it_is_told(tmp_path):
     assert done.returncode == 0 and not done.stderr
     assert Path(done.stdout.strip()).parent == tmp_path / "cache"
     assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was kept"
+
+
+@pytest.mark.parametrize("below", [True, False])
+def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, below):
+    """What is found there is executed."""
+    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    folder = Path(done.stdout.strip())
+    (folder if below else folder.parent).chmod(0o777)
+    for file in folder.rglob("*.nb?"):
+        file.write_bytes(b"not what was compiled")
+    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert done.returncode == 0 and "is writable by anybody" in done.stderr
+    assert Path(done.stdout.strip()) != folder
 
 
 def test_an_unwritable_folder_is_told_of_once_and_does_without(tmp_path):

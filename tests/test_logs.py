@@ -1,6 +1,7 @@
 """Log files: our bulk reader beside python-can's, and what is said of files that are damaged."""
 
 import gzip
+import os
 
 import can
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_daemon.errors import InputError
+from emb_daemon.logs import read
 from emb_daemon.logs.candump import format_candump, parse_candump
 from emb_daemon.logs.columns import Decoder, References
 from emb_daemon.logs.read import read_frames
@@ -124,6 +126,18 @@ def test_names_with_dots(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(gzip.compress(_GOOD.encode()) if name.endswith("gz") else _GOOD.encode())
     assert len(read_frames(path)) == 1
+
+
+def test_what_is_too_large_or_no_file_is_not_read(tmp_path, monkeypatch):
+    """A gzip bomb, and a pipe to which nobody writes."""
+    bomb, pipe = tmp_path / "bomb.log.gz", tmp_path / "pipe.log"
+    bomb.write_bytes(gzip.compress(b"\n" * 10_000_000))
+    os.mkfifo(pipe)
+    monkeypatch.setattr(read, "_most_bytes", lambda: 5_000_000)
+    with pytest.raises(InputError, match="unpacks to more than 5000000 bytes"):
+        read_frames(bomb)
+    with pytest.raises(InputError, match="not a regular file"):
+        read_frames(pipe)
 
 
 def test_a_gzipped_log_that_is_cut_off_is_read_up_to_the_cut(tmp_path, capsys):

@@ -22,6 +22,7 @@ from emb_daemon.errors import InputError, Unavailable
         (OSError(errno.ENOSPC, "No space left on device"), 1, "emb-daemon check: No space left on device"),
         (ModuleNotFoundError("x", name="scipy.optimize"), 2,
          "emb-daemon check needs scipy.optimize: pip install 'emb_daemon[offline]'"),
+        (MemoryError(), 2, "emb-daemon check: this machine has not the memory for that"),
         (KeyboardInterrupt(), 130, None),
     ],
 )  # fmt: skip

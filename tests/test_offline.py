@@ -93,7 +93,7 @@ _TRUTH = {"amplitude": 3.0, "rate": 0.8, "offset 0": 1.0, "offset 1": -2.0}
 def test_fit_recovers_what_was_put_in():
     found = _two_logs(np.random.default_rng(1), lambda rng, n: np.zeros(n))
     assert found.values == pytest.approx(_TRUTH, rel=1e-6)
-    assert found.converged and not found.at_bound and found.rms < 1e-6
+    assert found.rms < 1e-6
 
 
 def test_sigmas_are_the_spread_of_many_fits_with_autocorrelated_noise():
@@ -110,19 +110,12 @@ def test_sigmas_are_the_spread_of_many_fits_with_autocorrelated_noise():
     assert np.mean([b[0, 1] / np.sqrt(b[0, 0] * b[1, 1]) for b in blocks]) == pytest.approx(correlation, abs=0.15)
 
 
-def _line(data, sigma=1.0, **options):
-    """Offset and slope of data over 0 to 1; an episode has five samples."""
-    x = np.linspace(0.0, 1.0, len(data))
-    block = Block(lambda v: (v["offset"] + v["slope"] * x - data) / sigma, ("offset", "slope"), np.arange(len(data)) // 5)
-    free = {"offset": Free(0.0, 1e-3), "slope": Free(0.0, 1e-3)} | options.pop("free", {})
-    return fit([block], free, **options)
-
-
-def test_bounds_hold_and_are_told():
-    found = _line(1.0 + 3.0 * np.linspace(0.0, 1.0, 100), free={"slope": Free(0.0, 1e-3, -1.0, 2.0)})
+def test_bounds_hold():
+    x = np.linspace(0.0, 1.0, 100)
+    block = Block(lambda v: v["offset"] + v["slope"] * x - 1.0 - 3.0 * x, ("offset", "slope"), np.arange(100) // 5)
+    found = fit([block], {"offset": Free(0.0, 1e-3), "slope": Free(0.0, 1e-3, -1.0, 2.0)})
     assert found.values["slope"] == pytest.approx(2.0)
     assert found.values["offset"] == pytest.approx(1.5)
-    assert found.at_bound == {"slope"}
 
 
 def test_a_prior_weighs_as_much_as_it_says():
@@ -150,16 +143,6 @@ def test_a_given_derivative_does_what_difference_quotients_do():
     assert given.sigmas["a"] == pytest.approx(quotients.sigmas["a"], rel=1e-4)
 
 
-def test_huber_leaves_gross_errors_little_say():
-    rng = np.random.default_rng(3)
-    data = 1.0 + 3.0 * np.linspace(0.0, 1.0, 400) + rng.normal(0.0, 0.1, 400)
-    data[::20] += 50.0
-    plain, robust = _line(data, 0.1), _line(data, 0.1, huber=2.5)
-    assert abs(plain.values["offset"] - 1.0) > 1.0
-    assert robust.values == pytest.approx({"offset": 1.0, "slope": 3.0}, abs=0.1)
-    assert robust.sigmas["offset"] < 0.05
-
-
 # -- score ----------------------------------------------------------------------------------------------------------------
 
 
@@ -169,7 +152,7 @@ def test_figures_of_known_errors():
     assert figures(np.full(3, np.nan)) == {"samples": 0}
     assert rmse(np.array([1.0, 3.0]), np.array([3.0, 1.0])) == pytest.approx(np.sqrt(3.0))
     assert share_inside(error, np.full(5, 1.6)) == 0.75
-    assert share_inside(error, np.full(5, 1.6), sigmas=1.0) == 0.5
+    assert share_inside(error, np.full(5, 0.8)) == 0.5
 
 
 def test_episode_errors_are_those_of_the_samples_chosen():
@@ -191,8 +174,8 @@ def _mean_of_squares(node: ast.AST) -> bool:
     return any(text.endswith("** 2") for text in squared)
 
 
-#: Packages of the box, which cannot know the bench: what they square and average judges no estimate.
-#: `adapt/fit.py` squares and averages the difference between two fits of its own.
+#: Packages of the box, which cannot know the bench: what they square and average judges no estimate (`adapt/fit.py` does so
+#: with the difference between two fits of its own).
 _BOX = {"wire", "models", "effects", "estimator", "calibration", "adapt", "runtime"}
 
 
@@ -202,10 +185,10 @@ def _is_root(node: ast.AST) -> bool:
 
 def test_an_rmse_is_computed_in_one_module():
     package = Path(emb_daemon.__file__).parent
+    bench = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in _BOX]
     found = set()
-    for path in package.rglob("*.py"):
-        if path.relative_to(package).parts[0] not in _BOX:
-            roots = filter(_is_root, ast.walk(ast.parse(path.read_text())))
-            if any(_mean_of_squares(argument) for root in roots for argument in root.args):
-                found.add(str(path.relative_to(package)))
-    assert {name for name in found if not name.startswith("diagnose/")} == {"offline/score.py"}
+    for path in [*bench, *package.parent.glob("studies/*.py")]:
+        roots = filter(_is_root, ast.walk(ast.parse(path.read_text())))
+        if any(_mean_of_squares(argument) for root in roots for argument in root.args):
+            found.add(str(path.relative_to(package.parent)))
+    assert found == {"emb_daemon/offline/score.py"}

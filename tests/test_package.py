@@ -47,6 +47,22 @@ def test_the_wheel_is_complete(built):
         )
 
 
+def test_the_wheel_is_the_same_whenever_it_is_built(built, tmp_path, monkeypatch):
+    from hatchling.build import build_wheel
+
+    monkeypatch.chdir(_ROOT)
+    assert (tmp_path / build_wheel(str(tmp_path))).read_bytes() == built[0].read_bytes()
+
+
+def test_the_box_has_a_lock_of_its_own():
+    """Otherwise: python tools/lock_box.py."""
+    command = [sys.executable, str(_ROOT / "tools" / "lock_box.py"), "--check"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    lock = (_ROOT / "requirements-box.lock").read_text()
+    assert "numba==" in lock and "scipy==" not in lock and lock.count("==") <= lock.count("--hash=sha256:")
+
+
 def test_the_sdist_can_be_tested_and_documented(built):
     with tarfile.open(built[1]) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}

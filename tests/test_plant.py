@@ -16,7 +16,7 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios
 from emb_daemon.plant.brake import move_motor, static_curve
 from emb_daemon.plant.car import CYCLE_S, Car, idle
-from emb_daemon.plant.derive import plant_from_calibration, wear_pads
+from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.heat import cell_count, heat_cycle
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.records import EFFECTS, FORCE, LATCH, PLANT_STATE, SUBSTEP_S
@@ -184,7 +184,7 @@ def test_friction_heat_is_stored_or_lost(calibration, thickness):
     plant = plant_from_calibration(calibration, pad_thickness_mm=thickness)
     car = Car(np.atleast_1d(plant))
     before = stored_heat(plant, car.states[0])
-    schedule = scenarios.rig_drag(5000.0, 40.0, 60.0) + scenarios.rig_cooling(20.0, 60.0)
+    schedule = scenarios.rig_drag(5000.0, 40.0, 60.0) + scenarios.rest(60.0, 20.0)
     car.run(schedule.commands[:, None], schedule.drives)
     state = car.states[0]
     gained = stored_heat(plant, state) - before
@@ -283,16 +283,6 @@ def test_the_plant_can_have_every_effect_of_the_catalogue():
         assert [field.name for field in EFFECTS[effect.name]] == [parameter.name for parameter in effect.parameters]
 
 
-def test_worn_pads_are_stiffer_and_touch_later(calibration):
-    plant = plant_from_calibration(calibration, seed=2)
-    angle, stroke = scenarios.angle_at(plant, 8000.0), scenarios.angle_at(plant, 8000.0) - plant["contact_angle"]
-    wear_pads(plant, calibration, 1.5)
-    assert plant["pad_thickness"] == pytest.approx(0.0085)
-    assert scenarios.angle_at(plant, 8000.0) - plant["contact_angle"] < stroke
-    # 1.5 mm less on a gear gain of 39.8 um/rad, less what the stiffer pads save.
-    assert scenarios.angle_at(plant, 8000.0) - angle == pytest.approx(1.5e-3 / plant["gear_gain"], rel=0.05)
-
-
 def test_the_latch_holds_the_brake_without_current(bare):
     car = Car(np.atleast_1d(bare))
     schedule = scenarios.park(9000.0, 5.0).first(3.0) + scenarios.rest(4.0)
@@ -384,8 +374,13 @@ def test_an_effect_is_neutral_at_zero_and_shows_otherwise(calibration, name):
 
 @pytest.fixture(scope="module")
 def campaign(calibration):
-    plant = plant_from_calibration(calibration)
-    return scenarios.rig_campaign(plant, np.random.default_rng(0), stops=6, drag_seconds=20.0)
+    """Training, random angle, stops on a rotating disc, a long drag, random angle again."""
+    plant, rng = plant_from_calibration(calibration), np.random.default_rng(0)
+    schedule = scenarios.training(plant) + scenarios.random_angle(plant, 22.0, rng)
+    for _ in range(6):
+        force = float(np.exp(rng.uniform(np.log(2000.0), np.log(25000.0))))
+        schedule += scenarios.rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.5), rng.uniform(7.0, 11.0))
+    return schedule + scenarios.rig_drag(3500.0, 31.4, 20.0) + scenarios.random_angle(plant, 20.0, rng)
 
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
@@ -426,7 +421,7 @@ def test_thickness_variation_shows_at_the_wheels_orders_and_only_when_it_turns(b
 
 def test_a_late_resolver_reads_the_past(calibration):
     plant = plant_from_calibration(calibration, effects={"signal_delay": {"delay_s": 0.003}})
-    frames, truth = scenarios.simulate_log(plant, scenarios.sinusoid(plant, 2.0, 4.0))
+    frames, truth = scenarios.simulate_log(plant, scenarios.training(plant, 6.0))
     behind = truth["angle"][:, 0] - Decoder().columns(frames, "EMB_FL_Resolver")["MotorAngle"]
     speed = truth["speed"][:, 0]
     assert np.dot(behind, speed) / np.dot(speed, speed) == pytest.approx(0.003, rel=0.1)

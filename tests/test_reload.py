@@ -184,6 +184,33 @@ def test_the_last_of_quick_reloads_counts(daemon, folder):
     assert daemon.pipeline.parameters[0]["clearance"] == 8.0 and reading[:2] == [1, 1]
 
 
+def test_the_service_manager_hears_when_a_reload_begins_and_ends(daemon, folder):
+    """Of two quick ones the end is the end of both; a refused file ends one too."""
+    said, real = [], daemon._read_calibrations
+    daemon._manager.notify = lambda *assignments: said.append(assignments)
+    go_on = threading.Event()
+    daemon._read_calibrations = lambda: (go_on.wait(20.0), real())
+    before_us = time.monotonic_ns() // 1000
+    for _ in range(2):
+        daemon.reload()
+        daemon._follow_reload()
+    go_on.set()
+    reload_now(daemon)
+    assert [words[0] for words in said[-2:]] == ["RELOADING=1", "READY=1"] and said.count(("READY=1",)) == 1
+    assert before_us <= int(said[0][1].removeprefix("MONOTONIC_USEC=")) <= time.monotonic_ns() // 1000
+    (folder / "calibration.yaml").write_text("[")
+    reload_now(daemon)
+    assert said[-1] == ("READY=1",) and said[-2][0] == "RELOADING=1"
+
+
+def test_what_is_read_is_taken_by_the_loop_alone(daemon, folder):
+    """The reader ends between two looks of the loop at what waits: nothing changes under its hands."""
+    save_calibration(moved(SHIPPED, {"contact.clearance_rad": 7.0}), folder / "calibration.yaml")
+    waiting = daemon._waiting
+    daemon._read_calibrations()
+    assert daemon._waiting is waiting and not waiting
+
+
 def test_a_storm_of_signals_stops_nothing(daemon):
     """A handler that waited for a lock would wait for the loop that it interrupts."""
     before = signal.signal(signal.SIGHUP, lambda *_: daemon.reload())

@@ -1,5 +1,9 @@
 """What survives a restart: stored whole, given back to the same brake alone, and never believed when damaged."""
 
+import errno
+import hashlib
+import os
+
 import adaptkit
 import msgspec
 import numpy as np
@@ -10,8 +14,9 @@ from hypothesis import strategies as st
 
 from emb_daemon.adapt import files
 from emb_daemon.adapt.adaptation import Adaptation
-from emb_daemon.adapt.memory import Memory
+from emb_daemon.adapt.memory import Memory, hold
 from emb_daemon.adapt.snapshots import Snapshots, from_fields, to_fields
+from emb_daemon.errors import Unavailable
 
 INNER = np.dtype([("phase", "f8"), ("seen", "?")])
 RECORD = np.dtype([("angle", "f8"), ("count", "i8"), ("known", "?"), ("pads", "f8", (2, 3)), ("wheel", INNER)], align=True)
@@ -77,6 +82,45 @@ def test_it_belongs_to_one_corner_actuator_and_calibration(tmp_path):
         assert found is None and "not used" in warning and snapshots.path("FL").exists()
 
 
+@pytest.mark.parametrize("content", [b"[" * 200_000, b'{"a":' + b"9" * 5000 + b"}", b"{}", b"\xff" * 100])
+def test_whatever_a_file_holds_the_corner_starts(tmp_path, content):
+    sealed = b'{"sha256":"%s","content":%s}' % (hashlib.sha256(content).hexdigest().encode(), content)
+    snapshots, memory = Snapshots(tmp_path, RECORD), Memory(tmp_path)
+    for path in (snapshots.path("FL"), memory.path("FL")):
+        path.write_bytes(sealed)
+    found, _, warning = snapshots.load("FL", SHIPPED)
+    store, other = memory.load("FL", SHIPPED)
+    assert found is None and store.current is None and "damaged" in warning and "damaged" in other
+
+
+def test_what_is_no_file_holds_nobody_up(tmp_path):
+    """A pipe, to which nobody writes, in place of the file; a file that never ends."""
+    snapshots, memory = Snapshots(tmp_path, RECORD), Memory(tmp_path)
+    os.mkfifo(snapshots.path("FL"))
+    memory.path("FL").write_bytes(bytes(files._MOST_BYTES + 1))
+    assert "not a regular file" in snapshots.load("FL", SHIPPED)[2]
+    assert "larger than" in memory.load("FL", SHIPPED)[1]
+
+
+def test_a_state_directory_is_one_daemons(tmp_path):
+    held = hold(tmp_path / "state")
+    with pytest.raises(Unavailable, match="another process"):
+        hold(tmp_path / "state")
+    os.close(held)
+    os.close(hold(tmp_path / "state"))
+
+
+def test_a_file_that_cannot_be_set_aside_stops_nothing(tmp_path, monkeypatch):
+    snapshots = Snapshots(tmp_path, RECORD)
+    snapshots.path("FL").write_bytes(b"{")
+
+    def read_only(*_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, "replace", read_only)
+    assert "not set aside: Read-only file system" in snapshots.load("FL", SHIPPED)[2]
+
+
 def test_a_file_of_another_format_is_set_aside(tmp_path):
     snapshots = Snapshots(tmp_path, RECORD)
     snapshots.save("FL", SHIPPED, record(), 1)
@@ -110,6 +154,21 @@ def test_a_restart_goes_on_with_the_first_sample(driven, tmp_path):
     loop.run(parked(0.5))
     state = loop.pipeline.states[0]
     assert state["resumed"] and state["clearance"] == pytest.approx(contact_angle, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("clearance", 90.0), ("clearance_sigma", -1.0), ("scale", 10.0), ("growth", 1.0), ("disc", 5000.0), ("winding", 9.0),
+     ("history", 1e9), ("temperature_sigma", None), ("error", [9e9] * 14), ("covariance", [[1.0] * 13 + [2.0]] * 14)],
+)  # fmt: skip
+def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name, value):
+    """The checksum is right, the values are not."""
+    loop, _, stopped_ns = driven
+    path = tmp_path / "restart-FL.json"
+    content = files.decode(path.read_bytes(), dict)
+    path.write_bytes(files.encode(content | {"state": content["state"] | {name: value}}))
+    restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
+    assert f"{name}: beyond what this brake can have" in caplog.text and not loop.adaptation._resumable
 
 
 def test_a_snapshot_from_the_future_is_not_used(driven, tmp_path, caplog):

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from synthetic_rig import datasheet, draw, pads
 
-from emb_daemon.identify.steps.heat import nominal_thermal, thermal_parameters
+from emb_daemon.identify.calibration import nominal
+from emb_daemon.identify.steps.heat import thermal_parameters
+from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, TORQUE_CONSTANT
 from studies.frequency import fit_first_order, phasor, steady_rows
 from studies.thesis import best_fit_line, moving_window, regress_damping, regress_torque
 from studies.thesis_pad import thesis_nodes, thesis_profiles
@@ -42,16 +44,16 @@ def test_friction_by_sign_is_found_where_friction_jumps():
     truth = draw(rng)
     log = pads(truth, rng)[0].logs[1]
     angle, force, t = log.samples["angle"], log.force_N, truth.torque
-    constant, gear_gain = t["torque_constant_Nm_per_A"], datasheet(1.0, 1.0).actuator.gear_gain_m_per_rad
+    constant, gear_gain = t[TORQUE_CONSTANT], datasheet(1.0, 1.0).actuator.gear_gain_m_per_rad
     step = np.diff(angle, prepend=angle[0])
     moved = np.maximum.accumulate(np.where(step != 0.0, np.arange(len(angle)), 0))
     sign, mean = np.sign(step[moved]), np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     second = np.r_[0.0, 0.0, angle[2:] - 2.0 * angle[1:-1] + angle[:-2]] / 0.004**2
-    torque = gear_gain * mean + t["inertia_kg_m2"] * second + (t["offset_Nm"] + t["load_m_per_rad"] * mean) * sign
+    torque = gear_gain * mean + t[INERTIA] * second + (t[OFFSET] + t[LOAD] * mean) * sign
     log.samples["current_q"] = torque / constant
-    found = regress_torque([log], datasheet(constant, t["inertia_kg_m2"])).values
-    expected = {name: t[name] for name in ("torque_constant_Nm_per_A", "inertia_kg_m2", "offset_Nm", "load_m_per_rad")}
-    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    found = regress_torque([log], datasheet(constant, t[INERTIA])).values
+    expected = {key: t[key] for key in (TORQUE_CONSTANT, INERTIA, OFFSET, LOAD)}
+    assert {key: found[key] for key in expected} == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_moving_window_forgets_after_its_width():
@@ -89,7 +91,7 @@ def test_steady_rows_leave_out_the_approach_and_refuse_another_frequency():
 
 
 def _thesis_parameters():
-    p = thermal_parameters(nominal_thermal(datasheet(0.05, 1e-4)), 10.0)
+    p = thermal_parameters(nominal(datasheet(0.05, 1e-4), "rig", 10.0, [10.0]))
     p["conductivity_rise"] = 0.0
     return p
 

@@ -17,10 +17,11 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import compile_fit, fit_training
-from emb_daemon.adapt.learned import CLEARANCE, Evaluation, with_learned
+from emb_daemon.adapt.learned import Evaluation, with_learned
 from emb_daemon.adapt.memory import Entry, Memory, Store, entry_of, with_entry
 from emb_daemon.adapt.snapshots import Snapshots
 from emb_daemon.adapt.training import answer_adapting
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
@@ -72,10 +73,13 @@ class Adaptation:
         for name, calibration in calibrations.items():
             self.replace(name, calibration, self.read(name, calibration))
             if self._snapshots:
-                snapshot, time_ns, warning = self._snapshots.load(name, self.in_use(name))
+                in_use = self.in_use(name)
+                snapshot, time_ns, warning = self._snapshots.load(name, in_use)
+                if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
+                    warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
                 if warning:
                     log.warning("corner %s: %s", name, warning)
-                if snapshot is not None:
+                elif snapshot is not None:
                     self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:

@@ -22,9 +22,6 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.learned import (
-    LOAD_FRICTION,
-    OFFSET_FRICTION,
-    PRESLIDING_ANGLE,
     STIFFNESS_RELATIVE_SIGMA,
     STIFFNESS_SIGMA,
     TRAVELS,
@@ -34,21 +31,33 @@ from emb_daemon.adapt.learned import (
     why_out_of_bounds,
 )
 from emb_daemon.adapt.pairs import ANGLE, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
-from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.parameters import (
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    TORQUE_CONSTANT,
+    moved,
+    value_of,
+)
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
+from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
+from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import torque_sigma
+from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
-_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _CURVE = range(7)
-TORQUE_CONSTANT = "motor.torque_constant_Nm_per_A"
+_CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
+INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
+#: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
+#: off than a calibration leaves it.
+_INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
@@ -69,43 +78,35 @@ _RANGES = 5
 
 
 @njit
-def settle(s, p, row):
-    """Bring the path models of a STATE to rest at the first sample of a training."""
-    s.started = True
-    s.angle, s.slid_angle, s.speed = row.angle, row.angle, row.speed
-    s.friction_state, s.friction_variance = 0.0, 1.0
-    rest(s, p, position(s, p, row), row.factor)
-
-
-@njit
 def unexplained_step(s, p, row):
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
-    before = s.force
+    before, speed = s.force, s.speed
     stiffness_path(s, p, row, row.factor)
     torque, leverage, _ = torque_path(s, p, row)
     s.angle, s.speed = row.angle, row.speed
-    return torque - leverage * 0.5 * (before + s.force)
+    force = 0.5 * (before + s.force)
+    # What driving has found of friction at low and at high speed; a training's fit has neither.
+    slow = (
+        s.friction_mean * (p.offset_friction + p.load_friction * force) * exp(-0.5 * abs(row.speed + speed) / SLOW_RAD_PER_S)
+    )
+    return torque - leverage * force - s.error[SLOW] * slow - s.error[VISCOUS] * 0.5 * (row.speed + speed)
 
 
 @njit
-def unexplained(s, p, rows, residual, force):
-    """`unexplained_step` and stiffness force (N) at each row from the settled state ``s``; the first residual is NaN."""
+def _run(states, parameters, rows, residual, force):
+    """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
+    s, p = states[0], parameters[0]
+    settle_paths(s, p, rows[0], rows[0].factor)
     residual[0], force[0] = np.nan, s.force
     for i in range(1, len(rows)):
         residual[i] = unexplained_step(s, p, rows[i])
         force[i] = s.force
 
 
-@njit
-def _run(states, parameters, rows, residual, force):
-    settle(states[0], parameters[0], rows[0])
-    unexplained(states[0], parameters[0], rows, residual, force)
-
-
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithm of the presliding
-    angle, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
+    angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
@@ -132,8 +133,10 @@ class _Training:
         The first is the torque's mean over `_BLOCK` samples in standard deviations of what noise makes of it *with the trial's
         torque constant*: current and acceleration are both measured (Deming's regression), and in other units a small torque
         constant would seem to explain more because it makes the current's noise small."""
-        torque_constant = self._calibration.motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
-        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant})
+        motor = self._calibration.motor
+        torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
+        inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
+        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
         self._states[0] = self._state
         self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
@@ -242,16 +245,21 @@ class _Fit(NamedTuple):
     contact_sigma: float
 
 
-def _fit(training, x, steps, free):
+def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA):
     """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
     against that; outliers are left out of the second round."""
     prior = np.zeros(len(x))
-    prior[_GAIN] = _GAIN_SIGMA**-2
+    prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, _INERTIA_SIGMA**-2
     first = _improve(training, x, steps, prior, free)
     far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
     if np.mean(far) <= _FEW:
         training.left_out |= far
     return _improve(training, first.x, steps, first.spread * prior, free)
+
+
+def _as_good(held, fit):
+    """Whether a fit with the curve held explains a training as well as one with a curve of its own."""
+    return held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
 
 
 def _inverse(normal):
@@ -338,17 +346,21 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     top = highest - contact
     scale = max(start @ top**powers, 1.0) / top**powers
     friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
-    x = np.array([contact, 0.0, 0.0, *friction, *start / scale])
+    x = np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale])
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(now["offset_friction"], 1e-4)
 
     training = _Training(rows, calibration, state, scale)
-    fit = _fit(training, x, steps, np.arange(len(x)))
+    fit = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
     # Pads that did not change keep the curve of a whole campaign, however much better one with more freedom fits the noise.
-    held = fit.x.copy()
-    held[_CURVE:] = now["curve"][:terms] / scale
-    held = _fit(training, held, steps, np.arange(_CURVE))
-    unchanged = held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
+    kept = fit.x.copy()
+    kept[_CURVE:] = now["curve"][:terms] / scale
+    held = _fit(training, kept, steps, np.delete(np.arange(_CURVE), _INERTIA))
+    if not _as_good(held, fit):
+        # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+        kept[_GAIN] = 0.0
+        held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
+    unchanged = _as_good(held, fit)
     if unchanged:
         fit = held
     x, covariance = fit.x, fit.covariance

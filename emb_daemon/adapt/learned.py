@@ -8,15 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, moved, value_of
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 
-CLEARANCE = "contact.clearance_rad"
-LOAD_FRICTION = "friction.load_m_per_rad"
-OFFSET_FRICTION = "friction.offset_Nm"
-PRESLIDING_ANGLE = "friction.presliding_angle_rad"
 STIFFNESS_SIGMA = "noise.stiffness_N"
 STIFFNESS_RELATIVE_SIGMA = "noise.stiffness_relative"
 

@@ -6,6 +6,7 @@ corner starts from its calibration.
 """
 
 import contextlib
+import fcntl
 import os
 import time
 from pathlib import Path
@@ -18,7 +19,7 @@ from emb_daemon.adapt.learned import Evaluation, why_out_of_bounds
 from emb_daemon.adapt.records import ACCEPTED, OUTCOMES
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, Unavailable
 
 _FORMAT = 2
 #: Trainings that a file remembers, and the age from which an unfinished file is nobody's, s.
@@ -93,6 +94,22 @@ def state_directory(configured: str | None, relative_to: Path, environment=os.en
     return relative_to / configured if configured else None
 
 
+def hold(folder: Path) -> int:
+    """Keep a state directory, which may be read-only, to this process until it ends or the descriptor returned is closed.
+
+    Raises:
+        InputError: it cannot be made.
+        Unavailable: another process keeps it.
+    """
+    descriptor = os.open(Memory(folder).folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise Unavailable(f"{folder}: state directory of another process that runs") from None
+    return descriptor
+
+
 class Memory:
     """The folder of learned values."""
 
@@ -115,7 +132,7 @@ class Memory:
             OSError: not readable.
         """
         try:
-            content = self.path(corner).read_bytes()
+            content = files.read(self.path(corner))
         except FileNotFoundError:
             return None
         return decode(content)
@@ -134,7 +151,7 @@ class Memory:
         try:
             store = self.read(corner)
         except ValueError as error:
-            return empty, f"{self.path(corner)}: damaged ({error}), set aside as {files.set_aside(self.path(corner))}"
+            return empty, f"{self.path(corner)}: damaged ({error}), {files.set_aside(self.path(corner))}"
         except OSError as error:
             return empty, f"{self.path(corner)}: not readable: {error.strerror}"
         if store is None:
@@ -144,7 +161,7 @@ class Memory:
                 theirs, ours = getattr(store, name), getattr(empty, name)
                 return empty, f"{self.path(corner)}: belongs to {name} {theirs}, not {ours}; not used"
         if store.current and (fault := why_out_of_bounds(calibration, store.current.values)):
-            return empty, f"{self.path(corner)}: refused ({fault}), set aside as {files.set_aside(self.path(corner))}"
+            return empty, f"{self.path(corner)}: refused ({fault}), {files.set_aside(self.path(corner))}"
         return store, None
 
     def _sweep(self) -> None:

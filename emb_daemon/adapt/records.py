@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from emb_daemon.jit import fields
+
 #: Phases of a corner's adaptation: nothing; motion was asked for; motion came unasked; a training is being evaluated.
 IDLE, ASKING, WATCHING, EVALUATING = range(4)
 
@@ -21,18 +23,8 @@ OUTCOMES = (
 #: Samples of one training: what the path models read of a SAMPLE, and the stiffness factor that held then.
 TRAINING = np.dtype(
     [
-        ("dt", "f8"),
-        ("angle", "f8"),
-        ("speed", "f8"),
-        ("current_q", "f8"),
-        ("wheel_speed", "f8"),
-        ("wheel_pulse", "f8"),
-        ("caliper", "f8"),
-        ("factor", "f8"),
-        ("has_current", "?"),
-        ("has_thermocouple", "?"),
-        ("has_wheel_speed", "?"),
-        ("has_wheel_pulse", "?"),
+        *fields("f8", "dt angle speed current_q wheel_speed wheel_pulse caliper factor"),
+        *fields("?", "has_current has_thermocouple has_wheel_speed has_wheel_pulse"),
     ],
     align=True,
 )
@@ -43,17 +35,11 @@ LIMITS = np.dtype(
     [
         ("estimated", "?"),
         ("enabled", "?"),
-        ("minimum_ambient", "f8"),
-        ("maximum_ambient", "f8"),
-        ("parking_force", "f8"),
-        ("low_force", "f8"),
-        ("high_force", "f8"),
-        ("dither_amplitude", "f8"),
-        ("dither_frequency", "f8"),
-        ("settling_time", "f8"),
-        ("answer_time", "f8"),
-        ("longest_training", "f8"),
-        ("coverage", "f8"),
+        *fields(
+            "f8",
+            "minimum_ambient maximum_ambient parking_force low_force high_force dither_amplitude dither_frequency "
+            "settling_time answer_time longest_training coverage",
+        ),
     ],
     align=True,
 )
@@ -66,40 +52,20 @@ LIMITS = np.dtype(
 #: ``snapshot_wanted`` asks for what the estimator knows to be kept, last at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
-        ("phase", "i8"),
-        ("result", "i8"),
-        ("outcome", "i8"),
-        ("asked", "?"),
-        ("tried", "?"),
-        ("started", "?"),
-        ("was_low", "?"),
-        ("was_high", "?"),
-        ("power_on_angle", "f8"),
-        ("parked_time", "f8"),
-        ("phase_time", "f8"),
-        ("still_time", "f8"),
-        ("still_angle", "f8"),
-        ("tail_time", "f8"),
-        ("force", "f8"),
-        ("pulse", "f8"),
+        *fields("i8", "phase result outcome"),
+        *fields("?", "asked tried started was_low was_high"),
+        *fields("f8", "power_on_angle parked_time phase_time still_time still_angle tail_time force pulse"),
         ("parked", "?"),
         ("snapshot_ns", "i8"),
         ("snapshot_wanted", "?"),
         ("holding", "?"),
-        ("rows", "i8"),
-        ("training_rows", "i8"),
-        ("generation", "i8"),
+        *fields("i8", "rows training_rows generation"),
         ("evaluation_wanted", "?"),
         ("evaluation_ready", "?"),
         ("evaluation", "i8"),
-        ("contact_angle", "f8"),
-        ("contact_sigma", "f8"),
-        ("torque_error", "f8"),
-        ("torque_error_sigma", "f8"),
+        *fields("f8", "contact_angle contact_sigma torque_error torque_error_sigma"),
         ("ended", "?"),
-        ("ambient", "f8"),
-        ("rise", "f8"),
-        ("factor_sigma", "f8"),
+        *fields("f8", "ambient rise factor_sigma"),
         ("time_ns", "i8"),
     ],
     align=True,

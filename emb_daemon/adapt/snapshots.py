@@ -90,14 +90,14 @@ class Snapshots:
         the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
         path = self.path(corner)
         try:
-            found = files.decode(path.read_bytes(), Snapshot)
+            found = files.decode(files.read(path), Snapshot)
             if found.format != _FORMAT:
                 raise ValueError(f"format {found.format}, expected {_FORMAT}")
             record = from_fields(found.state, self._dtype)
         except FileNotFoundError:
             return None, 0, None
         except ValueError as error:
-            return None, 0, f"{path}: damaged ({error}), set aside as {files.set_aside(path)}"
+            return None, 0, f"{path}: damaged ({error}), {files.set_aside(path)}"
         except OSError as error:
             return None, 0, f"{path}: not readable: {error.strerror}"
         ours = {"corner": corner, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}

@@ -9,9 +9,10 @@ from math import hypot
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.fit import settle, unexplained_step
+from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
+from emb_daemon.estimator.paths import settle_paths
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
@@ -158,7 +159,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     scratch[0] = s
     t = scratch[0]
     t.contact_angle = contact + weight * (a.contact_angle - contact)
-    settle(t, learned, rows[first])
+    settle_paths(t, learned, rows[first], rows[first].factor)
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])
     s.contact_angle, s.past_contact = t.contact_angle, t.past_contact
@@ -240,7 +241,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
             elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate)
+        _advance(a, s, parameters, learned, limits, scratch, rows, m)
     estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
@@ -281,7 +282,7 @@ def _follow(a, s, p, limits, m, estimate):
 
 
 @njit
-def _advance(a, s, parameters, learned, limits, scratch, rows, m, estimate):
+def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:

@@ -2,7 +2,7 @@
 
 import difflib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -81,29 +81,40 @@ class Setup:
     def __init__(self, path: Path):
         """Raises InputErrors with every fault of configuration, calibrations and DBC."""
         self.path = Path(path)
-        self.configuration = load_yaml(self.path, Configuration)
         faults: list[str] = []
         folder = self.path.parent
         try:
-            dbc = self.configuration.dbc
-            self.layout = load_layout(folder / dbc if dbc else None, tuple(self.configuration.corners))
-        except InputErrors as error:
-            faults += error.faults
+            self.configuration = load_yaml(self.path, Configuration)
+            dbc, files = self.configuration.dbc, {name: c.calibration for name, c in self.configuration.corners.items()}
         except InputError as error:
-            faults.append(str(error))
-        self.calibrations: dict[str, Calibration] = {}
-        self.parameters = np.zeros(4, PARAMETERS)
-        loaded: dict[Path, Calibration | None] = {}
-        for name, corner in self.configuration.corners.items():
-            file = folder / corner.calibration
-            if file not in loaded:
-                loaded[file] = None
-                try:
-                    loaded[file] = load_calibration(file)
-                except InputErrors as error:
-                    faults += error.faults
-            if loaded[file] is not None:
-                self.calibrations[name] = loaded[file]
-                self.parameters[CORNERS.index(name)] = to_parameters(loaded[file])
+            faults += error.faults
+            dbc, files = _named(self.path)
+        try:
+            self.layout = load_layout(folder / dbc if dbc else None, tuple(files))
+        except InputError as error:
+            faults += error.faults
+        loaded: dict[str, Calibration] = {}
+        for file in dict.fromkeys(files.values()):
+            try:
+                loaded[file] = load_calibration(folder / file)
+            except InputError as error:
+                faults += error.faults
         if faults:
             raise InputErrors(faults)
+        self.calibrations = {name: loaded[file] for name, file in files.items()}
+        self.parameters = np.zeros(4, PARAMETERS)
+        for name, calibration in self.calibrations.items():
+            self.parameters[CORNERS.index(name)] = to_parameters(calibration)
+
+
+def _named(path: Path) -> tuple[str | None, dict[str, str]]:
+    """(DBC, calibration by corner) that a faulty configuration names all the same: their faults are told with its own."""
+    try:
+        content = load_yaml(path, Any)
+    except InputError:
+        content = None
+    stated = content if isinstance(content, dict) else {}
+    dbc, corners = stated.get("dbc"), stated.get("corners")
+    entries = corners.items() if isinstance(corners, dict) else ()
+    files = {name: entry.get("calibration") for name, entry in entries if name in CORNERS and isinstance(entry, dict)}
+    return dbc if isinstance(dbc, str) else None, {name: file for name, file in files.items() if isinstance(file, str)}

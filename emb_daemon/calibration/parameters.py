@@ -21,6 +21,11 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
 
+#: Keys of what more than one part of the program finds.
+TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
+LOAD_FRICTION, OFFSET_FRICTION = "friction.load_m_per_rad", "friction.offset_Nm"
+PRESLIDING_ANGLE, CLEARANCE = "friction.presliding_angle_rad", "contact.clearance_rad"
+
 #: Step of a numerical derivative over the size of what moves: errors of rounding and of curvature are both far below
 #: the residuals of a fit, and few samples cross a switch such as contact or a reversal.
 _STEP = 1e-3

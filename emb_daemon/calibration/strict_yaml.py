@@ -16,12 +16,16 @@ from typing import Any
 import msgspec
 import yaml
 
-from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.bounded import read_bounded
+from emb_daemon.errors import InputErrors
 
 _T = typing.TypeVar("_T")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 _CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
+#: Beyond what any file of ours has: bytes of a file, characters of a number, and levels, which the composer's and our own
+#: recursion must bear.
+_MOST_BYTES, _LONGEST_NUMBER, _DEEPEST = 4_000_000, 40, 50
 _NOT_FINITE = {".nan", ".inf", "-.inf", "+.inf", "nan", "inf", "-inf"}
 
 
@@ -47,6 +51,9 @@ class _Reader:
             return None
         if text in _CONSTANTS:
             return _CONSTANTS[text]
+        if len(text) > _LONGEST_NUMBER and (_INTEGER.match(text) or _FLOAT.match(text)):
+            self.fault(node, path, f"a number of {len(text)} characters; expected at most {_LONGEST_NUMBER}")
+            return None
         if _INTEGER.match(text):
             return int(text)
         if _FLOAT.match(text):
@@ -173,6 +180,29 @@ def _holds_struct(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 
+def _compose(name: str, text: str) -> yaml.Node:
+    """The file's tree. What libyaml would follow without end, or into a stack overflow, is refused before."""
+    depth = 0
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        for event in yaml.parse(text, Loader=loader):
+            line = event.start_mark.line + 1
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+                raise InputErrors([f"{name}:{line}: anchors and aliases (& and *) are not used here"])
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST:
+                raise InputErrors([f"{name}:{line}: nested more than {_DEEPEST} levels deep"])
+        root = yaml.compose(text, Loader=loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        raise InputErrors([f"{name}:{mark.line + 1 if mark else 1}: not YAML: {error.problem}"]) from None
+    except yaml.YAMLError as error:
+        raise InputErrors([f"{name}: not YAML: {str(error).splitlines()[0]}"]) from None
+    if root is None:
+        raise InputErrors([f"{name}: empty"])
+    return root
+
+
 def load_yaml(path: Path, kind: type[_T], text: str | None = None) -> _T:
     """Read a YAML file into a struct type.
 
@@ -181,25 +211,15 @@ def load_yaml(path: Path, kind: type[_T], text: str | None = None) -> _T:
     """
     if text is None:
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_bounded(path, _MOST_BYTES).decode()
         except FileNotFoundError:
             raise InputErrors([f"{path}: no such file"]) from None
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
+            raise InputErrors([f"{path}: {error.strerror}"]) from None
+        except UnicodeDecodeError as error:
             raise InputErrors([f"{path}: not a readable text file ({error})"]) from None
     reader = _Reader(str(path))
-    try:
-        root = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        raise InputErrors([f"{path}:{mark.line + 1 if mark else 1}: not YAML: {error.problem}"]) from None
-    except yaml.YAMLError as error:
-        raise InputErrors([f"{path}: not YAML: {str(error).splitlines()[0]}"]) from None
-    if root is None:
-        raise InputErrors([f"{path}: empty"])
-    try:
-        value = reader.convert(root, kind, "")
-    except RecursionError:
-        raise InputError(f"{path}: nested too deeply") from None
+    value = reader.convert(_compose(str(path), text), kind, "")
     if reader.faults:
         raise InputErrors(reader.faults)
     return value

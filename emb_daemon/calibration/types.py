@@ -14,13 +14,7 @@ from emb_daemon.calibration.curves import curve_at, rising_force, thickness_rang
 from emb_daemon.calibration.terms import Term, faults_of, fill_terms
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InvalidValue
-from emb_daemon.estimator.records import (
-    CURVE_TERMS,
-    FORCE_GRID,
-    PARAMETERS,
-    SPEED_GRID,
-    TEMPERATURE_GRID,
-)
+from emb_daemon.estimator.records import CURVE_TERMS, FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
 from emb_daemon.models.thermal import mesh
 
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -371,7 +365,7 @@ class Calibration(Struct, kw_only=True):
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
 
 
-def fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
+def _fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
     """Write the thermal part into a THERMAL record."""
     pad, disc = thermal.pad, thermal.disc
     t["conductivity"] = pad.conductivity_W_per_mK
@@ -428,7 +422,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["speed_sigma"] = c.noise.speed_rad_per_s
     p["presliding_sigma"] = c.noise.presliding
     p["torque_relative_sigma"] = c.noise.torque_relative
-    fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
+    _fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
     for name, values in c.effects.items():
         for key, value in values.items():
             p["effects"][name][key] = value

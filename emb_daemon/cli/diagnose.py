@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from emb_daemon.cli.logoptions import add_mapping_argument, log_reader
+
 EXAMPLE = "emb-daemon diagnose fit.log.gz --calibration config/calibration.yaml --validate val.log.gz --output found"
 
 
@@ -13,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--validate", nargs="+", type=Path, default=[], metavar="LOG", help="logs that judge only; default: left-out episodes"
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="calibration.yaml, report.json, report.html")
+    add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
 
 
@@ -33,6 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     corner_index(arguments.corner)
     calibration = load_calibration(arguments.calibration)
+    read = log_reader(arguments.mapping)
     paths = log_paths([*arguments.logs, *arguments.validate])
     try:
         arguments.output.mkdir(parents=True, exist_ok=True)
@@ -44,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     with bar:
         task = bar.add_task("reading logs", total=1.0)
-        logs = [load_log(path, arguments.corner) for path in paths]
+        logs = [load_log(path, arguments.corner, read) for path in paths]
         fit_logs, judges = logs[: len(arguments.logs)], logs[len(arguments.logs) :]
 
         def progress(text: str, share: float) -> None:

@@ -4,14 +4,21 @@ import argparse
 import sys
 from pathlib import Path
 
+from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.cli.outputs import check_output
+
 EXAMPLE = "emb-daemon identify campaign.yaml --output calibration.yaml --report report"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("campaign", type=Path, metavar="CAMPAIGN.yaml", help="which log plays which part")
-    parser.add_argument("--output", type=Path, required=True, metavar="CALIBRATION.yaml", help="calibration to write")
+    parser.add_argument("campaign", nargs="?", type=Path, metavar="CAMPAIGN.yaml", help="which log plays which part")
+    add_mapping_argument(parser)
+    parser.add_argument("--output", type=Path, metavar="CALIBRATION.yaml", help="calibration to write")
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="folder for report.html: every step with data, fit, residual"
+    )
+    parser.add_argument(
+        "--example", type=Path, metavar="DIR", help="write files of a made-up rig into DIR to start from, and nothing else"
     )
 
 
@@ -21,9 +28,13 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.identify.campaign import load_campaign
     from emb_daemon.identify.report import build
     from emb_daemon.identify.run import identify
+    from emb_daemon.logs.read import read_with_digest
 
+    if arguments.example:
+        return _example(arguments.example)
     _check_outputs(arguments)
-    campaign = load_campaign(arguments.campaign)
+    read = open_mapping(arguments.mapping).read_with_digest if arguments.mapping else read_with_digest
+    campaign = load_campaign(arguments.campaign, read)
     result = _with_progress(lambda progress: identify(campaign, progress))
     for fault in campaign.faults:
         print(fault, file=sys.stderr)
@@ -39,16 +50,24 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _example(folder: Path) -> int:
+    from emb_daemon.identify.example import write_example
+
+    print("\n".join(map(str, write_example(folder))))
+    print(
+        f"\nA simulated rig's; next:\n  emb-daemon identify {folder}/campaign.yaml --mapping {folder}/mapping.yaml "
+        f"--output {folder}/calibration.yaml"
+    )
+    return 0
+
+
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Minutes of work must not end in a file that cannot be written."""
     from emb_daemon.errors import InputError
 
-    if not arguments.output.parent.is_dir():
-        raise InputError(f"{arguments.output}: no such folder: {arguments.output.parent}")
-    if arguments.output.exists() and not arguments.output.is_file():
-        raise InputError(f"{arguments.output}: is no regular file, which writing would replace")
-    if arguments.output.resolve() == arguments.campaign.resolve():
-        raise InputError(f"{arguments.output}: is the campaign itself")
+    if not arguments.campaign or not arguments.output:
+        raise InputError("identify: expected CAMPAIGN.yaml and --output CALIBRATION.yaml, or --example DIR")
+    check_output(arguments.output, [arguments.campaign, arguments.mapping])
     if arguments.report and arguments.report.exists() and not arguments.report.is_dir():
         raise InputError(f"{arguments.report}: is a file, expected a folder for the report")
 

@@ -15,6 +15,7 @@ COMMANDS = {
     "run": "the daemon: estimates from a CAN bus, broadcast 250 times a second",
     "check": "validate configuration, calibrations and DBC; lists every fault",
     "replay": "the same estimator over logs, as fast as it goes",
+    "convert": "another rig's log as ours, by a mapping file",
     "identify": "calibration from a rig campaign, with its evidence",
     "diagnose": "find what the model lacks, add it, and show the error before and after",
     "simulate": "the simulated car on a bus",
@@ -82,6 +83,9 @@ def main(argv: list[str] | None = None) -> int:
         # A file that cannot be used is the user's; a full disk or a device that is gone may be better later.
         print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
+    except MemoryError:
+        print(f"emb-daemon {chosen.command}: this machine has not the memory for that", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 

@@ -4,14 +4,20 @@ import argparse
 import sys
 from pathlib import Path
 
+from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
+
+#: Least share of a log's samples with which a reason is told in its summary; tables have them all.
+_SEEN = 0.001
 EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml --output estimates.csv"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help=".log, .log.gz, .asc, .blf, .trc or .mf4")
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help=LOG_HELP)
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's DBC to our signals")
+    add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
+    for option, default, help in (("--from", 0.0, "give results from here on"), ("--to", float("inf"), "stop here")):
+        parser.add_argument(option, type=float, default=default, metavar="S", help=f"{help}, seconds of each log")
     parser.add_argument("--pad-thickness", type=float, metavar="MM", help="thickness of the pads mounted, if not the file's")
     parser.add_argument(
         "--measured-torque", action="store_true", help="heat the pads with the rig's brake torque sensor, which no car has"
@@ -37,8 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.logs.mapping import Mapping
-    from emb_daemon.logs.read import read_frames
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
     from emb_daemon.resources import resource
@@ -47,8 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
-    read = Mapping(arguments.mapping).read if arguments.mapping else read_frames
-    replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read)
+    read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
+    replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read, *window)
     if arguments.output and ending_of(arguments.output) in FRAME_ENDINGS:
         write_frames(arguments.output, np.concatenate([part for log in arguments.logs for part in replay.frames(log)]))
         return 0
@@ -69,21 +73,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> None:
     """What can be refused before the work."""
+    from emb_daemon.cli.outputs import check_output
     from emb_daemon.errors import InputError
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
     from emb_daemon.replay import ALL
 
     output, report = arguments.output, arguments.report
-    inputs = [path.resolve() for path in (*arguments.logs, arguments.calibration, arguments.mapping) if path]
-    for path in (output, report):
-        if path and not path.absolute().parent.is_dir():
-            raise InputError(f"{path}: no such folder: {path.absolute().parent}")
-        if path and path.exists() and not path.is_file():
-            raise InputError(f"{path}: is no regular file, which writing would replace")
-        if path and path.resolve() in inputs:
-            raise InputError(f"{path}: is one of the inputs, which it would overwrite")
-    if output and ending_of(output) not in TABLE_ENDINGS + FRAME_ENDINGS:
-        raise InputError(f"{output}: unknown ending, expected one of {', '.join(TABLE_ENDINGS + FRAME_ENDINGS)}")
+    if not 0.0 <= getattr(arguments, "from") < arguments.to:
+        raise InputError(
+            f"--from {getattr(arguments, 'from'):g} --to {arguments.to:g}: expected seconds from 0 on that ascend"
+        )
+    inputs = (*arguments.logs, arguments.calibration, arguments.mapping)
+    if output:
+        check_output(output, inputs, TABLE_ENDINGS + FRAME_ENDINGS)
+    if report:
+        check_output(report, inputs)
     if report and arguments.corner == ALL:
         raise InputError(f"--report: shows one corner, expected --corner FL, FR, RL or RR instead of {ALL}")
     if output and ending_of(output) in FRAME_ENDINGS:
@@ -125,6 +129,10 @@ def _write_report(arguments: argparse.Namespace, results: list, corner: str, cal
 
 def _print(report: dict) -> None:
     print(f"{report['log']}, {report['corner']}: {report['samples']} samples, {report['seconds']:.1f} s")
+    shares = report["reasons"] | ({"force invalid": report["invalid"]} if report["invalid"] else {})
+    told = [f"{word} {100.0 * share:.3g} %" for word, share in shares.items() if share >= _SEEN]
+    if told:
+        print(f"  of the samples: {', '.join(told)}")
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
         print("  no reference signals in this log")

@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
     # python-can imports asammdf, and with it pandas, wherever it is installed: a third of the daemon's memory and start-up
     # time for a file format that it never reads.
     sys.modules.setdefault("asammdf", None)
-    from emb_daemon.adapt.memory import state_directory
+    from emb_daemon.adapt.memory import hold, state_directory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.cli.busoptions import bus_options
     from emb_daemon.jit import compiled_for_the_next_start
@@ -34,8 +34,11 @@ def run(arguments: argparse.Namespace) -> int:
     configuration = setup.configuration
     set_up_logging(configuration.log_level)
     ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
-    bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
     state = state_directory(configuration.state_directory, arguments.config.parent)
+    if state:
+        # Two daemons would write what they learned over each other's.
+        hold(state)
+    bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
     daemon = Daemon(setup, bus, ServiceManager(), state)
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()

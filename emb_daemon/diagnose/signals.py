@@ -6,6 +6,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline.run import estimate, held
+from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
@@ -80,5 +81,5 @@ def smooth_basis(name: str, signal: np.ndarray, force: np.ndarray) -> np.ndarray
         apart = np.concatenate([[True], np.diff(knots) > 0.02 * (knots[-1] - knots[0])])
         knots = knots[apart]
         shape = np.column_stack([np.interp(signal, knots, row) for row in np.eye(len(knots))[1:]])
-    scale = np.sqrt(np.mean(force**2))
+    scale = rmse(force)
     return np.column_stack([shape, shape * (force / scale)[:, None]]) if scale > 0.0 else shape

@@ -118,7 +118,7 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
     total = 0.0
     for path in paths:
         stated = [value for name, value in figures.items() if name.endswith(f"{path} rmse_N")]
-        total += max([*stated, float(np.sqrt(np.mean(own[path] ** 2)))]) ** 2
+        total += max([*stated, rmse(own[path])]) ** 2
     if channel == "temperature":
         stated = [value for name, value in figures.items() if name.endswith(" K") and "thesis" not in name]
         heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0

@@ -2,7 +2,7 @@
 
 from emb_daemon.estimator.step import predict, step
 from emb_daemon.jit import njit
-from emb_daemon.wire.contract import CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
+from emb_daemon.wire.contract import CONTESTED, CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
 
 
 @njit
@@ -33,7 +33,7 @@ def answer_row(row, state, p, estimate):
     estimate.reasons |= row.reasons
     if not state.started:
         estimate.mode = INIT
-    elif estimate.source == INVALID:
+    elif estimate.source == INVALID or estimate.reasons & CONTESTED:
         estimate.mode = FAULT
     elif estimate.reasons and estimate.mode == RUNNING:
         estimate.mode = DEGRADED

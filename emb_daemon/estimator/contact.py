@@ -14,6 +14,7 @@ from emb_daemon.models.contact import (
     clearance_level,
     clearly_above,
     engaged,
+    forget_level,
     start_anew,
     threshold,
     torque_sigma,
@@ -25,6 +26,12 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 #: A speed beyond the motor's maximum by this factor, and an angle by this many rad more, is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
+#: Travel in one sample, rad, that the speed does not account for and that is no motion, beyond what a delay of this many
+#: seconds between both makes: 60 turns a second that nobody saw. And how well such a jump is known, rad.
+SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
+#: A motor stands below this speed; offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations
+#: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
+_STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
 #: Standard deviations of the contact angle, rad: known again below, and unknown.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Torque that a released brake may seem to need, share of what the largest force needs: the offset of an ordinary current
@@ -41,22 +48,44 @@ _CLAMPED = 0.1
 
 @njit
 def follow_zero(s, p, m):
-    """Whether the angle jumped as no motor can: then the resolver has a new zero, and the contact angle goes with it.
+    """Whether the resolver has another zero now, because its angle went where the speed says that the motor did not; then the
+    contact angle goes with it.
 
-    What the motor may have turned meanwhile is unknown, so the contact angle becomes uncertain by as much.
+    How far it went is known from the speed. Where the resolver had been repeating itself the motor may have turned on, and
+    what is no motion at all may be anything: then the contact angle becomes uncertain by as much.
     """
     jump = m.angle - s.angle
-    # While the resolver was stuck the motor turned on.
-    reach = p.maximum_speed * (m.dt + s.plausibility.frozen_s)
-    if abs(jump) <= SPEED_MARGIN * reach + _ANGLE_MARGIN:
+    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
+    stuck = s.plausibility.still > 1 or frozen_s > 0.0
+    reach = p.maximum_speed * (m.dt + frozen_s)
+    moved, sigma = 0.0, 0.0
+    if abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
+        moved, sigma = jump, reach
+    elif 0.0 < m.dt <= ONE_CYCLE_S and not stuck:
+        slip = jump - 0.5 * (m.speed + s.speed) * m.dt
+        unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
+        if abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
+            moved, sigma = slip, _ZERO_RAD
+        elif max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
+            s.drifted = s.stood_s = 0.0
+        else:
+            s.drifted += slip
+            s.stood_s += m.dt
+            noise = p.speed_sigma * sqrt(CYCLE_S * s.stood_s)
+            if abs(s.drifted) > _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * s.stood_s + _CERTAIN * noise:
+                moved, sigma = s.drifted, abs(s.drifted)
+                s.drifting_s = _DRIFTING_S
+    s.drifting_s = max(s.drifting_s - m.dt, 0.0)
+    if moved == 0.0:
         return False
-    s.angle += jump
-    s.angle_before += jump
-    s.slid_angle += jump
-    s.contact_angle += jump
-    s.contact_anchor += jump
-    s.start_angle += jump
-    s.covariance[1, 1] += reach * reach
+    s.drifted = s.stood_s = 0.0
+    s.angle += moved
+    s.angle_before += moved
+    s.slid_angle += moved
+    s.contact_angle += moved
+    s.contact_anchor += moved
+    s.start_angle += moved
+    s.covariance[CONTACT, CONTACT] += sigma * sigma
     open_again(s, p)
     s.contact.confirmed = False
     return True
@@ -167,7 +196,7 @@ def watch_contact(s, p, m, force_before, torque, leverage):
         s.covariance[OFFSET, OFFSET] += seen * seen
         force = seen / leverage
         friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
-        c.level = c.samples = 0.0
+        forget_level(c)
         c.engaged = True
         _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
     doubt = sqrt(s.covariance[1, 1])

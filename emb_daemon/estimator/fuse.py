@@ -34,8 +34,9 @@ from emb_daemon.estimator.status import (
     RESOLVER_IMPLAUSIBLE,
     TORQUE_OLD,
 )
-from emb_daemon.estimator.unknown import HOUSING_S, SLOW_RAD_PER_S, WINDING_S, set_walks, torque_offset
+from emb_daemon.estimator.unknown import HOUSING_S, SLOW_RAD_PER_S, WINDING_S, set_walks, softening_sigma, torque_offset
 from emb_daemon.jit import njit
+from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -57,7 +58,9 @@ from emb_daemon.models.plausibility import (
     UNDECIDED,
     beyond_friction,
     count_contradiction,
+    disbelieve_resolver,
     force_of_torque_alone,
+    hold,
 )
 
 #: Motor torque over what the calibration's torque constant makes of the current, at least; and age of the torque path's last
@@ -98,18 +101,24 @@ def needed_torque(s, p, m, mean_force, leverage):
 
 @njit
 def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
-    """Both hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``."""
+    """All hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``.
+
+    Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
+    torque."""
     factor = s.factor * s.scale
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known = p.clearance_sigma == 0.0
-    softening = p.thermal.softening * hypot(s.temperature_sigma, p.thermal.sigma)
-    softening += p.thermal.softening_history * s.history_sigma
-    relative = hypot((p.stiffness_relative_sigma + softening) * s.force, s.effects.terms.doubt)
+    relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
+    relative = hypot(relative, s.effects.terms.doubt)
     spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
     current_torque = p.torque_constant * p.current_sigma
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     h, walked = s.sensitivity[0], s.sensitivity[1]
-    set_walks(walked, p, s.error, s.winding, s.housing, m.dt)
+    softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
+    set_walks(walked, p, s.error, s.winding, s.housing, softening, m.dt)
+    # What has just become uncertain of the pads' heat is uncertain of the stiffness from now on.
+    walked[SCALE] += max(softening - s.softening, 0.0) * (softening + s.softening)
+    s.softening = softening
     if known:
         walked[CONTACT] = walked[SCALE] = 0.0
     predict_errors(s.error, s.covariance, decay, noise_decay, current_torque * current_torque, walked)
@@ -130,11 +139,13 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
     late = _LATE * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
-    white = 2.0 * speed_torque * speed_torque + friction_torque * friction_torque * friction_variance + late * late
+    moving = 2.0 * speed_torque * speed_torque + late * late
+    white = moving + friction_torque * friction_torque * friction_variance
     s.current_before, s.had_current = m.current_q, m.has_current
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
+    bare = np.inf
     if np.isfinite(torque):
         out.torque_sigma = sqrt(white) / leverage
         # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
@@ -152,6 +163,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         unexplained = torque - leverage * mean_force
         first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
         slow = max(variance - white - fast, 0.0)
+        bare = sqrt(moving + slow)
         out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
         out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
         for kind in range(ALTERNATIVES if not known else 0):
@@ -174,6 +186,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             fold(s, warmth, False)
             open_all(s, p)
             forget(s.consistency)
+            forget_level(s.contact)
     else:
         out.torque_sigma = np.inf
         s.torque_age += m.dt
@@ -185,11 +198,13 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     if out.force < 0.0:
         out.force = 0.0
     out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
+    return bare
 
 
 @njit
-def take_sides(s, p, m, out):
-    """Where the paths contradict each other, go on with the one that can be right; returns the facts."""
+def take_sides(s, p, m, torque_sigma, out):
+    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``torque_sigma`` N m, as
+    `fuse` returns it."""
     c, x, facts = s.plausibility, s.error, 0
     gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
     motor_torque = p.torque_constant * m.current_q * max(gain, _LEAST_GAIN) - x[OFFSET]
@@ -198,9 +213,11 @@ def take_sides(s, p, m, out):
     sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / p.gear_gain)
     if np.isfinite(out.innovation):
         torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
-        spread = p.gear_gain * hypot(out.stiffness_sigma, out.torque_sigma)
+        spread = hypot(p.gear_gain * out.stiffness_sigma, torque_sigma)
         beyond = beyond_friction(torque, s.force, spread, p.gear_gain, load, coulomb)
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    if m.has_current and hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb):
+        disbelieve_resolver(c)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
     if s.torque_age >= _OLD_S:
         facts |= TORQUE_OLD

@@ -10,6 +10,7 @@ from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import TURNING_RAD_PER_S, disc_speed
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Clamp force from which pads and disc exchange heat by contact, N.
 TOUCHING_N = 200.0
@@ -18,6 +19,9 @@ TOUCHING_N = 200.0
 _BEHIND_PLATES = 4.0
 #: By which thermocouples of a brake at rest differ: their tolerance (IEC 60584, class 1: 1.5 K each) and noise, K.
 _PLATES_SPREAD_K = 3.0
+#: Time by which a vehicle status that is sent at all has been heard, s: with its ambient temperature a start tells whether the
+#: plates are warm.
+_HEARD_S = 0.15
 #: Disc speed that is assumed where nothing tells of it, for what it may have heated, rad/s: 110 km/h.
 _UNSEEN_RAD_PER_S = 100.0
 #: Time between conduction steps, s: twelve samples, less half a sample against rounding.
@@ -135,7 +139,7 @@ def heat(s, p, m):
     wheel_speed, speed_sigma = disc_speed(s.wheel, m)
     if not s.temperature_known:
         s.factor = 1.0
-        if m.has_thermocouple:
+        if m.has_thermocouple and (m.has_status or m.cycle * CYCLE_S > _HEARD_S):
             _start_heat(s, t, m)
         return
     touching = s.fused > TOUCHING_N

@@ -70,6 +70,15 @@ def rest(s, p, x, factor):
 
 
 @njit
+def settle_paths(s, p, m, factor):
+    """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
+    s.started = True
+    s.angle, s.slid_angle, s.speed = m.angle, m.angle, m.speed
+    s.friction_state, s.friction_variance = 0.0, 1.0
+    rest(s, p, position(s, p, m), factor)
+
+
+@njit
 def torque_path(s, p, m):
     """Torque path over the cycle that ends at this sample.
 

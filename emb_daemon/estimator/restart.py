@@ -8,7 +8,17 @@ from math import exp
 
 import numpy as np
 
-from emb_daemon.estimator.unknown import HOUSING_S, WINDING_S, add_rest
+from emb_daemon.estimator.unknown import (
+    HOUSING_S,
+    LEAST_SCALE,
+    MOST_SCALE,
+    WINDING_S,
+    add_growth,
+    add_rest,
+    add_stiffness_jumps,
+    add_torque_jumps,
+    set_priors,
+)
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES
 from emb_daemon.models.thermal import NODES, heat_step
@@ -17,6 +27,11 @@ from emb_daemon.models.thermal import NODES, heat_step
 _UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
 #: Longest step of the heat that flowed meanwhile, s, and longest time that is followed, s.
 _STEP_S, _FOLLOWED_S = 5.0, 6 * 3600.0
+
+#: What no brake's snapshot holds: a contact further from the calibration's than ten times what brakes reach, m; more than a
+#: pad or disc survives, degC; growth beyond ten times that of an iron disc, m/K; heat of motor and housing over what the
+#: largest force's current leaves for ever; errors beyond so many of their standard deviations.
+_CONTACT_M, _COLDEST_C, _HOTTEST_C, _GROWTH_M_PER_K, _HEAT, _SIGMAS = 1e-3, -60.0, 1200.0, 2.6e-6, 4.0, 10.0
 
 SNAPSHOT = np.dtype(
     [
@@ -56,6 +71,34 @@ def take_snapshot(s, p, snapshot):
     snapshot.disc, snapshot.history = s.disc, s.history
     snapshot.temperature_sigma, snapshot.history_sigma = s.temperature_sigma, s.history_sigma
     return True
+
+
+def why_implausible(snapshot, p) -> str:
+    """What in a SNAPSHOT no brake with PARAMETERS ``p`` can have had, by the record's names; empty if nothing."""
+    prior = np.zeros((STATES, STATES))
+    set_priors(prior, p)
+    for add in (add_stiffness_jumps, add_torque_jumps, add_growth):
+        add(prior, p)
+    covariance = snapshot["covariance"]
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(np.where(spread > 0.0, spread, 1.0), np.where(spread > 0.0, spread, 1.0))
+    possible = {
+        "clearance": abs(snapshot["clearance"] - p["clearance"]) * p["gear_gain"] <= _CONTACT_M,
+        "clearance_sigma": 0.0 <= snapshot["clearance_sigma"] * p["gear_gain"] <= _CONTACT_M,
+        "scale": LEAST_SCALE <= snapshot["scale"] <= MOST_SCALE,
+        "growth": abs(snapshot["growth"]) * p["gear_gain"] <= _GROWTH_M_PER_K,
+        "covariance": np.all(np.abs(correlation) <= 1.0 + 1e-6) and np.linalg.eigvalsh(correlation)[0] > -1e-3,
+        "error": np.all(snapshot["error"] ** 2 <= _SIGMAS**2 * (np.diag(prior) + np.diag(covariance))),
+        "winding": 0.0 <= snapshot["winding"] <= _HEAT,
+        "housing": 0.0 <= snapshot["housing"] <= _HEAT,
+    }
+    for name in ("pads", "disc", "growth_start"):
+        if snapshot["temperature_known"]:
+            possible[name] = np.all((snapshot[name] >= _COLDEST_C) & (snapshot[name] <= _HOTTEST_C))
+    for name in ("history", "temperature_sigma", "history_sigma"):
+        possible[name] = abs(snapshot[name]) <= _HOTTEST_C
+    return ", ".join(name for name, is_possible in possible.items() if not is_possible)
 
 
 @njit

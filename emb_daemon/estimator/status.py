@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_daemon.estimator.records import (
+from emb_daemon.jit import njit
+from emb_daemon.wire.contract import (
     CONTACT_UNCERTAIN,
     FUSED,
     INVALID,
@@ -21,7 +22,6 @@ from emb_daemon.estimator.records import (
     TEMPERATURE_UNCERTAIN,
     TORQUE_ONLY,
 )
-from emb_daemon.jit import njit
 
 
 class Fact(NamedTuple):
@@ -33,7 +33,7 @@ class Fact(NamedTuple):
 
 
 TABLE = {
-    "zero_moved": Fact("the motor angle jumped as no motor can", OUT_OF_RANGE, FUSED),
+    "zero_moved": Fact("the motor angle went where the motor did not", OUT_OF_RANGE, FUSED),
     "current_implausible": Fact("the current is frozen while the motor must turn", PATHS_DISAGREE | STUCK, STIFFNESS_ONLY),
     "paths_contradict": Fact("the paths contradict each other, nothing tells which is wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
     "torque_old": Fact("the torque path has said nothing for a while", 0, STIFFNESS_ONLY),

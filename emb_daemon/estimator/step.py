@@ -14,7 +14,6 @@ from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
-from emb_daemon.estimator.records import INIT, INVALID, PREDICTED, RUNNING
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -29,12 +28,13 @@ from emb_daemon.estimator.status import (
     ZERO_MOVED,
     tell_status,
 )
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors
+from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import SCALE, maximum_likelihood
-from emb_daemon.models.plausibility import frozen, watch
+from emb_daemon.models.plausibility import disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
+from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
 #: Without a resolver sample for this long the last force is no estimate any more: the brake may have opened and closed, s.
 SILENCE_S = 0.1
@@ -82,6 +82,8 @@ def step(s, p, m, out):
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
+    if s.drifting_s > 0.0:
+        disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
     if p.clearance_sigma > 0.0:
         seek_release(s, p, m)
@@ -92,6 +94,7 @@ def step(s, p, m, out):
         if p.clearance_sigma > 0.0:
             rise = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference
             add_softening(s.covariance, p, rise, s.temperature_sigma)
+            s.softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
         open_all(s, p)
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
@@ -101,7 +104,7 @@ def step(s, p, m, out):
     # Over a gap the current of its last cycle and the mean acceleration say nothing of each other.
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown:
         watch_contact(s, p, m, force_before, torque, leverage)
-    fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
+    torque_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
     out.torque_force, out.ml_force = np.nan, s.force
@@ -110,7 +113,7 @@ def step(s, p, m, out):
         force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
-    facts = take_sides(s, p, m, out)
+    facts = take_sides(s, p, m, torque_sigma, out)
     bound(s.monitor, p, m)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage

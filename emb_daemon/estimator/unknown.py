@@ -34,6 +34,8 @@ _SETTLED_M = 5e-6
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
 _SCALE, _SCALE_WALK_PER_SQRT_S = 0.001, 0.01 / 60.0
+#: Time in which heat that nobody knows of has become another: it leaves a pad within minutes, s.
+_HEAT_CHANGES_S = 100.0
 #: Kelvin below the calibration's temperature that its own days cover.
 _MEASURED_K = 10.0
 #: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
@@ -90,12 +92,18 @@ def set_friction(P, p, caliper):
 
 
 @njit
+def softening_sigma(p, temperature, history):
+    """Standard deviation of the stiffness, share, of pads whose temperature and its memory have these, K."""
+    return p.thermal.softening * temperature + p.thermal.softening_history * history
+
+
+@njit
 def add_softening(P, p, rise, sigma):
     """What the temperature of pads that are first seen leaves open of the stiffness: they are ``rise`` K warmer than those of
     the calibration, give or take ``sigma`` K. Softening was identified on hot pads; what it says of colder ones is
     extrapolated."""
     unsure = max(-rise - _MEASURED_K, 0.0) + sigma
-    P[SCALE, SCALE] += ((p.thermal.softening + p.thermal.softening_history) * unsure) ** 2
+    P[SCALE, SCALE] += softening_sigma(p, unsure, unsure) ** 2
 
 
 @njit
@@ -116,14 +124,15 @@ def set_priors(P, p):
 
 
 @njit
-def set_walks(walked, p, x, winding, housing, dt):
-    """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat."""
+def set_walks(walked, p, x, winding, housing, softening, dt):
+    """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat,
+    ``softening`` what of the stiffness the pads' unknown temperature leaves open."""
     faded = abs(x[FADE]) * winding + abs(x[HOUSING]) * housing + _FADE * (winding + housing)
     walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = walked[SLOW] = 0.0
     walked[CONTACT] = p.contact_walk * p.contact_walk * dt
     walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + (_MISSED * faded) ** 2 / _MISSED_S) * dt
     walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
-    walked[SCALE] = (0.1 * _SCALE_WALK_PER_SQRT_S) ** 2 * dt
+    walked[SCALE] = ((0.1 * _SCALE_WALK_PER_SQRT_S) ** 2 + 2.0 * softening * softening / _HEAT_CHANGES_S) * dt
     walked[LOAD] = (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * dt
     walked[COULOMB] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction) ** 2 * dt
     walked[VISCOUS] = (_FRICTION_WALK_PER_SQRT_S * p.offset_friction / p.maximum_speed) ** 2 * dt

@@ -2,38 +2,62 @@
 
 import datetime
 import os
-
-import msgspec
+from collections.abc import Sequence
 
 from emb_daemon import __version__
-from emb_daemon.calibration.types import Calibration, Provenance, Source
-from emb_daemon.identify.campaign import Campaign
+from emb_daemon.calibration.parameters import keys, moved, value_of
+from emb_daemon.calibration.types import Calibration, Contact, Curve, Friction, Motor, Noise, Provenance, Source, Stiffness
+from emb_daemon.identify.campaign import Campaign, Datasheet
+from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.judge import Judged
 from emb_daemon.identify.steps import Step
+from emb_daemon.identify.steps.heat import nominal_thermal
 from emb_daemon.identify.text import rounded
 
 
-def assemble(campaign: Campaign, *steps: Step, pad_thickness_mm: float | None = None) -> Calibration:
-    """Sections of all steps together; the pads are the campaign's if not said otherwise."""
+def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: Sequence[float]) -> Calibration:
+    """What the datasheet says, with a curve for each thickness that was measured; whatever it cannot say, a step moves.
+
+    Only heat may stay as it is here, where no log heats the pads.
+    """
+    actuator = sheet.actuator
+    curves = tuple(Curve(pad_thickness_mm=mm, coefficients=(1.0, *[0.0] * (TERMS - 1))) for mm in measured_mm)
     return Calibration(
         format=1,
-        actuator=f"rig-{campaign.file.rig}",
-        pad_thickness_mm=pad_thickness_mm or campaign.pad_thickness_mm,
-        **{name: value for step in steps for name, value in step.values.items()},
+        actuator=name,
+        pad_thickness_mm=pad_thickness_mm,
+        motor=Motor(
+            torque_constant_Nm_per_A=actuator.motor_torque_constant_Nm_per_A,
+            inertia_kg_m2=actuator.lumped_inertia_kg_m2,
+            gear_gain_m_per_rad=actuator.gear_gain_m_per_rad,
+            maximum_speed_rad_per_s=actuator.max_motor_speed_rad_per_s,
+        ),
+        friction=Friction(load_m_per_rad=0.0, offset_Nm=0.0, presliding_angle_rad=1e-2),
+        stiffness=Stiffness(curves=curves, relaxation_time_s=0.0, maximum_force_N=actuator.rated_clamp_force_N),
+        contact=Contact(clearance_rad=actuator.pad_clearance_rad, clearance_sigma_rad=1.0, walk_rad_per_sqrt_s=0.0),
+        noise=Noise(
+            stiffness_N=1.0,
+            stiffness_relative=0.0,
+            stiffness_correlation_s=1.0,
+            current_A=1.0,
+            current_correlation_s=1.0,
+            speed_rad_per_s=1.0,
+            presliding=0.0,
+            torque_relative=0.0,
+        ),
+        thermal=nominal_thermal(sheet),
     )
 
 
 def tidy(calibration: Calibration) -> Calibration:
-    """Seven digits: far more than is known, and a file that people can read."""
+    """Seven digits: far more than is known, and a file that people can read.
 
-    def shortened(value):
-        if isinstance(value, dict):
-            return {key: shortened(entry) for key, entry in value.items()}
-        if isinstance(value, list | tuple):
-            return [shortened(entry) for entry in value]
-        return rounded(value, 7) if isinstance(value, float) else value
-
-    return msgspec.convert(shortened(msgspec.to_builtins(calibration)), Calibration)
+    Raises:
+        InputErrors: what was found is not what a calibration file may hold.
+    """
+    values = {key: value_of(calibration, key) for key in keys(calibration)}
+    # What is short already keeps standing as the default that a file need not state.
+    return moved(calibration, {key: rounded(v, 7) for key, v in values.items() if rounded(v, 7) != v}, checked=True)
 
 
 def provenance(

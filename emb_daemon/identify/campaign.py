@@ -3,6 +3,7 @@
 Logs are read once, checked for what their part needs, and left out with a word when they cannot serve.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -32,28 +33,20 @@ _SPEED_TOLERANCE = 0.2
 class Trial(Struct, kw_only=True):
     """One log with pads of one thickness."""
 
+    #: Relative to the campaign.
     log: str
+    #: The campaign's if it is left out.
     pad_thickness_mm: Positive | None = None
 
 
-class Sine(Struct, kw_only=True):
+class Sine(Trial, kw_only=True):
     """Motor angle a sinusoid."""
 
-    log: str
     frequency_Hz: Positive
-    pad_thickness_mm: Positive | None = None
 
 
-class Adaptation(Struct, kw_only=True):
-    """Park brake training without the reference force, for the study of adaptation; identification judges on ``judge``."""
-
-    training: str
-    judge: str
-    pad_thickness_mm: Positive | None = None
-
-
-class Gear(Struct, kw_only=True):
-    """One state of wear of the gear."""
+class Training(Struct, kw_only=True):
+    """Park brake training, and a log to judge on what is known then."""
 
     training: str
     judge: str | None = None
@@ -63,59 +56,90 @@ class Gear(Struct, kw_only=True):
 class DiscCooling(Struct, kw_only=True):
     """Heated, then released at constant disc speed, against which the log is checked."""
 
+    #: Relative to the campaign.
     log: str
+    #: Speed of the disc in the log's second half.
     disc_turns_per_s: Annotated[float, Meta(ge=0.0)]
 
 
 class ThermalLogs(Struct, kw_only=True):
     """Second test rig: the disc turns, thermocouples stand in the pads."""
 
+    #: About 3 kN, the disc's speed a slow sinusoid: heat paths of pads and disc.
     tune: str | None = None
+    #: Stops and pauses, to judge by.
     validate: str | None = None
+    #: A grid of clamp force and disc speed at rising temperature: the friction coefficient.
     heat_flux_map: str | None = None
+    #: Cold clamps, heating, then a burst of clamps every few minutes for hours: softening and its history.
     pad_cooling: str | None = None
+    #: One for each disc speed.
     disc_cooling: tuple[DiscCooling, ...] = ()
 
 
 class Integrated(Struct, kw_only=True):
     """Everything together on hot pads."""
 
+    #: Training, braking heat and random angle: softening where no burst log is.
     fit: str | None = None
+    #: The same again, to judge by.
     judge: str | None = None
 
 
 class CampaignFile(Struct, kw_only=True):
     """CAMPAIGN.yaml. Paths are relative to the file."""
 
+    #: A name, for the calibration's.
     rig: str
+    #: FL, FR, RL or RR: of the log's messages.
     corner: str = "FL"
     #: The rig's own description of its bus; it must agree with the layout that the daemon reads.
     dbc: str | None = None
+    #: What the supplier states, a file with the keys of the second part of this page.
     datasheet: str
     #: Of every log that states none, and of the pads that the calibration is for; the datasheet's if it is left out.
     pad_thickness_mm: Positive | None = None
+    #: Slow clamp and release from the released position to the largest force, some ten seconds each way.
     curves: tuple[Trial, ...] = ()
+    #: A new random motor angle every 100 ms between released and clamped, beginning released: relaxation, inertia, friction.
     random: tuple[Trial, ...] = ()
-    adaptation: tuple[Adaptation, ...] = ()
+    #: Of other pads, without the reference force: for the study of adaptation; identification judges alone.
+    adaptation: tuple[Training, ...] = ()
+    #: Sinusoids, for figures over frequency.
     frequency_response: tuple[Sine, ...] = ()
-    gear_wear: tuple[Gear, ...] = ()
+    #: One for each state of wear.
+    gear_wear: tuple[Training, ...] = ()
+    #: Logs with thermocouples in the pads; without any the force does not follow temperature.
     thermal: ThermalLogs | None = None
+    #: Hot pads, everything together.
     integrated: tuple[Integrated, ...] = ()
 
 
 class Actuator(Struct, kw_only=True):
+    """Motor, gear and screw."""
+
+    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact.
     gear_gain_m_per_rad: Positive
     #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
+    #: Share, two standard deviations.
     motor_torque_constant_tolerance: Positive = _TOLERANCE
+    #: Of everything that turns, seen from the motor.
     lumped_inertia_kg_m2: Positive
+    #: Share, two standard deviations.
     lumped_inertia_tolerance: Positive = _TOLERANCE
+    #: The fastest that the motor turns.
     max_motor_speed_rad_per_s: Positive
+    #: Largest force of the brake.
     rated_clamp_force_N: Positive
+    #: Motor angle between the released position and contact; half of it must surely be free of contact.
     pad_clearance_rad: Positive
 
 
 class Resolver(Struct, kw_only=True):
+    """Motor angle sensor."""
+
+    #: Of one turn of the motor.
     counts_per_revolution: Positive
     #: In words, for people.
     angle_is: str = ""
@@ -127,22 +151,39 @@ class Resolver(Struct, kw_only=True):
 
 
 class PadNominal(Struct, kw_only=True):
+    """One pad."""
+
+    #: Friction material alone.
     thickness_mm: Positive
+    #: That touches the disc.
     frontal_area_m2: Positive
+    #: Of the friction material.
     density_kg_per_m3: Positive
+    #: Of the friction material.
     specific_heat_J_per_kgK: Positive
+    #: Of the friction material, at 20 degC.
     conductivity_W_per_mK: Positive
 
 
 class DiscNominal(Struct, kw_only=True):
+    """Brake disc."""
+
+    #: Of the friction ring.
     mass_kg: Positive
+    #: Of its material.
     specific_heat_J_per_kgK: Positive
+    #: At which the pads rub.
     effective_radius_m: Positive
+    #: That meets the air, both sides.
     cooling_area_m2: Positive
+    #: Of its material.
     conductivity_W_per_mK: Positive
 
 
 class Wheel(Struct, kw_only=True):
+    """Wheel speed sensor."""
+
+    #: Must be the daemon's own count.
     pulses_per_revolution: Positive
 
     def __post_init__(self):
@@ -158,6 +199,7 @@ class Datasheet(Struct, kw_only=True):
     pad: PadNominal
     disc: DiscNominal
     wheel: Wheel | None = None
+    #: Of pad on disc.
     friction_coefficient: Positive
 
     def stated(self, key: str) -> tuple[float, float]:
@@ -170,23 +212,6 @@ class Datasheet(Struct, kw_only=True):
             ),
             "motor.inertia_kg_m2": (actuator.lumped_inertia_kg_m2, actuator.lumped_inertia_tolerance),
         }[key]
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """How much a log moves the brake.
-
-    Attributes:
-        travel_rad: between the smallest and the largest motor angle.
-        reversals_per_s: turning points of the motor angle by more than a twentieth of the travel, per second of motion.
-        force_N: largest reference force.
-        noise_N: standard deviation of the reference force before the pads first touch.
-    """
-
-    travel_rad: float
-    reversals_per_s: float
-    force_N: float
-    noise_N: float
 
 
 @njit
@@ -205,21 +230,22 @@ def _turning_points(angle, threshold):
     return count
 
 
-def excitation(log: Log, clearance_rad: float) -> Excitation:
-    """What a log excites; ``clearance_rad`` is the datasheet's, of which the first half is surely free of contact."""
+def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
+    """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is surely free of contact.
+
+    Returns:
+        (largest reference force in N, its standard deviation before the pads first touch, turning points of the motor angle by
+        more than a twentieth of its travel per second of motion).
+    """
     angle, force = log.samples["angle"], log.force_N
     travel = float(np.ptp(angle))
     reversals = _turning_points(angle, max(travel / 20.0, 1e-6)) if travel > 0.0 else 0
     moving = float(np.sum(log.samples["dt"][1:][np.diff(angle) != 0.0]))
     left = np.flatnonzero(angle - angle[0] > 0.5 * clearance_rad)
-    free = np.isfinite(force) & (np.arange(len(angle)) < (left[0] if len(left) else 0))
-    known = force[np.isfinite(force)]
-    return Excitation(
-        travel_rad=travel,
-        reversals_per_s=reversals / moving if moving > 0.0 else 0.0,
-        force_N=float(known.max()) if len(known) else np.nan,
-        noise_N=float(np.std(force[free])) if free.sum() > 20 else np.nan,
-    )
+    known = np.isfinite(force)
+    free = known & (np.arange(len(angle)) < (left[0] if len(left) else 0))
+    noise_N = float(np.std(force[free])) if free.sum() > 20 else np.nan
+    return float(force[known].max()), noise_N, reversals / moving if moving > 0.0 else 0.0
 
 
 @dataclass
@@ -229,6 +255,8 @@ class Campaign:
     path: Path
     file: CampaignFile
     datasheet: Datasheet
+    #: What reads a log's FRAME array and digest: `logs.read.read_with_digest`, or a mapping's for another rig's logs.
+    read: Callable[[Path], tuple[np.ndarray, str]] = read_with_digest
     faults: list[str] = field(default_factory=list)
     #: Logs used, by name in the campaign: SHA-256 of the file.
     sources: dict[str, str] = field(default_factory=dict)
@@ -258,7 +286,7 @@ class Campaign:
 
     def _read(self, name: str) -> Log:
         def read(path):
-            frames, self.sources[name] = read_with_digest(path)
+            frames, self.sources[name] = self.read(path)
             return frames
 
         if name not in self._logs:
@@ -311,18 +339,18 @@ class Campaign:
         if log is None:
             return None
         actuator = self.datasheet.actuator
-        found = excitation(log, actuator.pad_clearance_rad)
+        force_N, noise_N, reversals_per_s = _excitation(log, actuator.pad_clearance_rad)
         cycle = float(np.median(log.samples["dt"][1:])) if len(log.samples) > 1 else np.inf
         lacking = None
         if len(log.samples) < 500 or cycle > 0.0041:
             lacking = f"{len(log.samples)} samples, one every {1e3 * cycle:.0f} ms"
-        elif not found.force_N > 0.1 * actuator.rated_clamp_force_N:
-            lacking = f"clamp force reaches only {1e-3 * found.force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
-        elif not np.isfinite(found.noise_N):
+        elif not force_N > 0.1 * actuator.rated_clamp_force_N:
+            lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
+        elif not np.isfinite(noise_N):
             lacking = "does not begin with the brake released"
-        elif not reversals[0] <= found.reversals_per_s <= reversals[1]:
+        elif not reversals[0] <= reversals_per_s <= reversals[1]:
             lacking = (
-                f"motor turns round {found.reversals_per_s:.2f} times per second, "
+                f"motor turns round {reversals_per_s:.2f} times per second, "
                 f"expected {reversals[0]:g} to {reversals[1]:g}: a log of another kind"
             )
         if lacking:
@@ -363,8 +391,8 @@ def _missing(value, folder: Path, key: str = "") -> list[str]:
     return [f"{key}: {folder / value}: no such file"] if is_log and not (folder / value).is_file() else []
 
 
-def load_campaign(path: str | Path) -> Campaign:
-    """Read a campaign and its datasheet; no log is read yet.
+def load_campaign(path: str | Path, read=read_with_digest) -> Campaign:
+    """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`.
 
     Raises:
         InputErrors: every fault of either file with line and key; every log that is not there.
@@ -378,4 +406,4 @@ def load_campaign(path: str | Path) -> Campaign:
         raise InputErrors([f"{path}: {line}" for line in missing])
     if file.dbc is not None:
         _check_dbc(path.parent / file.dbc, file.corner)
-    return Campaign(path, file, datasheet)
+    return Campaign(path, file, datasheet, read)

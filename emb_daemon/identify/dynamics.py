@@ -3,32 +3,30 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from msgspec import structs
 
-from emb_daemon.calibration.types import Curve
+from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value_of
+from emb_daemon.calibration.types import Calibration, Curve, to_parameters
 from emb_daemon.effects import REGISTRY
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.effects.base import Effect
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.run import stiffness_force
 
 #: Terms of the characteristic curve, the thesis's cubic.
 TERMS = 3
-_RELAXATION, _DELAY = "relaxation_time_s", "signal_delay.delay_s"
-_SLIP = "stiffness_hysteresis.slip_angle_rad"
-#: Parameters of the dynamics that all pads of an actuator share.
-DYNAMICS = (
-    _RELAXATION,
-    "second_relaxation.share",
-    "second_relaxation.time_constant_s",
-    "stiffness_hysteresis.share",
-    _SLIP,
-    _DELAY,
-)
-#: Effects that a fit may leave out; the delay of the reference against the resolver is a nuisance that always stays in.
-OPTIONAL = ("second_relaxation", "stiffness_hysteresis")
-#: Further starting points of the slip angle, times the first, and evaluations that each is given to prove itself.
-_SLIP_STARTS = (0.3, 3.0)
+RELAXATION = "stiffness.relaxation_time_s"
+#: By how much the rig's reference is later than its resolver, s: fitted beside the calibration's keys, none of the brake's.
+DELAY = "reference delay"
+#: Effects on the static force, which the dynamics may have or not.
+OPTIONAL = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
+#: Where shapes of such effects begin: times the lag's time constant, and as a share of the travel.
+_TIMES, _SHARE_OF_TRAVEL = 10.0, 0.05
+#: Further starting points of those that are an angle, times the first, and evaluations that each is given to prove itself.
+_ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
+#: Positive numbers are searched as logarithms from here, in their own units.
+_LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
 EPISODE = 250
 
@@ -86,25 +84,43 @@ class DynamicsFit:
     """Joint fit over pads of several thicknesses.
 
     Attributes:
-        values, sigmas: shared dynamics by name (`DYNAMICS`); an effect left out has no entries, what was held no sigma.
+        calibration: with what was found.
+        delay_s: by which the reference is late.
+        sigmas: of the shared dynamics, by key and for `DELAY`; none where they were held.
+        curves: of the pads that were fitted.
         residuals: simulated minus reference force, by log path.
         rms: over all samples fitted, N.
     """
 
-    values: dict[str, float]
+    calibration: Calibration
+    delay_s: float
     sigmas: dict[str, float]
     curves: list[CurveFit]
     rms: float
     residuals: dict[str, np.ndarray] = field(repr=False)
 
-    def effects(self) -> dict[str, dict[str, float]]:
-        """Effects as a calibration holds them; the delay of the rig's reference is none of the brake's."""
-        found: dict[str, dict[str, float]] = {}
-        for name, value in self.values.items():
-            effect, _, key = name.partition(".")
-            if effect in OPTIONAL:
-                found.setdefault(effect, {})[key] = value
-        return found
+    def value(self, key: str) -> float:
+        """One of `sigmas`' keys."""
+        return self.delay_s if key == DELAY else value_of(self.calibration, key)
+
+    def values(self) -> dict[str, float]:
+        """What was found, by the calibration's keys."""
+        found = [*dynamics(self.calibration)]
+        for curve in self.curves:
+            found += curve_keys(self.calibration, curve.thickness_mm)
+        return {key: value_of(self.calibration, key) for key in found}
+
+
+def dynamics(calibration: Calibration) -> tuple[str, ...]:
+    """Keys of the dynamics that all pads of an actuator share."""
+    effects = calibration.effects.items()
+    return (RELAXATION, *(f"effects.{effect}.{name}" for effect, parameters in effects for name in parameters))
+
+
+def curve_keys(calibration: Calibration, thickness_mm: float) -> list[str]:
+    """Keys of the coefficients of one thickness's curve."""
+    number = [curve.pad_thickness_mm for curve in calibration.stiffness.curves].index(thickness_mm)
+    return [f"stiffness.curves[{number}].coefficients[{n}]" for n in range(TERMS)]
 
 
 def powers(x: np.ndarray, terms: int = TERMS) -> np.ndarray:
@@ -112,31 +128,17 @@ def powers(x: np.ndarray, terms: int = TERMS) -> np.ndarray:
     return np.maximum(x, 0.0)[:, None] ** np.arange(1, terms + 1)
 
 
-def with_dynamics(values: dict[str, float]) -> np.ndarray:
-    """PARAMETERS, shape (1,), of a brake with only the shared dynamics set: no curve, no clearance."""
-    parameters = np.zeros(1, PARAMETERS)
-    # What effects add to the pads' way is divided by it, even when it is nothing.
-    parameters["gear_gain"] = 1.0
-    for name, value in values.items():
-        effect, _, key = name.partition(".")
-        if key:
-            parameters["effects"][effect][key] = value
-        else:
-            parameters["relaxation_time"] = value
-    return parameters
+def simulate(log: Log, calibration: Calibration, thickness_mm: float, clearance: float, delay_s: float = 0.0) -> np.ndarray:
+    """Force in N of the stiffness path over a log with pads of a thickness."""
+    here = moved(calibration, {"pad_thickness_mm": thickness_mm, CLEARANCE: clearance})
+    samples = log.samples.copy()
+    _delay(samples, log.samples, delay_s)
+    return stiffness_force(samples, to_parameters(here))
 
 
-def simulate(log: Log, values: dict[str, float], coefficients: np.ndarray, clearance: float) -> np.ndarray:
-    """Force in N of the stiffness path over a log; dynamics by name as in `DYNAMICS`."""
-    parameters = with_dynamics(values)
-    parameters["curve"][0, : len(coefficients)] = coefficients
-    parameters["clearance"] = clearance
-    return stiffness_force(log.samples, parameters)
-
-
-def in_service(values: dict[str, float]) -> dict[str, float]:
-    """Dynamics as the daemon has them: the delay of the rig's reference is none of the brake's."""
-    return {**values, _DELAY: 0.0}
+def _delay(into: np.ndarray, samples: np.ndarray, delay_s: float) -> None:
+    """Write the angles of samples as they were ``delay_s`` earlier; the first stays, for the clearance counts from it."""
+    into["angle"][1:] = (samples["angle"] - delay_s * samples["speed"])[1:]
 
 
 def is_slow(log: Log) -> bool:
@@ -154,8 +156,8 @@ def clearance_guess(log: Log) -> float:
 def _rest_noise(log: Log) -> float:
     """Standard deviation in N of the reference force before the motor first moves by a hundredth of its travel."""
     angle = log.samples["angle"]
-    moved = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
-    return float(np.nanstd(log.force_N[: max(moved[0] if len(moved) else 0, 5)]))
+    left = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
+    return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
 
 
 def _travel(log: Log) -> np.ndarray:
@@ -178,65 +180,66 @@ def regress_free(log: Log, clearance: float) -> tuple[np.ndarray, float]:
     return solution[:-1] / span / (1.0 - decay), -cycle / np.log(decay)
 
 
-def starting_values(groups: list[Pads]) -> dict[str, float]:
-    """Where a search for the dynamics starts: thesis 3-5 for the time constant, the rest by proportion."""
+def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[Effect, ...] = OPTIONAL) -> Calibration:
+    """Where a search for curves and dynamics starts: thesis 3-5 for curves and time constant, the rest by proportion."""
     logs = [log for pads in groups for log in pads.logs]
     # Slow logs hardly show the lag: they count only where there are no others.
     fast = [log for log in logs if not is_slow(log)] or logs
     time = float(np.clip(np.median([regress_free(log, clearance_guess(log))[1] for log in fast]), 2e-3, 0.5))
-    span = max(float(_travel(log).max()) - clearance_guess(log) for log in logs)
-    return {
-        _RELAXATION: time,
-        "second_relaxation.share": 0.1,
-        "second_relaxation.time_constant_s": float(np.clip(10.0 * time, 0.06, 10.0)),
-        "stiffness_hysteresis.share": 0.02,
-        _SLIP: float(np.clip(0.05 * span, 0.06, 9.0)),
-        _DELAY: 0.0,
-    }
+    usual = {"s": _TIMES * time, "rad": _SHARE_OF_TRAVEL * max(_span(log) for log in logs)}
+    values = {RELAXATION: time}
+    for effect in effects:
+        for p in effect.parameters:
+            start = usual.get(p.unit, p.prior) if p.starts else p.prior
+            values[f"effects.{effect.name}.{p.name}"] = float(np.clip(start, p.low, p.high))
+    for pads in groups:
+        log = pads.logs[-1]
+        coefficients = regress_free(log, clearance_guess(log))[0]
+        if coefficients[0] <= 0.0:
+            coefficients = np.nanmax(log.force_N) / TERMS / _scale(pads)
+        values |= dict(zip(curve_keys(calibration, pads.thickness_mm), coefficients, strict=True))
+    return moved(structs.replace(calibration, effects={}), values)
 
 
-def _free_dynamics(name: str, start: float) -> Free:
+def _span(log: Log) -> float:
+    """Travel past contact, rad."""
+    return float(_travel(log).max()) - clearance_guess(log)
+
+
+def _scale(pads: Pads) -> np.ndarray:
+    """What makes newtons at full travel of a curve's coefficients."""
+    return max(map(_span, pads.logs)) ** np.arange(1, TERMS + 1)
+
+
+def _free(calibration: Calibration, key: str) -> Free:
     """Positive ones are searched as logarithms: with plain ones the slip angle can cross zero and not come back."""
-    if name == _DELAY:
-        return Free(start, 1e-7, -0.01, 0.01)
-    low, high = 1e-3, 1.0
-    effect, _, key = name.partition(".")
-    for known in REGISTRY:
-        if known.name == effect:
-            parameter = next(p for p in known.parameters if p.name == key)
-            low, high = max(parameter.low, 1e-4), parameter.high
-    return Free(start, 5e-5, low, high, logarithmic=True)
-
-
-def _free_curve(pads: Pads, curve: CurveFit | None, scale: np.ndarray) -> list[Free]:
-    """A curve's coefficients in N at full travel, one for each term."""
-    log = pads.logs[-1]
-    start = (curve.coefficients if curve else regress_free(log, clearance_guess(log))[0]) * scale
-    if start[0] <= 0.0:
-        start = np.full(TERMS, np.nanmax(log.force_N) / TERMS)
-    full = float(np.sum(np.abs(start)))
-    # Force rises from contact: the first coefficient stays positive.
-    return [Free(value, 2e-5 * full, 1e-3 * full if n == 0 else -np.inf) for n, value in enumerate(start)]
+    known = parameter(calibration, key)
+    return Free(known.value, 5e-5, max(known.low, _LEAST), known.high, logarithmic=True)
 
 
 class _Model:
-    """What is fitted: keys are names of `DYNAMICS`, (group, term) of a curve and (group, log's number) of a clearance."""
+    """What is fitted: the calibration's keys, `DELAY`, and for each log its clearance under (group, log's number)."""
 
-    def __init__(self, groups, names, held, fraction):
-        self.groups, self.names, self.held = groups, names, held
-        self.fraction = fraction
-        self.spans = [max(float(_travel(log).max()) - clearance_guess(log) for log in pads.logs) for pads in groups]
-        self.scales = [span ** np.arange(1, TERMS + 1) for span in self.spans]
+    def __init__(self, groups: list[Pads], start: Calibration, delay_s: float, fraction: float, fixed: bool):
+        self.groups, self.start, self.delay_s, self.fraction = groups, start, delay_s, fraction
+        self.shared = () if fixed else (*dynamics(start), DELAY)
+        self.curves = [curve_keys(start, pads.thickness_mm) for pads in groups]
 
-    def free(self, start: dict[str, float], curves: list[CurveFit] | None) -> dict:
-        free = {name: _free_dynamics(name, start[name]) for name in self.names}
+    def free(self) -> dict:
+        free = {key: _free(self.start, key) for key in self.shared if key != DELAY}
+        if DELAY in self.shared:
+            free[DELAY] = Free(self.delay_s, 1e-7, -0.01, 0.01)
+        for pads, own in zip(self.groups, self.curves, strict=True):
+            values, scale = [value_of(self.start, key) for key in own], _scale(pads)
+            full = float(np.abs(values) @ scale)
+            # Force rises from contact: the first coefficient stays positive.
+            for n, key in enumerate(own):
+                free[key] = Free(values[n], 2e-5 * full / scale[n], -np.inf if n else 1e-3 * full / scale[0])
         for g, pads in enumerate(self.groups):
-            terms = _free_curve(pads, curves[g] if curves else None, self.scales[g])
-            free |= {("curve", g, n): term for n, term in enumerate(terms)}
-        for g, pads in enumerate(self.groups):
+            span = max(map(_span, pads.logs))
             for number, log in enumerate(pads.logs):
                 # Force stands clear of its noise somewhat past contact.
-                free["clearance", g, number] = Free(clearance_guess(log) - 0.02 * self.spans[g], 5e-6 * self.spans[g])
+                free[g, number] = Free(clearance_guess(log) - 0.02 * span, 5e-6 * span)
         return free
 
     def blocks(self) -> list[Block]:
@@ -245,66 +248,71 @@ class _Model:
     def _block(self, g: int, number: int, log: Log) -> Block:
         rows = len(log.samples) if self.fraction == 1.0 or is_slow(log) else int(self.fraction * len(log.samples))
         samples, force = log.samples[:rows], log.force_N[:rows]
-        known = np.isfinite(force)
-        curve = [("curve", g, n) for n in range(TERMS)]
+        known, own = np.isfinite(force), samples.copy()
+        start = moved(self.start, {"pad_thickness_mm": self.groups[g].thickness_mm})
+        keys = (*self.shared, *self.curves[g])
 
         def residual(values):
-            parameters = with_dynamics(self.held | {name: values[name] for name in self.names})
-            parameters["curve"][0, :TERMS] = [values[key] for key in curve] / self.scales[g]
-            parameters["clearance"] = values["clearance", g, number]
-            return (stiffness_force(samples, parameters) - force)[known]
+            trial = {key: values[key] for key in keys} | {CLEARANCE: values[g, number]}
+            _delay(own, samples, trial.pop(DELAY, self.delay_s))
+            return (stiffness_force(own, to_parameters(moved(start, trial))) - force)[known]
 
-        keys = (*self.names, *curve, ("clearance", g, number))
-        return Block(residual, keys, np.arange(np.count_nonzero(known)) // EPISODE)
+        return Block(residual, (*keys, (g, number)), np.arange(np.count_nonzero(known)) // EPISODE)
 
     def result(self, found: Fit) -> DynamicsFit:
         curves = []
-        for g, pads in enumerate(self.groups):
-            own = [("curve", g, n) for n in range(TERMS)]
-            contacts = [("clearance", g, number) for number in range(len(pads.logs))]
+        for g, (pads, own) in enumerate(zip(self.groups, self.curves, strict=True)):
+            contacts = [(g, number) for number in range(len(pads.logs))]
             clearances = np.array([found.values[key] for key in contacts])
             curves.append(
                 CurveFit(
                     pads.thickness_mm,
-                    np.array([found.values[key] for key in own]) / self.scales[g],
-                    found.block(own) / np.outer(self.scales[g], self.scales[g]),
+                    np.array([found.values[key] for key in own]),
+                    found.block(own),
                     clearances,
                     np.array([found.sigmas[key] for key in contacts]),
                     float(max(_travel(log).max() - c for log, c in zip(pads.logs, clearances, strict=True))),
                 )
             )
         logs = [log for pads in self.groups for log in pads.logs]
-        residuals = {str(log.path): r for log, r in zip(logs, found.residuals, strict=True)}
-        values = self.held | {name: found.values[name] for name in self.names}
-        return DynamicsFit(values, {name: found.sigmas[name] for name in self.names}, curves, found.rms, residuals)
+        return DynamicsFit(
+            calibration=moved(
+                self.start, {key: value for key, value in found.values.items() if isinstance(key, str) and key != DELAY}
+            ),
+            delay_s=found.values.get(DELAY, self.delay_s),
+            sigmas={key: found.sigmas[key] for key in self.shared},
+            curves=curves,
+            rms=found.rms,
+            residuals={str(log.path): r for log, r in zip(logs, found.residuals, strict=True)},
+        )
 
 
 def fit_dynamics(
     groups: list[Pads],
-    effects: tuple[str, ...] = OPTIONAL,
-    start: dict[str, float] | None = None,
-    curves: list[CurveFit] | None = None,
+    start: Calibration,
+    delay_s: float = 0.0,
+    *,
     fraction: float = 1.0,
+    search: bool = False,
     fixed: bool = False,
 ) -> DynamicsFit:
     """One set of dynamics, a curve for each pair of pads, a contact angle for each log.
 
     Args:
-        effects: which of `OPTIONAL` take part.
-        start: dynamics to start from, by name; without it several starting points are tried.
-        curves: curves to start from, one per group.
+        start: dynamics, with the effects that take part, and curves to start from.
+        delay_s: of the reference, to start from.
         fraction: share that is fitted of each log that is not slow, from its beginning.
-        fixed: keep the dynamics at ``start`` and fit curves and contact angles alone.
+        search: try several starting points for angles that shape an effect.
+        fixed: keep the dynamics and fit curves and contact angles alone.
     """
-    names = [name for name in DYNAMICS if name in (_RELAXATION, _DELAY) or name.partition(".")[0] in effects]
-    first = start or starting_values(groups)
-    held = {name: first[name] for name in names if name in first} if fixed else {}
-    model = _Model(groups, [] if fixed else names, held, fraction)
-    blocks = model.blocks()
-    first = model.free(first, curves)
-    if start is None and _SLIP in names:
+    model = _Model(groups, start, delay_s, fraction, fixed)
+    blocks, first = model.blocks(), model.free()
+    angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]
+    if search and angles:
         # A loop's width and its turning length trade off: other turning lengths may lead to another valley.
-        starts = [first, *(first | {_SLIP: _free_dynamics(_SLIP, factor * first[_SLIP].start)} for factor in _SLIP_STARTS)]
+        starts = [first]
+        for factor in _ANGLE_STARTS:
+            starts.append(first | {key: replace(first[key], start=factor * first[key].start) for key in angles})
         tried = [fit(blocks, free, tolerance=1e-5, evaluations=_TRIAL) for free in starts]
         best = min(tried, key=lambda found: found.rms).values
         first = {key: replace(free, start=best[key]) for key, free in first.items()}

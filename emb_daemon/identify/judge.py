@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from msgspec.structs import replace
 
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, Campaign
@@ -56,8 +56,7 @@ def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_m
     there = thickness.interpolation_error(thickness_mm)
     here = thickness.interpolation_error(calibration.pad_thickness_mm)
     relative = float(np.sqrt(max(calibration.noise.stiffness_relative**2 - here**2, 0.0) + there**2))
-    noise = replace(calibration.noise, stiffness_relative=relative)
-    return replace(calibration, pad_thickness_mm=thickness_mm, noise=noise)
+    return moved(calibration, {"pad_thickness_mm": thickness_mm, "noise.stiffness_relative": relative})
 
 
 def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep, torque: TorqueStep) -> list[Judged]:
@@ -79,8 +78,7 @@ def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep
     for entry in campaign.file.gear_wear:
         if entry.judge is not None and entry.training in gears:
             log = campaign.load_motion(entry.judge, "gear_wear.judge", NEED_RANDOM, reversals=RANDOM)
-            # Wear changes friction; motor and inertia stay.
-            worn = replace(ours, friction=gears[entry.training].friction())
+            worn = moved(ours, gears[entry.training].friction())
             add(entry, "gear", f"{_stem(entry.judge)}, curve predicted", log, worn)
     for entry in campaign.file.frequency_response:
         bounds = (0.0, 4.0 * entry.frequency_Hz)

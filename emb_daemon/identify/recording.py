@@ -72,12 +72,7 @@ def _mean_between(start: np.ndarray, end: np.ndarray, times: np.ndarray, values:
     return (integral(end) - integral(start)) / (end - start)
 
 
-def default_step(duration_s: float) -> float:
-    """Grid fine enough for what a log of that length does: 0.2 s up to fifteen minutes, 1 s over hours."""
-    return 0.2 if duration_s < 930.0 else 0.5 if duration_s < 3600.0 else 1.0
-
-
-def recording(log: Log, step_s: float | None = None) -> Recording:
+def recording(log: Log) -> Recording:
     """Inputs and thermocouples of a log on an even grid.
 
     Motor frames of thermal logs are rare, so that vehicle and thermocouple frames are taken at their own rate: a brake
@@ -93,7 +88,8 @@ def recording(log: Log, step_s: float | None = None) -> Recording:
         return 1e-9 * (time_ns - log.time_ns[0])
 
     duration = min(log.time_s[-1], seconds(reference.pads["inner"][0][-1]))
-    step = default_step(duration) if step_s is None else step_s
+    # Fine enough for what a log of that length does.
+    step = 0.2 if duration < 930.0 else 0.5 if duration < 3600.0 else 1.0
     count = int(duration / step)
     if count < 10:
         raise InputError(f"{log.path}: {duration:.0f} s long; at least {10 * step:.0f} s are needed to identify heat")

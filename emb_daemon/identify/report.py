@@ -21,8 +21,8 @@ def build(result: Identification) -> Page:
     stiffness.section(page, result.stiffness)
     thickness.section(page, result.thickness, campaign.pad_thickness_mm)
     torque.section(page, result.torque)
-    noise.section(page, calibration.noise, calibration.contact)
-    thermal.section(page, result.thermal)
+    noise.section(page, calibration)
+    thermal.section(page, result.thermal, calibration)
     _logs(page, result)
     return page
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from msgspec.structs import replace
 
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.identify.calibration import assemble, provenance, tidy
+from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.judge import Judged, judge, judge_others
 from emb_daemon.identify.steps import Step, contact, held_out, noise, stiffness, thermal, thickness, torque
@@ -51,10 +52,14 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     progress(0.0, "reading logs")
     pads = thickness.load_pads(campaign)
     progress(0.05, "characteristic curves and dynamics")
-    stiff = stiffness.identify(pads, campaign.datasheet.actuator.rated_clamp_force_N)
+    sheet, measured_mm = campaign.datasheet, [own.thickness_mm for own in pads]
+    start = nominal(sheet, f"rig-{campaign.file.rig}", campaign.pad_thickness_mm, measured_mm)
+    stiff = stiffness.identify(pads, start)
     progress(0.3, "torque path")
-    motor = torque.identify(campaign, pads)
-    zero = contact.identify(stiff, campaign.datasheet.resolver.count_rad)
+    motor = torque.identify(campaign, pads, start)
+    zero = contact.identify(stiff, sheet.resolver.count_rad, sheet.actuator.pad_clearance_rad)
+    for note in zero.notes:
+        campaign.fault(f"contact: {note}")
     progress(0.4, "each thickness from the others")
     folds = held_out.identify(campaign, stiff)
     progress(0.6, "noise levels")
@@ -62,16 +67,16 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     interpolation = thick.interpolation_error(campaign.pad_thickness_mm)
     levels = noise.identify(campaign, stiff, motor, folds, interpolation)
     progress(0.65, "pads and disc: heat")
-    heat = thermal.identify(campaign, assemble(campaign, stiff, motor, zero, levels, thermal.nominal(campaign)))
+    known = moved(start, stiff.values | motor.values | zero.values | levels.values)
+    heat = thermal.identify(campaign, known)
     progress(0.9, "judging")
-    calibration = tidy(assemble(campaign, stiff, motor, zero, levels, heat))
+    calibration = tidy(moved(known, heat.values))
     judged = []
     for fold in folds:
         others = [other for other in folds if other is not fold] or [fold]
         mine = noise.identify(campaign, stiff, motor, others, interpolation)
-        known = assemble(campaign, fold, zero, mine, heat, pad_thickness_mm=fold.pads.thickness_mm)
-        known = replace(known, contact=replace(known.contact, clearance_rad=max(fold.clearance_rad, 0.0)))
-        judged += [judge(f"random, {fold.pads.thickness_mm:g} mm", "random", log, known) for log in fold.judged]
+        there = moved(calibration, mine.values | fold.values)
+        judged += [judge(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.judged]
     judged += judge_others(campaign, calibration, thick, motor)
     calibration = replace(calibration, provenance=provenance(campaign, (stiff, motor, heat), judged, heat.figures))
     progress(1.0, "done")

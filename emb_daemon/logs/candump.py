@@ -17,11 +17,13 @@ def _hex_values() -> np.ndarray:
 
 
 _HEX = _hex_values()
+_NOWHERE = np.zeros(0, np.uint8)
 
 
 @njit
-def _parse_line(text, start, stop, frame):
-    """Fill ``frame`` from ``text[start:stop]``; False if the line is malformed."""
+def _parse_line(text, start, stop, frame, octets):
+    """Fill ``frame`` from ``text[start:stop]``, and ``octets`` with its payload if there is room; False if the line is
+    malformed."""
     at = start
     if text[at] != 40:  # (
         return False
@@ -79,8 +81,11 @@ def _parse_line(text, start, stop, frame):
             low = _HEX[text[at + 1]]
             if low == 255:
                 return False
+            octet = _HEX[text[at]] * 16 + low
             if length < 8:
-                data |= np.uint64(_HEX[text[at]] * 16 + low) << np.uint64(8 * length)
+                data |= np.uint64(octet) << np.uint64(8 * length)
+            if length < len(octets):
+                octets[length] = octet
             length += 1
             at += 2
     if at < stop and text[at] == _SPACE:
@@ -89,7 +94,7 @@ def _parse_line(text, start, stop, frame):
             flags |= TRANSMITTED
         while at < stop and text[at] != _SPACE:
             at += 1
-    if at < stop or (length > 8 and not flags & FD):
+    if at < stop or length > (64 if flags & FD else 8):
         return False
     frame.can_id = can_id
     frame.data = data
@@ -99,9 +104,9 @@ def _parse_line(text, start, stop, frame):
 
 
 @njit
-def _parse(text, frames):
+def _parse(text, frames, octets):
     """Returns (frames filled, line number of the first malformed line or 0, whether that line is an unfinished last one)."""
-    count, line, start, size = 0, 0, 0, len(text)
+    count, line, start, size, filled = 0, 0, 0, len(text), 0
     while start < size:
         stop = start
         while stop < size and text[stop] != _NEWLINE:
@@ -109,19 +114,22 @@ def _parse(text, frames):
         line += 1
         end = stop - 1 if stop > start and text[stop - 1] == 13 else stop
         if end > start:
-            if not _parse_line(text, start, end, frames[count]):
+            if not _parse_line(text, start, end, frames[count], octets[filled:]):
                 return count, line, stop == size
+            filled += np.int64(frames[count].length)
             count += 1
         start = stop + 1
     return count, 0, False
 
 
-def parse_candump(text: bytes) -> tuple[np.ndarray, int, bool]:
+def parse_candump(text: bytes, octets: np.ndarray = _NOWHERE) -> tuple[np.ndarray, int, bool]:
     """FRAME array of a whole candump log, the number of the first malformed line (0: none) and whether that line is the
-    last one and lacks its newline, as a log does whose writer was killed."""
+    last one and lacks its newline, as a log does whose writer was killed.
+
+    ``octets``, a uint8 array of half the text's length, takes the payloads, one after the other, those of CAN FD whole."""
     array = np.frombuffer(text, np.uint8)
     frames = np.zeros(text.count(b"\n") + 1, FRAME)
-    count, bad_line, unfinished = _parse(array, frames)
+    count, bad_line, unfinished = _parse(array, frames, octets)
     return frames[:count], bad_line, unfinished
 
 

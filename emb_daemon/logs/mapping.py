@@ -1,10 +1,10 @@
-"""Logs of other people's rigs: their DBC's signals as our frames, by a mapping file.
+"""Logs of other people's rigs as our frames, by a mapping file: CAN logs by the rig's own DBC, tables and measurements by
+column.
 
-A foreign log has neither our ids nor E2E protection. Its signals are decoded by its own DBC, converted to our units and put
-on the wire as our messages with counters that count resolver cycles, so that the pipeline stays the only
-way into the estimator.
+A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,116 +12,99 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import Struct
+from emb_daemon.calibration.types import NonNegative, Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.logs.columns import absent_raw
-from emb_daemon.logs.read import read_frames
-from emb_daemon.resources import resource
-from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.e2e import COUNTER_MODULO, protect
-from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
-from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+from emb_daemon.logs.read import Recorded, read_log
+from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, completed, frames_of, is_received, our_messages
+from emb_daemon.logs.tables import read_table
+from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
+from emb_daemon.wire.layout import CORNERS, load_database
 from emb_daemon.wire.units import UNITS
 
-#: Deviation of a foreign rig's sampling period from ours up to which its samples are taken as they are.
-_SAME_PERIOD = 0.05
-#: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
-_CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
+_PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 
 
 class Mapped(Struct, kw_only=True):
-    """Where one of our signals comes from: a signal of the rig's DBC, or a constant."""
+    """Where one of our signals comes from: a signal of the rig, or a constant."""
 
-    #: Message.Signal of the rig's DBC.
+    #: Message.Signal of the rig's DBC; without a DBC, the name of a column or channel.
     signal: str | None = None
-    #: Its unit, where the rig's DBC states none or a wrong one.
+    #: Its unit, where the rig's DBC states none or a wrong one; always for columns and channels.
     unit: str | None = None
-    #: ours = scale * (theirs, in our unit) + offset; offset in our unit.
+    #: ours = scale * (theirs, in our unit) + offset; -1 turns a direction round.
     scale: float = 1.0
+    #: In our unit.
     offset: float = 0.0
+    #: What the value jumps by where it starts anew, in the rig's unit: 360 of an angle in degrees within one turn. Between two
+    #: samples it must move by less than half of it.
+    period: Positive | None = None
+    #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
+    #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
+    mean_ms: NonNegative | None = None
     #: A constant in our unit, for what the rig does not measure.
     value: float | None = None
 
     def __post_init__(self):
         if (self.signal is None) == (self.value is None):
-            raise ValueError("expected either signal (Message.Signal of the rig's DBC) or value (a constant)")
-        if self.value is not None and (self.unit is not None or self.scale != 1.0 or self.offset != 0.0):
+            raise ValueError("expected either signal (of the rig) or value (a constant)")
+        alone = (self.unit, self.period, self.mean_ms) == (None, None, None) and (self.scale, self.offset) == (1.0, 0.0)
+        if self.value is not None and not alone:
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
             raise ValueError("scale: 0 leaves nothing of the signal")
 
 
+class Time(Struct, kw_only=True):
+    """The column of times of a table."""
+
+    #: Name of the column.
+    signal: str
+    #: s, ms or us.
+    unit: str = "s"
+
+    def __post_init__(self):
+        if UNITS.get(self.unit, ("",))[0] != "s":
+            raise ValueError(f"unit: expected s, ms or us, found {self.unit!r}")
+
+
 class MappingFile(Struct, kw_only=True):
     """mapping.yaml."""
 
+    #: Version of this file format.
     format: Annotated[int, Meta(ge=1, le=1)]
-    #: The rig's DBC, relative to this file.
-    dbc: str
+    #: The rig's DBC, ARXML or KCD, relative to this file; left out for tables and measurements.
+    dbc: str | None = None
+    #: Of a .csv or .parquet table; channels of a measurement have times of their own.
+    time: Time | None = None
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
 
+    def __post_init__(self):
+        if self.dbc is not None and self.time is not None:
+            raise ValueError("time: the frames of a CAN log have theirs; expected dbc or time")
+
 
 class _Source:
-    """One foreign signal, converted to our unit."""
+    """One foreign signal, and how it becomes ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a
+    sampling period."""
 
-    def __init__(self, message, name: str, scale: float, offset: float):
-        self.message, self.name, self.scale, self.offset = message, name, scale, offset
-        self.time_ns = np.zeros(0, np.int64)
-        self.values = np.zeros(0)
+    def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
+        self.name, self.period = mapped.signal, mapped.period
+        self.scale, self.offset, self.span_ns = scale, offset, span_ns
 
-    def decode(self, frames: np.ndarray) -> None:
-        """Take the signal's values from a log; one in a frame too short for it is left out."""
-        flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
-        mine = (frames["can_id"] == self.message.frame_id) & (flags == EXTENDED * self.message.is_extended_frame)
-        times, values = [], []
-        for frame in frames[mine].tolist():
-            data = frame[1].to_bytes(8, "little")[: min(frame[3], 8)]
-            value = self.message.decode(data, decode_choices=False, allow_truncated=True).get(self.name)
-            if value is not None:
-                times.append(frame[0])
-                values.append(float(value))
-        order = np.argsort(times, kind="stable")
-        self.time_ns = np.array(times, np.int64)[order]
-        self.values = self.scale * np.array(values)[order] + self.offset
-
-    @property
-    def period_ns(self) -> float:
-        return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 2 else float(CYCLE_NS)
-
-    def held(self, at_ns: np.ndarray, cycle_ns: int) -> np.ndarray:
-        """The value last heard, NaN where that is too long ago."""
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        row = np.searchsorted(self.time_ns, at_ns, side="right") - 1
-        age = at_ns - self.time_ns[np.maximum(row, 0)]
-        fresh = (row >= 0) & (age <= max(_CARRIED_CYCLES * cycle_ns, _CARRIED_PERIODS * self.period_ns))
-        return np.where(fresh, self.values[np.maximum(row, 0)], np.nan)
-
-    def sampled(self, at_ns: np.ndarray) -> np.ndarray:
-        """The value at each time, straight between samples, NaN in gaps."""
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        origin = self.time_ns[0]
-        values = np.interp((at_ns - origin).astype(float), (self.time_ns - origin).astype(float), self.values)
-        after = np.clip(np.searchsorted(self.time_ns, at_ns), 0, len(self.time_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        apart = np.minimum(np.abs(self.time_ns[after] - at_ns), np.abs(at_ns - self.time_ns[before]))
-        return np.where(apart <= max(CYCLE_NS, _CARRIED_PERIODS * self.period_ns), values, np.nan)
-
-    def averaged(self, at_ns: np.ndarray) -> np.ndarray:
-        """Mean over the cycle that ends at each time where the rig samples faster than we do, otherwise as `sampled`."""
-        if self.period_ns > 0.75 * CYCLE_NS:
-            return self.sampled(at_ns)
-        total = np.concatenate([[0.0], np.cumsum(self.values)])
-        stop = np.searchsorted(self.time_ns, at_ns, side="right")
-        start = np.searchsorted(self.time_ns, at_ns - CYCLE_NS, side="right")
-        return np.where(stop > start, (total[stop] - total[start]) / np.maximum(stop - start, 1), np.nan)
+    def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
+        series = Series.of(time_ns, values)
+        turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
+        return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
 
 
 class Mapping:
-    """A mapping file, checked against both DBCs.
+    """A mapping file, checked against both descriptions.
+
+    Attributes:
+        notes: a line for each signal that the rig does not measure and that others stand in for.
 
     Raises:
         InputErrors: every fault of the file: unknown signals of either DBC, units that do not fit, signals left out.
@@ -129,18 +112,15 @@ class Mapping:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        file = load_yaml(self.path, MappingFile)
-        theirs = load_database(self.path.parent / file.dbc)
-        self._ours = {
-            message.name: (message, database)
-            for database in (load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc")))
-            for message in database.messages
-        }
+        self._file = load_yaml(self.path, MappingFile)
+        self._theirs = load_database(self.path.parent / self._file.dbc) if self._file.dbc else None
+        self._ours = our_messages()
         self._faults: list[str] = []
-        #: Signals by message: where they come from, a constant, or None for an instrument that the rig has not.
-        self._messages: dict[str, dict[str, _Source | float | None]] = {}
-        for name, mapped in file.signals.items():
-            self._add(name, mapped, theirs)
+        self.notes: list[str] = []
+        #: By message and signal of ours; a signal that another stands in for is not among them.
+        self._messages: dict[str, dict[str, _Source | float]] = {}
+        for name, mapped in self._file.signals.items():
+            self._add(name, mapped)
         self._complete()
         if self._faults:
             raise InputErrors(self._faults)
@@ -148,24 +128,22 @@ class Mapping:
     def _fault(self, key: str, text: str) -> None:
         self._faults.append(f"{self.path}: signals.{key}: {text}")
 
-    def _add(self, name: str, mapped: Mapped, theirs) -> None:
+    def _add(self, name: str, mapped: Mapped) -> None:
         message_name, _, signal_name = name.partition(".")
-        if message_name not in self._ours or (message_name.startswith("EMB_") and not _is_received(message_name)):
+        if message_name not in self._ours or (message_name.startswith("EMB_") and not is_received(message_name)):
             return self._fault(name, "expected Message.Signal of what the daemon receives, such as EMB_FL_Resolver.MotorAngle")
         ours = {signal.name: signal for signal in self._ours[message_name][0].signals}.get(signal_name)
-        if ours is None or signal_name in ("CRC", "Counter", "Status"):
+        if ours is None or signal_name in HEADER:
             return self._fault(name, f"{message_name} has no such signal to map")
         signals = self._messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
             return None
-        their_message, _, their_signal = mapped.signal.rpartition(".")
         try:
-            message = theirs.get_message_by_name(their_message)
-            found = message.get_signal_by_name(their_signal)
+            stated = self._their_unit(mapped.signal)
         except KeyError:
             return self._fault(name, f"{mapped.signal}: the rig's DBC has no such message and signal")
-        unit = (found.unit or "" if mapped.unit is None else mapped.unit).strip()
+        unit = (stated if mapped.unit is None else mapped.unit).strip()
         if unit not in UNITS:
             return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {', '.join(UNITS)[:-2]}")
         target, factor, shift = UNITS[unit]
@@ -174,32 +152,51 @@ class Mapping:
             return self._fault(
                 name, f"{mapped.signal} is in {unit or 'no unit'}, which cannot become {ours.unit or 'a number'}{hint}"
             )
-        signals[signal_name] = _Source(message, their_signal, mapped.scale * factor, mapped.scale * shift + mapped.offset)
+        span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
+        span_ns = None if span_ms is None else 1e6 * span_ms
+        signals[signal_name] = _Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
+    def _their_unit(self, signal: str) -> str:
+        """Of a signal as the rig describes it, empty if it does not.
+
+        Raises:
+            KeyError: the rig's DBC has no such signal.
+        """
+        if self._theirs is None:
+            return ""
+        message, _, name = signal.rpartition(".")
+        return self._theirs.get_message_by_name(message).get_signal_by_name(name).unit or ""
+
     def _complete(self) -> None:
-        """A message is sent whole: what is left out would be a zero that somebody believes."""
-        corners = [corner for corner in CORNERS if f"EMB_{corner}_Resolver" in self._messages]
+        """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
+        corners = [corner for corner in CORNERS if self._sources(f"EMB_{corner}_Resolver")]
         if not corners and not self._faults:
             self._faults.append(
-                f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle and MotorSpeed of at least one corner"
+                f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner"
             )
-        self._clocks = {}
         for name, signals in self._messages.items():
+            substitutes = SUBSTITUTES.get(name.rpartition("_")[2], {})
             for signal in self._ours[name][0].signals:
-                optional = signal.name in (*_UNUSED, "CRC", "Counter", "Status") or name.startswith("RIG_")
+                optional = signal.name in (*_UNUSED, *HEADER) or name.startswith("RIG_")
                 other = name in ("VEH_WheelSpeed", "VEH_WheelPulse") and signal.name[-2:] not in corners
-                if signal.name not in signals:
-                    if optional or other:
-                        signals[signal.name] = None if name.startswith("RIG_") else 0.0
-                    else:
-                        self._fault(f"{name}.{signal.name}", "missing: map it too, or give it a constant `value`")
-            if name.endswith("_Resolver") and not any(isinstance(source, _Source) for source in signals.values()):
+                if signal.name in signals or optional or other:
+                    continue
+                if signal.name in substitutes:
+                    self.notes.append(f"{self.path}: {name}.{signal.name} is not measured: {substitutes[signal.name]}")
+                else:
+                    self._fault(f"{name}.{signal.name}", "missing: map it too, or give it a constant `value`")
+            if name.endswith("_Thermocouple") and not any(plate in signals for plate in _PLATES):
+                self._fault(name, f"expected {' or '.join(_PLATES)}")
+            if name.endswith("_Resolver") and not self._sources(name):
                 self._fault(name, "only constants: expected at least one signal of the rig")
         for corner in corners:
-            clock = self._messages[f"EMB_{corner}_Resolver"].get("MotorAngle")
-            if isinstance(clock, _Source):
-                self._clocks[corner] = clock
+            for message, text in _LOST.items():
+                if (name := message.format(corner)) not in self._messages:
+                    self.notes.append(f"{self.path}: {name} is not mapped: {text}")
+
+    def _sources(self, message: str) -> dict[str, _Source]:
+        return {key: source for key, source in self._messages.get(message, {}).items() if isinstance(source, _Source)}
 
     def read(self, path: str | Path) -> np.ndarray:
         """A foreign log as FRAME array of our messages, in time order; instead of `logs.read.read_frames`.
@@ -207,74 +204,61 @@ class Mapping:
         Raises:
             InputError: unreadable, or nothing of the mapped signals in it.
         """
-        return self.translate(read_frames(path), Path(path))
+        return self.read_with_digest(path)[0]
 
-    def translate(self, frames: np.ndarray, path: Path = Path("frames")) -> np.ndarray:
-        """Our frames of a foreign log's frames; ``path`` is what messages call it."""
-        for signals in self._messages.values():
-            for source in signals.values():
-                if isinstance(source, _Source):
-                    source.decode(frames)
-        ticks = {corner: _clock(source) for corner, source in self._clocks.items()}
-        if not any(len(times) for times, _ in ticks.values()):
-            wanted = ", ".join(
-                sorted({f"{source.message.name} ({source.message.frame_id:#x})" for source in self._clocks.values()})
-            )
-            raise InputError(f"{path}: no frame of {wanted} in it, which {self.path} maps to motor angle")
-        first = min(int(times[0]) for times, _ in ticks.values() if len(times))
-        last = max(int(times[-1]) for times, _ in ticks.values() if len(times))
-        parts = [self._frames_of(name, signals, ticks, first, last) for name, signals in self._messages.items()]
-        result = np.concatenate(parts)
-        # Stable: at one instant slow messages come first and the resolver last, as the pipeline pairs it with its current.
-        return result[np.argsort(result["time_ns"], kind="stable")]
-
-    def _frames_of(self, name: str, signals: dict, ticks: dict, first: int, last: int) -> np.ndarray:
-        message, database = self._ours[name]
-        corner = name.split("_")[1]
-        if corner in ticks and name.endswith(("_Resolver", "_Current", "_Force")):
-            times, cycles = ticks[corner]
-            take = {"_Current": _Source.averaged}.get(name[name.rindex("_") :], _Source.sampled)
-            values = {key: take(source, times) if isinstance(source, _Source) else source for key, source in signals.items()}
+    def read_with_digest(self, path: str | Path) -> tuple[np.ndarray, str]:
+        """`read`, and the SHA-256 of the file as it was read."""
+        path, wanted = Path(path), {source.name for name in self._messages for source in self._sources(name).values()}
+        if self._theirs is None:
+            raw, digest = read_table(path, sorted(wanted), self._file.time)
         else:
-            cycle_ns = (message.cycle_time or 40) * 1_000_000
-            times = np.arange(first, last + 1, cycle_ns)
-            cycles = np.arange(len(times))
-            values = {
-                key: source.held(times, cycle_ns) if isinstance(source, _Source) else source for key, source in signals.items()
+            recorded = read_log(path)
+            raw, digest = self._decoded(recorded, wanted), recorded.digest
+        messages = {
+            name: {
+                key: source.converted(*raw[source.name]) if isinstance(source, _Source) else source
+                for key, source in signals.items()
             }
-        names = tuple(key for key in signals if key not in ("CRC", "Counter", "Status"))
-        payload, usable = np.zeros(len(times), np.uint64), np.ones(len(times), bool)
-        for signal, key in zip(signal_columns(database, name, names), names, strict=True):
-            start, length = np.uint64(signal["start"]), int(signal["length"])
-            if values[key] is None:
-                payload |= np.uint64(absent_raw(length) & ((1 << length) - 1)) << start
-                continue
-            column = np.broadcast_to(np.asarray(values[key], float), times.shape)
-            usable &= np.isfinite(column) & (column >= signal["low"]) & (column <= signal["high"])
-            raw = np.rint((np.where(np.isfinite(column), column, 0.0) - signal["offset"]) / signal["factor"]).astype(np.int64)
-            payload |= (raw.astype(np.uint64) & np.uint64((1 << length) - 1)) << start
-        frames = np.zeros(int(usable.sum()), FRAME)
-        frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
-        frames["data"] = payload[usable]
-        if not name.startswith("RIG_"):
-            counters = cycles[usable] % COUNTER_MODULO
-            for frame, counter in zip(frames, counters.tolist(), strict=True):
-                frame["data"] = protect(message.frame_id, frame["data"], counter, 0)
-        return frames
+            for name, signals in self._messages.items()
+        }
+        frames = frames_of({name: completed(name, signals) for name, signals in messages.items()})
+        if not len(frames):
+            raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
+        return frames, digest
+
+    def _clocks(self) -> str:
+        names = sorted({next(iter(self._sources(f"EMB_{corner}_Resolver").values())).name for corner in CORNERS
+                        if self._sources(f"EMB_{corner}_Resolver")})  # fmt: skip
+        if self._theirs is None:
+            return ", ".join(names)
+        messages = {name: self._theirs.get_message_by_name(name.rpartition(".")[0]) for name in names}
+        return ", ".join(f"{name} ({message.frame_id:#x})" for name, message in messages.items())
+
+    def _decoded(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Times and values of the rig's signals; one in a frame too short for it is left out."""
+        found, frames = {}, recorded.frames
+        by_message: dict[str, list[str]] = {}
+        for signal in wanted:
+            by_message.setdefault(signal.rpartition(".")[0], []).append(signal)
+        for name, signals in by_message.items():
+            message = self._theirs.get_message_by_name(name)
+            flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
+            mine = (frames["can_id"] == message.frame_id) & (flags == EXTENDED * message.is_extended_frame)
+            rows = np.flatnonzero(mine)
+            decoded = [
+                message.decode(payload, decode_choices=False, allow_truncated=True) for payload in recorded.payloads(rows)
+            ]
+            for signal in signals:
+                values = [row.get(signal.rpartition(".")[2], np.nan) for row in decoded]
+                found[signal] = (frames["time_ns"][rows], np.array(values, float))
+        return found
 
 
-def _is_received(message: str) -> bool:
-    return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
-
-
-def _clock(angle: _Source) -> tuple[np.ndarray, np.ndarray]:
-    """Times of the resolver samples and the cycle that each belongs to: the rig's own samples if its period is ours, a grid of
-    our period otherwise."""
-    times = angle.time_ns
-    if len(times) < 3:
-        return times, np.arange(len(times))
-    if abs(angle.period_ns / CYCLE_NS - 1.0) <= _SAME_PERIOD:
-        steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
-        return times, np.concatenate([[0], np.cumsum(steps)])
-    grid = np.arange(int(times[0]), int(times[-1]) + 1, CYCLE_NS)
-    return grid, np.arange(len(grid))
+#: What a corner loses with a message that is not mapped.
+_LOST = {
+    "EMB_{}_Current": "the force rests on the motor angle alone",
+    "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
+    "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
+    "VEH_Status": "that the brake begins released has to be shown by motor and current; of a bench say so by `value: 0` of "
+    "ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp",
+}

@@ -3,38 +3,51 @@
 import gzip
 import hashlib
 import io
+import os
 import sys
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.bounded import read_bounded
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import parse_candump
+from emb_daemon.logs.resample import at_our_rate
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITTED
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
 
 
+def _most_bytes() -> int:
+    """Bytes of a log that this machine can hold, with what is made of them: a quarter of its memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
 def read_file(path: Path) -> bytes:
     """The one place where a log file is read."""
     try:
-        return path.read_bytes()
+        return read_bounded(path, _most_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
 
 
-def _unpacked(path: Path, raw: bytes) -> bytes:
+def unpacked(path: Path, raw: bytes) -> bytes:
     """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
     if raw[:2] != b"\x1f\x8b":
         return raw
-    parts = []
+    parts, left = [], _most_bytes()
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(raw)) as file:
             while part := file.read1(1 << 20):
                 parts.append(part)
+                left -= len(part)
+                if left < 0:
+                    raise InputError(f"{path}: unpacks to more than {_most_bytes()} bytes, a quarter of this machine's memory")
     except (zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{path}: damaged gzip file ({error})") from None
     except EOFError:
@@ -44,48 +57,60 @@ def _unpacked(path: Path, raw: bytes) -> bytes:
     return b"".join(parts)
 
 
-def _candump(path: Path, text: bytes) -> np.ndarray:
-    frames, bad_line, unfinished = parse_candump(text)
+@dataclass(frozen=True)
+class Recorded:
+    """A log file as it stands: ``frames``, a FRAME array in file order, ``octets``, their payloads one after the other (those
+    of CAN FD whole), and ``digest``, the SHA-256 of the file."""
+
+    frames: np.ndarray
+    octets: np.ndarray
+    digest: str
+
+    def payloads(self, rows: np.ndarray) -> list[bytes]:
+        """Payloads of the frames with these row numbers."""
+        ends = np.cumsum(self.frames["length"], dtype=np.int64)
+        starts = ends - self.frames["length"]
+        return [self.octets[start:end].tobytes() for start, end in zip(starts[rows], ends[rows], strict=True)]
+
+
+def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray]:
+    octets = np.zeros(len(text) // 2, np.uint8)
+    frames, bad_line, unfinished = parse_candump(text, octets)
     if bad_line and unfinished and bad_line > 1:
         print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
     elif bad_line:
         raise InputError(f"{path}:{bad_line}: not a candump line, expected '(seconds.fraction) interface id#data'")
-    return frames
+    return frames, octets
 
 
-def _python_can(path: Path, content: bytes, reader_name: str) -> np.ndarray:
+def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray]:
     import can
     from can.io.generic import TextIOMessageReader
 
-    file = io.BytesIO(content)
+    file, octets = io.BytesIO(content), bytearray()
     try:
         kind = getattr(can, reader_name)
         reader = kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file)
-        rows = [
-            (
-                round(message.timestamp * 1e9),
-                int.from_bytes(message.data[:8], "little"),
-                message.arbitration_id,
-                len(message.data),
-                EXTENDED * message.is_extended_id
-                | REMOTE * message.is_remote_frame
-                | ERROR * message.is_error_frame
-                | FD * message.is_fd
-                | TRANSMITTED * (not message.is_rx),
-            )
-            for message in reader
-        ]
+        rows = []
+        for message in reader:
+            octets += message.data
+            flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
+            flags |= FD * message.is_fd | TRANSMITTED * (not message.is_rx)
+            data = int.from_bytes(message.data[:8], "little")
+            rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
     except ImportError as error:
         raise InputError(f"{path}: reading this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
     except Exception as error:
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {error}") from None
-    return np.array(rows, FRAME)
+    return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
 
 
 def read_frames(path: str | Path) -> np.ndarray:
-    """All frames of a log as a FRAME array in file order; ``time_ns`` is the log's own clock.
+    """All frames of a log as a FRAME array; ``time_ns`` is the log's own clock.
 
-    The format goes by the last ending alone (before ``.gz``), so that names with dots in them are fine.
+    They stand in file order; those of a log whose resolver has another rate than ours are brought to it
+    (`resample.at_our_rate`), with a word on stderr. The format goes by the last ending alone (before ``.gz``), so that names
+    with dots in them are fine.
 
     Raises:
         InputError: missing, damaged, empty or unknown file; names the file and the line where there are lines.
@@ -95,13 +120,26 @@ def read_frames(path: str | Path) -> np.ndarray:
 
 def read_with_digest(path: str | Path) -> tuple[np.ndarray, str]:
     """`read_frames`, and the SHA-256 of the file as it was read."""
+    recorded = read_log(path)
+    frames = at_our_rate(recorded.frames)
+    if frames is not recorded.frames:
+        print(f"{path}: sampled at another rate than every {CYCLE_NS // 1_000_000} ms, brought to it", file=sys.stderr)
+    return frames, recorded.digest
+
+
+def read_log(path: str | Path) -> Recorded:
+    """A log as it stands.
+
+    Raises:
+        InputError: as `read_frames`.
+    """
     path = Path(path)
     ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     if ending != ".log" and ending not in _PYTHON_CAN:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
     raw = read_file(path)
-    content = _unpacked(path, raw)
-    frames = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
+    content = unpacked(path, raw)
+    frames, octets = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     if not len(frames):
         raise InputError(f"{path}: holds no frames")
-    return frames, hashlib.sha256(raw).hexdigest()
+    return Recorded(frames, octets, hashlib.sha256(raw).hexdigest())

@@ -1,5 +1,6 @@
 """Tables of estimates and logs of frames, by the output file's ending; whole or not at all."""
 
+import datetime
 import os
 import tempfile
 from pathlib import Path
@@ -128,6 +129,8 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
         from asammdf import MDF, Signal
     except ImportError as error:
         raise InputError(f"{path}: writing this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+    # A measurement's times count from its start: viewers add the two.
+    start_s = np.floor(columns["time_s"][0]) if len(columns["time_s"]) else 0.0
     signals = []
     for name, values in columns.items():
         if name == "time_s":
@@ -139,9 +142,12 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
             values = values.astype(np.uint8)
             conversion = {f"val_{code}": code for code in range(len(texts))}
             conversion |= {f"text_{code}": text.encode() for code, text in enumerate(texts.tolist())}
-        signals.append(Signal(values, columns["time_s"], name=name, unit=unit, comment=comment, conversion=conversion))
+        signals.append(
+            Signal(values, columns["time_s"] - start_s, name=name, unit=unit, comment=comment, conversion=conversion)
+        )
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         with MDF(version="4.10") as file:
+            file.header.start_time = datetime.datetime.fromtimestamp(start_s, datetime.UTC)
             file.append(signals, acq_name="emb_daemon", comment="estimates of emb_daemon replay", common_timebase=True)
             part = file.save(Path(folder) / "signals.mf4", compression=2)
         os.replace(part, path)

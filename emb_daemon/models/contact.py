@@ -14,8 +14,9 @@ import numpy as np
 from emb_daemon.jit import njit
 
 #: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
-#: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``excess``: torque not believed, smoothed
-#: over ``watched`` samples. ``agreed``: closing samples that confirm.
+#: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``early``: what was above it, N m, in the
+#: mean of the first ``begun`` samples of this stroke. ``excess``: torque not believed, smoothed over ``watched`` samples.
+#: ``agreed``: closing samples that confirm.
 CONTACT = np.dtype(
     [
         ("engaged", "?"),
@@ -23,6 +24,8 @@ CONTACT = np.dtype(
         ("confirmed", "?"),
         ("level", "f8"),
         ("samples", "f8"),
+        ("early", "f8"),
+        ("begun", "f8"),
         ("rise", "f8"),
         ("shortfall", "f8"),
         ("agreed", "i8"),
@@ -49,6 +52,9 @@ _SMOOTHED, _CONFIRMING = 15.0, 100
 _TOLERANCE, _TELLING = 0.07, 3.0
 #: Clearance samples that show an offset of torque, and factor by which correlated noise makes their mean less certain.
 _SHOWN, _CORRELATED = 20.0, 1.5
+#: Samples at the beginning of a stroke that tell an offset, which is there at once, from a force, which grows; least number of
+#: them; and share of the excess that an offset must have shown by then.
+_BEGINNING, _BEGUN, _AT_ONCE = 8.0, 3.0, 0.5
 #: Standard deviations of the contact angle beyond which it counts as passed.
 _CERTAIN = 4.0
 
@@ -96,8 +102,12 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
     level, level_sigma = clearance_level(state, sigma, offset, offset_sigma)
     state.excess += (torque - predicted - level - state.excess) / state.watched
     if friction_mean < _TURNED_OVER:
+        state.begun = state.early = 0.0
         return NOTHING
     clear = x < -_CERTAIN * contact_sigma
+    if clear and state.begun < _BEGINNING:
+        state.begun += 1.0
+        state.early += (torque - predicted - level - state.early) / state.begun
     if clear:
         state.samples = min(state.samples + 1.0, _MOST)
         state.level += (torque - state.level) / state.samples
@@ -107,6 +117,9 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
     state.shortfall = max(0.0, state.shortfall - (above + tolerated) / sigma - _DRIFT)
     if state.rise > limit:
         state.rise, state.agreed = 0.0, 0
+        if state.begun >= _BEGUN and state.early > _AT_ONCE * state.excess:
+            forget_level(state)
+            return NOTHING
         was_engaged, state.engaged = state.engaged, True
         if clear or (was_engaged and not state.confirmed):
             return TOO_LATE
@@ -128,6 +141,12 @@ def clearance_level(state, sigma, offset, offset_sigma):
     if state.samples < _SHOWN:
         return offset, offset_sigma
     return state.level, max(_CORRELATED * sigma / sqrt(state.samples), offset_sigma)
+
+
+@njit
+def forget_level(state):
+    """The clearance level is another now: the offset of the torque has changed."""
+    state.level = state.samples = 0.0
 
 
 @njit

@@ -5,8 +5,8 @@ everything learned let expect. Its squares, less what model errors may make of t
 inspection schemes", Biometrika 41, 1954): a few samples far off or many less far off raise the alarm, and as many good ones
 end it. Which path is wrong is decided by what only one of them uses:
 
-    resolver   angle and speed repeat to the bit although torque or speed must turn the motor, or the angle does not follow the
-               speed
+    resolver   angle and speed repeat to the bit although torque or speed must turn the motor, the angle alone while the torque
+               changes by more than friction at rest can carry, or the angle does not follow the speed
     current    repeats to the bit, or asks for force while the pads do not touch
 
 Otherwise it stays open; then stiffness goes on, and its standard deviation covers the difference.
@@ -22,7 +22,8 @@ from emb_daemon.jit import njit
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
-#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one.
+#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``held_low``, ``held_high``: between
+#: what it has been since the angle moved last.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -38,6 +39,8 @@ PLAUSIBILITY = np.dtype(
         ("averaged", "?"),
         ("torque_mean", "f8"),
         ("torque_variance", "f8"),
+        ("held_low", "f8"),
+        ("held_high", "f8"),
     ],
     align=True,
 )
@@ -63,6 +66,8 @@ _COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
 _STICTION = 0.3
+#: Standard deviations of one sample's torque that its mean over `_AVERAGED_S` does not reach.
+_CERTAIN = 6.0
 #: Standard deviations of the contact angle by which the motor is clear of it when the pads do not touch.
 _CLEAR_OF_CONTACT = 6.0
 #: Time over which torque is averaged when it must do without the resolver, s.
@@ -140,6 +145,27 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
     deviation ``sigma``: where it is not zero, the motor turns."""
     band = (1.0 + _STICTION) * (offset_friction + load_friction * force)
     return max(abs(torque - gear_gain * force) - band, 0.0) / sigma
+
+
+@njit
+def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
+    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque changed by more than
+    friction at rest carries in both directions, under a clamp force of ``force`` N.
+
+    ``moved``: whether the angle did at this sample; ``sigma``: standard deviation of the torque, N m."""
+    if moved:
+        c.held_low = c.held_high = c.torque_mean
+        return False
+    c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
+    carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
+    return c.held_high - c.held_low > 2.0 * carried + _CERTAIN * sigma
+
+
+@njit
+def disbelieve_resolver(c):
+    """Until the angle moves as the speed says."""
+    if c.verdict != STIFFNESS_WRONG:
+        c.verdict, c.alike, c.frozen_s = STIFFNESS_WRONG, 0, _AVERAGED_S
 
 
 @njit

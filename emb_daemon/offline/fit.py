@@ -67,9 +67,7 @@ class Fit:
         covariance: of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out;
             Wu, Annals of Statistics 14, 1986), which stays honest with few episodes, and the priors' own part.
         residuals: one array per block.
-        at_bound: parameters that stand at a bound; their sigmas are those of a free parameter.
         from_prior: share of each parameter's information that is its prior's, 0 to 1.
-        converged: the search ended before its limit of evaluations.
     """
 
     keys: tuple[Hashable, ...]
@@ -77,9 +75,7 @@ class Fit:
     sigmas: Values
     covariance: np.ndarray
     residuals: list[np.ndarray] = field(repr=False)
-    at_bound: frozenset
     from_prior: Values
-    converged: bool
 
     @property
     def rms(self) -> float:
@@ -96,18 +92,16 @@ def fit(
     blocks: Sequence[Block],
     free: Mapping[Hashable, Free],
     *,
-    huber: float = np.inf,
     tolerance: float = 1e-8,
     evaluations: int = 100,
 ) -> Fit:
     """Values that make the residuals small.
 
     Args:
-        huber: residuals beyond it count linearly (Huber 1964).
         tolerance: relative fall of the cost that ends the search.
         evaluations: limit of the residual's evaluations, not counting derivatives.
     """
-    problem = _Problem(blocks, free, huber)
+    problem = _Problem(blocks, free)
     low, high = problem.bounds()
     found = least_squares(
         problem.reduced,
@@ -124,7 +118,6 @@ def fit(
     covariance, from_prior = problem.covariance(found.x)
     unit = np.where(problem.logarithmic, np.exp(np.where(problem.logarithmic, found.x, 0.0)), 1.0)
     covariance = covariance * np.outer(unit, unit)
-    near = (found.x - low <= problem.steps) | (high - found.x <= problem.steps)
     keys = problem.keys
     return Fit(
         keys=keys,
@@ -132,9 +125,7 @@ def fit(
         sigmas=dict(zip(keys, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         covariance=covariance,
         residuals=residuals,
-        at_bound=frozenset(key for key, at in zip(keys, near, strict=True) if at),
         from_prior=dict(zip(keys, from_prior.tolist(), strict=True)),
-        converged=found.status > 0,
     )
 
 
@@ -155,8 +146,8 @@ def _triangle(tall: np.ndarray) -> np.ndarray:
 class _Problem:
     """Blocks and priors as functions of the vector that is searched."""
 
-    def __init__(self, blocks, free, huber):
-        self.blocks, self.free, self.huber = blocks, free, huber
+    def __init__(self, blocks, free):
+        self.blocks, self.free = blocks, free
         self.keys = tuple(free)
         row = {key: index for index, key in enumerate(self.keys)}
         self.columns = [np.array([row[key] for key in block.keys], int) for block in blocks]
@@ -203,19 +194,8 @@ class _Problem:
             derivative[:, index] = (block.residual(self.values(moved)) - residual) / (moved[column] - x[column])
         return residual, derivative
 
-    def _robust(self, residual):
-        """Residuals whose squares are Huber's cost, and by how much they rise with the residuals."""
-        size = np.abs(residual)
-        far = size > self.huber
-        if not far.any():
-            return residual, np.ones(len(residual))
-        bent = np.sqrt(self.huber * (2.0 * size[far] - self.huber))
-        robust, slope = residual.copy(), np.ones(len(residual))
-        robust[far], slope[far] = np.sign(residual[far]) * bent, self.huber / bent
-        return robust, slope
-
     def reduced(self, x):
-        cost = sum(float(r @ r) for r in (self._robust(residual)[0] for residual in self.residuals(x)))
+        cost = sum(float(residual @ residual) for residual in self.residuals(x))
         vector = np.zeros(len(x) + 1)
         vector[0] = np.sqrt(cost + np.sum((self.weight * (x - self.mean)) ** 2))
         return vector
@@ -225,8 +205,7 @@ class _Problem:
         count = len(x)
         parts = [np.column_stack([np.diag(self.weight), self.weight * (x - self.mean)])]
         for columns, (residual, derivative) in zip(self.columns, self.derivatives(x), strict=True):
-            robust, slope = self._robust(residual)
-            triangle = _triangle(np.column_stack([derivative * slope[:, None], robust]))
+            triangle = _triangle(np.column_stack([derivative, residual]))
             part = np.zeros((len(triangle), count + 1))
             part[:, columns], part[:, -1] = triangle[:, :-1], triangle[:, -1]
             parts.append(part)
@@ -243,14 +222,12 @@ class _Problem:
         prior = np.diag(self.weight**2)
         normals, scores = [], []
         for block, columns, (residual, derivative) in zip(self.blocks, self.columns, self.derivatives(x), strict=True):
-            inside = np.abs(residual) <= self.huber
-            pull = np.clip(residual, -self.huber, self.huber)
             starts = np.flatnonzero(np.diff(block.episode, prepend=block.episode[:1] - 1))
             for rows in map(slice, starts, [*starts[1:], len(residual)]):
                 normal, score = np.zeros((count, count)), np.zeros(count)
                 own = derivative[rows]
-                normal[np.ix_(columns, columns)] = own.T @ (own * inside[rows, None])
-                score[columns] = own.T @ pull[rows]
+                normal[np.ix_(columns, columns)] = own.T @ own
+                score[columns] = own.T @ residual[rows]
                 normals.append(normal)
                 scores.append(score)
         information = sum(normals) + prior
@@ -283,11 +260,16 @@ def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None 
             for normal, score in zip(normals, scores, strict=True)
         ]
     )
-    moves -= moves.mean(axis=0)
-    covariance = (len(moves) - 1) / len(moves) * moves.T @ moves
+    covariance = left_out_covariance(moves)
     if prior is not None:
         inverse = np.linalg.pinv(total * scale, rcond=1e-12)
         covariance += inverse @ (prior * scale) @ inverse.T
     covariance *= scale
     covariance[~known, ~known] = np.inf
     return covariance
+
+
+def left_out_covariance(estimates: np.ndarray) -> np.ndarray:
+    """Covariance (n, n) of estimates, from those with each episode left out in turn, shape (episodes, n): the jackknife."""
+    moves = estimates - estimates.mean(axis=0)
+    return (len(moves) - 1) / len(moves) * moves.T @ moves

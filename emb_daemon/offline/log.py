@@ -8,16 +8,16 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
-from emb_daemon.jit import njit
-from emb_daemon.logs.columns import Decoder, References
+from emb_daemon.logs.columns import Decoder, References, crc_is_right
 from emb_daemon.logs.read import read_frames
 from emb_daemon.pipeline import Pipeline
-from emb_daemon.wire.e2e import crc
-from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.frames import EXTENDED, FRAME
 from emb_daemon.wire.layout import CORNERS
 
 #: Samples that a pipeline takes in one call; a log is collected piece by piece.
 CAPACITY = 1 << 14
+#: Ids that a message about a log lists, the most frequent.
+_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -60,20 +60,12 @@ class Log:
     @cached_property
     def slow(self) -> SlowChannels:
         """Thermocouples, wheel speeds and vehicle status at their own rate."""
-        decoder, frames = Decoder(), self.frames[_crc_is_right(self.frames)]
+        decoder, frames = Decoder(), self.frames[crc_is_right(self.frames)]
         return SlowChannels(*(decoder.columns(frames, message) for message in _slow_messages(self.corner)))
 
 
 def _slow_messages(corner: str) -> tuple[str, str, str]:
     return f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"
-
-
-@njit
-def _crc_is_right(frames):
-    right = np.empty(len(frames), np.bool_)
-    for row in range(len(frames)):
-        right[row] = crc(frames[row].can_id, frames[row].data) == frames[row].data & np.uint64(0xFF)
-    return right
 
 
 def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
@@ -107,13 +99,28 @@ def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
 
 def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -> Log:
     """A corner's samples with what its frames say beside them; errors as in `log_of`."""
+    decoder = Decoder()
     if not len(samples):
-        raise InputError(f"{path}: no resolver sample of corner {corner} that passes its CRC and counter check")
+        raise InputError(f"{path}: {_why_empty(frames, corner, decoder.can_id(f'EMB_{corner}_Resolver'))}")
     reference = References(frames, corner)
     times = samples["time_ns"]
-    decoder = Decoder()
     slow = np.isin(frames["can_id"], [decoder.can_id(message) for message in _slow_messages(corner)])
     return Log(path, corner, samples, times, reference, reference.at(times, reference.clamp_force_N), frames[slow])
+
+
+def _why_empty(frames: np.ndarray, corner: str, resolver_id: int) -> str:
+    """Why frames hold no resolver sample of a corner, and what helps."""
+    mine = frames["can_id"] == resolver_id
+    if (frames["flags"][mine] & EXTENDED == 0).any():
+        return f"no resolver sample of corner {corner} that passes its CRC and counter check"
+    found, counts = np.unique(frames["can_id"], return_counts=True)
+    often = found[np.argsort(-counts, kind="stable")]
+    listed = ", ".join(f"{can_id:#x}" for can_id in np.sort(often[:_LISTED]))
+    rest = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    return (
+        f"no frame of id {resolver_id:#x}, the resolver of corner {corner}; found {listed}{rest}; a rig with other ids needs "
+        "a mapping file (--mapping), another corner --corner"
+    )
 
 
 def corner_index(corner: str) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
-from emb_daemon.estimator.paths import position, rest, stiffness_path, torque_path
+from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import njit
@@ -47,11 +47,8 @@ _COLD = np.ones(1)
 @njit
 def _run_paths(samples, factor, parameters, states, force, out):
     p, s = parameters[0], states[0]
-    s.started = True
-    s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
-    s.friction_variance = 1.0
     s.contact_angle = samples[0].angle + p.clearance
-    rest(s, p, position(s, p, samples[0]), factor[0])
+    settle_paths(s, p, samples[0], factor[0])
     for row in range(len(samples)):
         m = samples[row]
         stiffness_path(s, p, m, factor[row] if len(factor) > 1 else factor[0])
@@ -63,22 +60,24 @@ def _run_paths(samples, factor, parameters, states, force, out):
             s.angle, s.speed = m.angle, m.speed
 
 
-def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
-    """Both force paths, the contact angle held; returns PATHS rows.
+def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
+    """Both force paths of cold pads, the contact angle held; returns PATHS rows.
 
     Args:
         samples: SAMPLE rows, shape (n,), or any rows with their fields.
         parameters: one PARAMETERS record, or an array of shape (1,).
-        factor: stiffness factor, shape (1,) for all rows or (n,).
     """
     force, out = np.empty(len(samples)), np.zeros(len(samples), PATHS)
-    _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
+    _run_paths(samples, _COLD, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
     out["force"] = force
     return out
 
 
 def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
-    """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`; same arguments."""
+    """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`.
+
+    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,).
+    """
     force = np.empty(len(samples))
     _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, np.zeros(0, PATHS))
     return force

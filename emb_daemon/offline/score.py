@@ -27,10 +27,10 @@ def rmse(error: np.ndarray, weight: np.ndarray | None = None) -> float:
     return float(np.sqrt(np.average(error[known] ** 2, weights=None if weight is None else weight[known])))
 
 
-def share_inside(error: np.ndarray, sigma: np.ndarray, sigmas: float = 2.0) -> float:
-    """Share of the finite errors that are no larger than ``sigmas`` of their stated standard deviations."""
+def share_inside(error: np.ndarray, sigma: np.ndarray) -> float:
+    """Share of the finite errors that are no larger than two of their stated standard deviations."""
     known = np.isfinite(error)
-    return float(np.mean(np.abs(error[known]) <= sigmas * sigma[known])) if known.any() else float("nan")
+    return float(np.mean(np.abs(error[known]) <= 2.0 * sigma[known])) if known.any() else float("nan")
 
 
 def figures(error: np.ndarray) -> dict[str, float]:

@@ -125,22 +125,6 @@ def plant_from_calibration(
     return p
 
 
-def wear_pads(plant: np.void, calibration: Calibration, loss_mm: float) -> None:
-    """Wear the pads of a plant down by ``loss_mm`` of thickness, in place: contact moves away, the curve becomes steeper.
-
-    What scatter made of the unit's curve stays.
-
-    Raises:
-        InputError: the thickness left is too far outside of what was measured.
-    """
-    before = 1e3 * float(plant["pad_thickness"])
-    old = curve_at(calibration.stiffness.curves, before)
-    new = curve_at(calibration.stiffness.curves, before - loss_mm)
-    plant["curve"] *= np.divide(new, old, out=np.ones_like(old), where=old != 0.0)
-    plant["contact_angle"] += 1e-3 * loss_mm / plant["gear_gain"]
-    plant["pad_thickness"] -= 1e-3 * loss_mm
-
-
 def _scatter(p: np.void, rng: np.random.Generator, scatter: float, scattered_effects: set[str]) -> None:
     for name, sigma in _SCATTER.items():
         p[name] = p[name] * (1.0 + scatter * sigma * rng.standard_normal(p[name].shape))

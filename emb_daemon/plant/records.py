@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.jit import fields
 from emb_daemon.wire.contract import CYCLE_NS
 
 #: Integration steps in one 4 ms cycle.
@@ -185,10 +186,7 @@ PLANT = np.dtype(
 #: State of one corner. Angles are past the released position; temperatures degC; works and heats in J since the start.
 PLANT_STATE = np.dtype(
     [
-        ("angle", "f8"),
-        ("speed", "f8"),
-        ("current", "f8"),
-        ("friction", "f8"),
+        *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip element, drive of the relaxations and their states.
         ("driven_angle", "f8"),
         ("past_contact", "f8"),
@@ -206,10 +204,7 @@ PLANT_STATE = np.dtype(
         ("stiffness_factor", "f8"),
         # Controller.
         ("latched", "?"),
-        ("position_target", "f8"),
-        ("target_rate", "f8"),
-        ("speed_integral", "f8"),
-        ("force_correction", "f8"),
+        *fields("f8", "position_target target_rate speed_integral force_correction"),
         # Wheel (its zero is where its pulses count from) and heat.
         ("wheel_angle", "f8"),
         ("uneven_disc", "?"),
@@ -218,26 +213,15 @@ PLANT_STATE = np.dtype(
         ("surface", "f8", (2,)),
         ("plate", "f8", (2,)),
         ("plate_reading", "f8", (2,)),
-        ("caliper", "f8"),
-        ("disc", "f8"),
-        ("winding_rise", "f8"),
-        ("magnet_rise", "f8"),
-        ("softening_memory", "f8"),
-        ("wear", "f8"),
+        *fields("f8", "caliper disc winding_rise magnet_rise softening_memory wear"),
         # Sensors.
-        ("current_error", "f8"),
-        ("mean_current", "f8"),
-        ("mean_current_error", "f8"),
+        *fields("f8", "current_error mean_current mean_current_error"),
         ("angle_history", "f8", (HISTORY,)),
         ("current_history", "f8", (HISTORY,)),
         ("history_at", "i8"),
         ("angle_reading", "f8"),
         # Books.
-        ("motor_work", "f8"),
-        ("friction_loss", "f8"),
-        ("clamp_work", "f8"),
-        ("friction_heat", "f8"),
-        ("heat_lost", "f8"),
+        *fields("f8", "motor_work friction_loss clamp_work friction_heat heat_lost"),
     ],
     align=True,
 )
@@ -251,9 +235,7 @@ COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=Tru
 #: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.
 DRIVE = np.dtype(
     [
-        ("wheel_speed", "f8"),
-        ("target_speed", "f8"),
-        ("ambient", "f8"),
+        *fields("f8", "wheel_speed target_speed ambient"),
         ("park_brake", "i8"),
         ("brake_request", "i8"),
     ],
@@ -267,11 +249,7 @@ TRAINING = np.dtype(
     [
         ("requested", "?"),
         ("running", "?"),
-        ("low", "f8"),
-        ("high", "f8"),
-        ("amplitude", "f8"),
-        ("frequency", "f8"),
-        ("start", "f8"),
+        *fields("f8", "low high amplitude frequency start"),
         ("tick", "i8"),
         ("silent", "i8"),
     ],
@@ -286,12 +264,7 @@ CAR = np.dtype(
         ("speed", "f8"),
         ("wheel_speed", "f8"),
         # kg carried by the simulated corners, m, N/(m/s)^2, N, m/s^2
-        ("mass", "f8"),
-        ("wheel_radius", "f8"),
-        ("drag", "f8"),
-        ("rolling", "f8"),
-        ("acceleration", "f8"),
-        ("supply_voltage", "f8"),
+        *fields("f8", "mass wheel_radius drag rolling acceleration supply_voltage"),
         # s; messages leave up to this late after their sample.
         ("jitter", "f8"),
         ("counter", "i8", (15,)),
@@ -303,27 +276,13 @@ CAR = np.dtype(
 #: What was true at each resolver sample. Angles are the resolver's, contact and zero included; index 0 is the inner pad.
 TRUTH = np.dtype(
     [
-        ("time_ns", "i8"),
-        ("corner", "i8"),
-        ("counter", "i8"),
-        ("force", "f8"),
-        ("static_force", "f8"),
-        ("angle", "f8"),
-        ("speed", "f8"),
-        ("current", "f8"),
-        ("contact_angle", "f8"),
-        ("stiffness_factor", "f8"),
-        ("brake_torque", "f8"),
+        *fields("i8", "time_ns corner counter"),
+        *fields("f8", "force static_force angle speed current contact_angle stiffness_factor brake_torque"),
         ("surface", "f8", (2,)),
         ("mean", "f8", (2,)),
         ("depth", "f8", (2, len(PAD_DEPTHS_M))),
         ("plate", "f8", (2,)),
-        ("caliper", "f8"),
-        ("disc", "f8"),
-        ("wheel_speed", "f8"),
-        ("wheel_angle", "f8"),
-        ("vehicle_speed", "f8"),
-        ("wear", "f8"),
+        *fields("f8", "caliper disc wheel_speed wheel_angle vehicle_speed wear"),
         ("park_brake", "i8"),
         ("brake_request", "i8"),
         ("training", "?"),

@@ -7,13 +7,7 @@ import numpy as np
 from emb_daemon.errors import InputError
 from emb_daemon.plant.brake import static_angle
 from emb_daemon.plant.car import CYCLE_S, Car
-from emb_daemon.plant.records import (
-    ANGLE,
-    COMMAND,
-    DRIVE,
-    FORCE,
-    RELEASE,
-)
+from emb_daemon.plant.records import ANGLE, COMMAND, DRIVE, FORCE, RELEASE
 from emb_daemon.wire.contract import PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
 
 #: A request is signalled while the demanded force is above this, N.
@@ -119,15 +113,6 @@ def training(
     return _angles(schedule, _approach(angle)) + rest(0.5)
 
 
-def sinusoid(plant: np.void, frequency: float, seconds: float, low_N: float = 1000.0, high_N: float = 8000.0) -> Schedule:
-    """A sinusoid in motor angle, for the frequency response (thesis 3.3.1)."""
-    schedule = rest(seconds)
-    time = CYCLE_S * np.arange(len(schedule))
-    low, high = angle_at(plant, low_N), angle_at(plant, high_N)
-    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * time))
-    return _angles(schedule, _approach(angle)) + rest(0.5)
-
-
 def rig_stop(force_N: float, wheel_speed: float, clamp_seconds: float = 3.0, cycle_seconds: float = 9.0) -> Schedule:
     """On the rig: the disc is brought to ``wheel_speed`` rad/s, braked to a stand and held a moment."""
     schedule = rest(cycle_seconds)
@@ -147,21 +132,6 @@ def rig_drag(force_N: float, wheel_speed: float, seconds: float) -> Schedule:
     return _forces(rest(seconds, wheel_speed), force * np.clip(CYCLE_S * np.arange(len(force)) / 0.5, 0.0, 1.0)) + rest(
         2.0, wheel_speed
     )
-
-
-def rig_cooling(wheel_speed: float, seconds: float) -> Schedule:
-    """On the rig: released, the disc turning."""
-    return rest(seconds, wheel_speed)
-
-
-def rig_campaign(plant: np.void, rng: np.random.Generator, stops: int = 24, drag_seconds: float = 45.0) -> Schedule:
-    """What the diagnosis logs hold: training, random angle, stops on a rotating disc, a long drag, random angle again."""
-    schedule = training(plant) + random_angle(plant, 22.0, rng)
-    for _ in range(stops):
-        force = float(np.exp(rng.uniform(np.log(2000.0), np.log(25000.0))))
-        schedule += rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.5), rng.uniform(7.0, 11.0))
-    schedule += rig_drag(3500.0, 31.4, drag_seconds)
-    return schedule + random_angle(plant, 20.0, rng)
 
 
 def accelerate(speed: float, seconds: float) -> Schedule:

@@ -32,7 +32,7 @@ class PythonCanBus:
         self._echoes = deque(maxlen=_ECHOES) if echoes else None
         self._frames = np.zeros(4096, FRAME)
         self.dropped = self.unsent = 0
-        self.down = False
+        self.down = self.full = False
         try:
             self._fd = bus.fileno()
         except NotImplementedError:
@@ -77,6 +77,7 @@ class PythonCanBus:
                 | FD * message.is_fd
             )
             count += 1
+        self.full = count == len(self._frames)
         return self._frames[:count]
 
     def _concerns_us(self, message) -> bool:

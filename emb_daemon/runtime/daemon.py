@@ -31,6 +31,9 @@ from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 
 #: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
 _MARGIN_NS = 200_000
+#: How long a frame may take from its stamp to the queue without the loop answering as if it did not come: a replay of the
+#: bus's log knows only the stamp.
+_QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are answered in one tick.
 _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
@@ -47,21 +50,24 @@ class Pacer:
     """When to wake next, from when samples arrived."""
 
     def __init__(self, now_ns: int):
-        self.expected_ns: dict[int, int] = {}
+        self._arrived_ns: dict[int, int] = {}
         self.last_tick_ns = now_ns
 
     def arrived(self, corner: int, time_ns: int) -> None:
         """A sample of ``corner`` was complete at ``time_ns``."""
-        self.expected_ns[corner] = time_ns + CYCLE_NS
+        self._arrived_ns[corner] = time_ns
 
     def next_wake(self, now_ns: int) -> int:
         """Time of the next tick; not later than a period after the last one. In the past if a sample is overdue."""
-        for corner, expected in self.expected_ns.items():
-            # A sample that is a whole period late is lost: expect the next.
-            while now_ns > expected + CYCLE_NS:
-                expected += CYCLE_NS
-            self.expected_ns[corner] = expected
-        wakes = [expected + _MARGIN_NS for expected in self.expected_ns.values()]
+        wakes = []
+        for corner, arrived in list(self._arrived_ns.items()):
+            if now_ns - arrived > (LATE_CYCLES + 1) * CYCLE_NS:
+                # Predictions answer for it, at the loop's own pace, until it is heard again.
+                del self._arrived_ns[corner]
+            else:
+                # A sample that is a whole period late is lost: expect the next.
+                periods = max(1, -(-(now_ns - arrived) // CYCLE_NS) - 1)
+                wakes.append(arrived + periods * CYCLE_NS + _MARGIN_NS)
         free = self.last_tick_ns + CYCLE_NS
         if not wakes:
             return free
@@ -71,25 +77,38 @@ class Pacer:
 
 
 @njit
-def _scan(estimates, count, receptions, arrivals, reported):
+def _scan(estimates, count, states, receptions, arrivals, reported):
     """What the loop must know of new estimates: ``arrivals`` gets the time at which each corner's sample was complete, 0 for
-    none; ``reported`` mode and reasons. Returns (number of invalid estimates, bit mask of corners whose state changed)."""
-    invalid, changed = 0, 0
+    none; ``reported`` mode and reasons. Returns bit masks of corners: estimated, lost to what is no number, changed."""
+    estimated, lost, changed = 0, 0, 0
     arrivals[:] = 0
     for row in range(count):
         estimate = estimates[row]
         corner = estimate.corner
+        estimated |= 1 << corner
         if estimate.is_sample:
             base = CORNER_MESSAGES * corner
             arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
-        if estimate.is_sample and estimate.source == contract.INVALID:
-            invalid += 1
+        if estimate.source == contract.INVALID and not _is_number(states[corner]):
+            lost |= 1 << corner
         # What disturbs the loop is logged once, not for each corner.
-        state = estimate.mode << 16 | estimate.reasons & ~_OF_THE_LOOP
+        state = estimate.mode << 16 | estimate.reasons & 0xFFFF & ~_OF_THE_LOOP
         if state != reported[corner]:
             reported[corner] = state
             changed |= 1 << corner
-    return invalid, changed
+    return estimated, lost, changed
+
+
+@njit
+def _is_number(state):
+    """Whether a corner's state is made of numbers. No sample mends one that is not, a restart does; where inputs make an
+    estimate invalid, a restart would mend nothing and take the other corners with it."""
+    total = state.force + state.contact_angle + state.factor * state.scale
+    for i in range(len(state.error)):
+        total += state.error[i] + state.covariance[i, i]
+        for k in range(len(state.alternatives)):
+            total += state.alternatives[k].error[i] + state.alternatives[k].covariance[i, i]
+    return np.isfinite(total)
 
 
 class Daemon:
@@ -112,12 +131,17 @@ class Daemon:
         corners = tuple(setup.configuration.corners)
         self.pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self.ticks = self.missed = 0
-        self._invalid = 0
+        self._active = sum(1 << CORNERS.index(name) for name in corners)
+        #: Since the watchdog was last thought of: ticks run and missed until then, corners estimated, and lost.
+        self._before = (0, 0)
+        self._estimated = self._lost = 0
         # Plain flags: a signal handler that takes a lock, as an Event does, may wait for the very thread it interrupts.
         self._stopping = self._reload_wanted = False
         self._reader: threading.Thread | None = None
-        #: Calibrations by corner: of the files in use, and of those that were read and wait for the brake's release.
+        #: Calibrations by corner: of the files in use, of those that the reader has read, and of those that wait for the
+        #: brake's release. The reader writes the second only, and the loop takes it when the reader has ended.
         self._calibrations = dict(setup.calibrations)
+        self._read: dict[str, tuple[Calibration, Store | None]] | None = None
         self._waiting: dict[str, tuple[Calibration, Store | None]] = {}
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
@@ -141,7 +165,8 @@ class Daemon:
         _, count = scratch.collect(np.zeros(1, FRAME))
         count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
         scratch.broadcast(count)
-        _scan(scratch.estimates, count, scratch.receptions, self._arrivals.copy(), self._reported.copy())
+        arrivals, reported = self._arrivals.copy(), self._reported.copy()
+        _scan(scratch.estimates, count, scratch.states, scratch.receptions, arrivals, reported)
         if self._adaptation:
             self._adaptation.warm_up(scratch)
         wait()
@@ -173,15 +198,15 @@ class Daemon:
             if remaining > 0:
                 time.sleep(1e-9 * remaining)
             else:
-                self._bus.wait(1e-9 * (CYCLE_NS // 2))
+                self._bus.wait(1e-9 * _QUEUED_NS)
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
             if self._reload_wanted or self._reader is not None or self._waiting:
                 self._follow_reload()
             if watchdog_ns and now >= next_ping:
-                next_ping = now + watchdog_ns
-                self._ping()
+                # One that is withheld is thought of again soon: a stall that is over is no hang.
+                next_ping = now + (watchdog_ns if self._ping() else watchdog_ns // 4)
             if now >= next_status:
                 next_status = now + _STATUS_NS
                 self._manager.notify(f"STATUS={self.ticks} ticks, {self.missed} missed, {self._bus.dropped} frames dropped")
@@ -193,10 +218,11 @@ class Daemon:
     def tick(self, now_ns: int, pacer: Pacer) -> None:
         """Everything that has arrived, answered."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
+        heard_ns = int(frames["time_ns"][-1]) if self._bus.full else now_ns - _QUEUED_NS
         while True:
             start, count = pipeline.collect(frames, start, predictions=False)
             if start >= len(frames):
-                count = pipeline.overdue(now_ns, count)
+                count = pipeline.overdue(heard_ns, count)
             pipeline.answer(count)
             self._bus.send(pipeline.broadcast(count))
             self._follow(count, pacer)
@@ -206,8 +232,12 @@ class Daemon:
 
     def _follow(self, count: int, pacer: Pacer) -> None:
         """Learn when the next samples are due; log what changed."""
-        invalid, changed = _scan(self.pipeline.estimates, count, self.pipeline.receptions, self._arrivals, self._reported)
-        self._invalid += invalid
+        pipeline = self.pipeline
+        estimated, lost, changed = _scan(
+            pipeline.estimates, count, pipeline.states, pipeline.receptions, self._arrivals, self._reported
+        )
+        self._estimated |= estimated
+        self._lost |= lost
         for corner in range(len(CORNERS)):
             if self._arrivals[corner]:
                 pacer.arrived(corner, int(self._arrivals[corner]))
@@ -252,8 +282,13 @@ class Daemon:
         """Have the calibrations read, one reading at a time, and let corners go over to those that changed."""
         if self._reader is not None and not self._reader.is_alive():
             self._reader = None
+            if self._read is not None:
+                self._waiting, self._read = self._read, None
+            if not self._reload_wanted:
+                self._manager.notify("READY=1")
         if self._reload_wanted and self._reader is None:
             self._reload_wanted = False
+            self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
             self._reader = threading.Thread(target=self._read_calibrations, name="reload", daemon=True)
             self._reader.start()
         for name in [name for name in self._waiting if self._released(name)]:
@@ -279,7 +314,7 @@ class Daemon:
             else:
                 log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
                 waiting[name] = calibration, self._adaptation.read(name, calibration) if self._adaptation else None
-        self._waiting = waiting
+        self._read = waiting
 
     def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None) -> None:
         """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what
@@ -292,10 +327,25 @@ class Daemon:
         words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
         log.info("corner %(corner)s: begins anew with calibration %(calibration)s", words, extra={"fields": words})
 
-    def _ping(self) -> None:
-        """Tell the watchdog that the loop is well: it ticks, and no estimate came out that is not a number."""
-        if self._invalid:
-            log.error("%d invalid estimates: the watchdog is not pinged", self._invalid)
-            self._invalid = 0
-            return
-        self._manager.notify("WATCHDOG=1")
+    def _ping(self) -> bool:
+        """Tell the watchdog that the loop is well; False, with the reason in the log, if it is not.
+
+        Well is what a restart would not make better: most ticks are met, each corner's estimates are on their way, and none of
+        their states has been lost. An interface that is down or gone is not among it.
+        """
+        met, missed = self.ticks - self._before[0], self.missed - self._before[1]
+        silent = self._active & ~self._estimated
+        amiss = [
+            f"corner {name}: estimator lost, what it knows is not a number"
+            for index, name in enumerate(CORNERS)
+            if self._lost >> index & 1
+        ]
+        amiss += [f"corner {name}: no estimate" for index, name in enumerate(CORNERS) if silent >> index & 1]
+        if missed > met:
+            amiss.append(f"{missed} of {met + missed} periods missed")
+        self._before, self._estimated, self._lost = (self.ticks, self.missed), 0, 0
+        if amiss:
+            log.error("the watchdog is not pinged: %s", "; ".join(amiss))
+        else:
+            self._manager.notify("WATCHDOG=1")
+        return not amiss

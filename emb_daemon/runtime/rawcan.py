@@ -17,6 +17,7 @@ import numpy as np
 
 from emb_daemon.errors import Unavailable
 from emb_daemon.jit import njit
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 
 # Linux UAPI values that the socket module does not export.
@@ -24,6 +25,9 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
 _MSG_DONTWAIT = 0x40
 _EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _CAN_RAW_ERR_FILTER, _ERROR_CLASSES = 2, 0x1FFF_FFFF
+#: Between stamping a frame and queueing it the kernel may be held up. A stamp that lies no further back than this before the
+#: last look into the queue is believed: the pipeline bears as much for jitter, should the clock have been set instead.
+_IN_TRANSIT_NS = 2 * CYCLE_NS
 
 _CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
 _CAN_FRAME_BYTES = 16
@@ -38,6 +42,11 @@ _MMSGHDR = np.dtype(
     }
 )
 _CONTROL_BYTES = 64
+#: Errors of a socket whose interface was deleted, and those after which the next call may go well.
+_INTERFACE_GONE = (errno.ENODEV, errno.ENXIO)
+_PASSING = (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ECONNRESET, errno.EPIPE, errno.ENOBUFS)
+#: How often another socket is tried for while the interface is gone.
+_REOPEN_NS = 100_000_000
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -67,8 +76,8 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
 
     A peer that closed its end of a socket pair leaves empty messages without end: those are no frames.
 
-    The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock and the result is held
-    between the last drain and now, where the truth must lie.
+    The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock, and the result is held
+    between ``earliest_ns`` and now. Whole microseconds, as candump logs them: a log of the bus then gives the same times.
     """
     drops = np.int64(-1)
     for index in range(count):
@@ -96,7 +105,7 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
                 for byte in range(8):
                     seconds |= np.int64(bytes_[at + 16 + byte]) << (8 * byte)
                     nanoseconds |= np.int64(bytes_[at + 24 + byte]) << (8 * byte)
-                stamp = seconds * 1_000_000_000 + nanoseconds - offset_ns
+                stamp = seconds * 1_000_000_000 + nanoseconds // 1000 * 1000 - offset_ns
             elif kind == _SO_RXQ_OVFL and size >= 20:
                 drops = np.int64(0)
                 for byte in range(4):
@@ -122,49 +131,55 @@ class RawCanSocket:
 
     Args:
         stamped: frames carry the sender's time stamp (`socket_pair`) instead of the kernel's.
+        reopen: gives another such socket when the interface of this one is gone, or raises Unavailable.
 
     Attributes:
-        dropped: frames that the kernel discarded because the receive buffer was full.
+        dropped: frames that this socket's receive buffer had no room for.
         unsent: frames that the kernel did not take.
+        down: the interface is down or gone, as the last attempt to use it found.
+        full: the last drain took as much as it can; more may be waiting.
     """
 
-    def __init__(self, sock: socket.socket, stamped: bool = False, capacity: int = 1024):
-        self._socket = sock
-        self._fd = sock.fileno()
+    def __init__(self, sock: socket.socket, stamped: bool = False, capacity: int = 1024, reopen=None):
+        self._socket, self._reopen = sock, reopen
         frame_bytes = _CAN_FRAME.itemsize if stamped else _CAN_FRAME_BYTES
         self._received = _Batch(capacity, frame_bytes, control=True)
         self._sent = _Batch(capacity, frame_bytes, control=False)
         self._stamped = stamped
         self._frames = np.zeros(capacity, FRAME)
         self._capacity = capacity
-        self._last_drain_ns = time.monotonic_ns()
+        #: When the queue was last looked into, the last frame's time, and when to try for another socket, if this one is gone.
+        self._looked_ns = self._latest_ns = time.monotonic_ns()
+        self._reopen_ns: int | None = None
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.dropped = 0
         self.unsent = 0
-        self.down = False
+        self.down = self.full = False
         # Compiled now, not when the first frame is waiting.
-        self._take(0, self._last_drain_ns)
+        self._take(0, self._looked_ns)
         _to_kernel(self._frames[:0], 0, self._sent.raw)
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until a frame is there or the time is over."""
         # Not poll(), whose timeout is whole milliseconds.
-        return bool(select.select([self._fd], [], [], timeout_s)[0]) if timeout_s > 0 else False
+        return bool(select.select([self._socket], [], [], timeout_s)[0]) if timeout_s > 0 else False
 
     def drain(self) -> np.ndarray:
         """All frames that have arrived, at most ``capacity``, as a FRAME array valid until the next call."""
-        count = _libc.recvmmsg(self._fd, self._received.address, self._capacity, _MSG_DONTWAIT, None)
-        now = time.monotonic_ns()
+        looked = time.monotonic_ns()
+        if self._reopen_ns is not None and looked >= self._reopen_ns:
+            self._rebind(looked)
+        count = _libc.recvmmsg(self._socket.fileno(), self._received.address, self._capacity, _MSG_DONTWAIT, None)
+        self.full = count == self._capacity
         if count < 0:
-            code = ctypes.get_errno()
-            # An interface that goes down reports ENETDOWN once; the socket stays bound and works again when it is up.
-            self.down = code in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-            if not self.down and code not in (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED):
-                raise OSError(code, os.strerror(code))
+            self._failed(ctypes.get_errno())
             return self._frames[:0]
         self.down = False
-        count, drops = self._take(count, now)
-        self._last_drain_ns = now
+        count, drops = self._take(count, time.monotonic_ns())
+        # Before the call, not after: what comes while it returns is found by the next.
+        self._looked_ns = looked
+        if count:
+            self._latest_ns = int(self._frames["time_ns"][count - 1])
         if drops >= 0:
             self.dropped = drops
         return self._frames[:count]
@@ -175,10 +190,11 @@ class RawCanSocket:
         # offset outside of it (the clock was set, or drifts) is moved, to its edge.
         real, after = time.time_ns(), time.monotonic_ns()
         self._offset_ns = min(max(self._offset_ns, real - after), real - now)
+        # A sender's own stamp is of the monotonic clock, which nobody sets.
+        earliest = self._latest_ns if self._stamped else max(self._latest_ns, self._looked_ns - _IN_TRANSIT_NS)
         return _from_kernel(
-            batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, self._last_drain_ns, now,
-            self._frames,
-        )  # fmt: skip
+            batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, earliest, now, self._frames
+        )
 
     def send(self, frames: np.ndarray) -> None:
         """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
@@ -186,8 +202,36 @@ class RawCanSocket:
         for first in range(0, len(frames), self._capacity):
             batch = frames[first : first + self._capacity]
             _to_kernel(batch, time.monotonic_ns(), self._sent.raw)
-            taken = max(_libc.sendmmsg(self._fd, self._sent.address, len(batch), _MSG_DONTWAIT), 0)
-            self.unsent += len(batch) - taken
+            taken = _libc.sendmmsg(self._socket.fileno(), self._sent.address, len(batch), _MSG_DONTWAIT)
+            if taken < 0:
+                self._failed(ctypes.get_errno())
+            else:
+                self.down = False
+            self.unsent += len(batch) - max(taken, 0)
+
+    def _failed(self, code: int) -> None:
+        """Remember what an error says of the interface. Raises OSError if it is none that passes by itself."""
+        if code in _INTERFACE_GONE:
+            self.down = True
+            if self._reopen_ns is None:
+                self._reopen_ns = time.monotonic_ns()
+        elif code == errno.ENETDOWN:
+            # The socket stays bound, and works again when the interface is up.
+            self.down = True
+        elif code not in _PASSING:
+            raise OSError(code, os.strerror(code))
+
+    def _rebind(self, now_ns: int) -> None:
+        """A socket stays bound to an interface that is deleted; one of the same name needs another."""
+        self._reopen_ns = None
+        if self._reopen is not None:
+            try:
+                fresh = self._reopen()
+            except Unavailable:
+                self._reopen_ns = now_ns + _REOPEN_NS
+            else:
+                self._socket.close()
+                self._socket = fresh
 
     def close(self) -> None:
         self._socket.close()
@@ -199,6 +243,14 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
     Raises:
         Unavailable: no such interface, or the kernel has no CAN.
     """
+
+    def reopen() -> socket.socket:
+        return _bound_socket(channel, ids, receive_buffer)
+
+    return RawCanSocket(reopen(), reopen=reopen)
+
+
+def _bound_socket(channel: str, ids: list[int], receive_buffer: int) -> socket.socket:
     if not hasattr(socket, "AF_CAN"):
         raise Unavailable("socketcan: this Python has no AF_CAN")
     try:
@@ -220,7 +272,7 @@ def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) 
     except OSError as error:
         sock.close()
         raise Unavailable(f"socketcan: interface {channel}: {error.strerror}") from None
-    return RawCanSocket(sock)
+    return sock
 
 
 def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:

@@ -128,15 +128,16 @@ def signal_columns(database, message: str, names: tuple[str, ...]):
 
 
 def load_database(path: Path):
-    """A cantools database.
+    """A cantools database: ARXML, KCD or SYM by ending, or a DBC.
 
     Raises:
         InputError: the file cannot be read or is no DBC.
     """
     import cantools
 
+    ending = path.suffix.lower()[1:]
     try:
-        return cantools.database.load_file(path, database_format="dbc")
+        return cantools.database.load_file(path, database_format=ending if ending in ("arxml", "kcd", "sym") else "dbc")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected a DBC") from None
     except Exception as error:

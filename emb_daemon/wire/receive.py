@@ -22,16 +22,19 @@ _NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
 _LONG = np.iinfo(np.int64).max
 
-#: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame; ``sequence_ns`` and ``sequence`` of the last
+#: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame, and whether its sender says that they are
+#: ``degraded``; ``sequence_ns`` and ``sequence`` of the last
 #: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``later_ns`` the least lateness among the
 #: ``seen`` frames of the present ``window``; ``candidate`` the counter of the last frame
 #: that did not stand in sequence, or -1, and ``candidate_ns`` when it came; ``refused_ns`` when a frame was last refused for
-#: its form or sequence; ``range_ns`` when one was last refused for a value out of range; ``count[verdict]``.
+#: its form or sequence; ``range_ns`` when one was last refused for a value out of range; ``data`` of the last frame in
+#: sequence, and ``contested_ns`` when another claimed to be that frame; ``count[verdict]``.
 RECEPTION = np.dtype(
     [
         ("values", "f8", (SIGNALS,)),
         ("time_ns", "i8"),
         ("counter", "i8"),
+        ("degraded", "?"),
         ("sequence_ns", "i8"),
         ("sequence", "i8"),
         ("due_ns", "i8"),
@@ -42,6 +45,8 @@ RECEPTION = np.dtype(
         ("candidate_ns", "i8"),
         ("refused_ns", "i8"),
         ("range_ns", "i8"),
+        ("data", "u8"),
+        ("contested_ns", "i8"),
         ("count", "i8", (len(VERDICTS),)),
     ],
     align=True,
@@ -51,7 +56,7 @@ RECEPTION = np.dtype(
 def new_reception() -> np.ndarray:
     """Receivers of all slots, shape (SLOTS,), that have heard nothing."""
     reception = np.zeros(SLOTS, RECEPTION)
-    for field in ("time_ns", "sequence_ns", "due_ns", "candidate_ns", "refused_ns", "range_ns"):
+    for field in ("time_ns", "sequence_ns", "due_ns", "candidate_ns", "refused_ns", "range_ns", "contested_ns"):
         reception[field] = _NEVER
     reception["counter"] = reception["sequence"] = reception["candidate"] = -1
     reception["values"] = np.nan
@@ -118,6 +123,14 @@ def _follow_schedule(due, time_ns, reception):
 
 
 @njit
+def _contests(frame, reception, cycle_ns):
+    """Whether a frame claims to be the last one in sequence and says something else. No sender does that: there are two, and
+    which of them is genuine nobody can tell."""
+    same = np.int64(counter_of(frame.data)) == reception.sequence and frame.time_ns - reception.sequence_ns < cycle_ns
+    return same and (np.uint64(frame.data) >> np.uint64(12)) != (reception.data >> np.uint64(12))
+
+
+@njit
 def _verdict(frame, slot, reception, layout):
     if frame.length != 8:
         return BAD_LENGTH
@@ -126,8 +139,11 @@ def _verdict(frame, slot, reception, layout):
     counter = np.int64(counter_of(frame.data))
     if counter >= COUNTER_MODULO:
         return BAD_COUNTER
+    if _contests(frame, reception, layout.cycle_ns[slot]):
+        reception.contested_ns = frame.time_ns
     if not _in_sequence(counter, frame.time_ns, reception, layout.cycle_ns[slot]):
         return BAD_COUNTER
+    reception.data = frame.data
     if status_of(frame.data) > STATUS_DEGRADED:
         return BAD_STATUS
     for column in range(layout.received_count[slot]):
@@ -161,6 +177,7 @@ def receive(frame, receptions, layout):
         return slot, verdict
     reception.time_ns = frame.time_ns
     reception.counter = reception.sequence
+    reception.degraded = status_of(frame.data) == STATUS_DEGRADED
     for column in range(layout.received_count[slot]):
         reception.values[column] = unpack(frame.data, layout.received[slot, column])
     return slot, verdict

@@ -18,10 +18,10 @@ with atheris.instrument_imports(include=["emb_daemon"]):
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.errors import InputError
-    from emb_daemon.estimator.records import INVALID
     from emb_daemon.logs.read import read_frames
     from emb_daemon.pipeline import Pipeline
     from emb_daemon.resources import resource
+    from emb_daemon.wire.contract import INVALID
     from emb_daemon.wire.e2e import protect
     from emb_daemon.wire.frames import FRAME
 

@@ -69,6 +69,32 @@ def test_interface_down_and_up(peer: socket.socket) -> None:
         bus.close()
 
 
+def test_interface_deleted_and_added_again() -> None:
+    """As an adapter that is unplugged and plugged in: heard again, within the time that rebinding is tried after."""
+
+    def link(*words: str) -> None:
+        subprocess.run(["ip", "link", *words], check=True)
+
+    name = "vcan7"
+    link("add", "dev", name, "type", "vcan")
+    link("set", name, "up")
+    bus = open_socketcan(name, [RESOLVER])
+    try:
+        link("delete", name)
+        assert _numbers(bus) == [] and bus.down
+        link("add", "dev", name, "type", "vcan")
+        link("set", name, "up")
+        time.sleep(0.15)
+        bus.drain()
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as peer:
+            peer.bind((name,))
+            _send(peer, 3)
+            assert _numbers(bus) == [3] and not bus.down
+    finally:
+        bus.close()
+        subprocess.run(["ip", "link", "delete", name], check=False)
+
+
 def test_receive_overflow_is_counted_by_the_daemons_socket(peer: socket.socket) -> None:
     bus = open_socketcan(CHANNEL, [RESOLVER], receive_buffer=SMALL_BUFFER)
     try:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.calibration.types import Contact
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.identify.dynamics import simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
@@ -14,22 +14,33 @@ _ROWS = 2500
 _STEP = 1e-3
 
 
-def identify(stiffness: StiffnessStep, count_rad: float) -> Step:
+def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> Step:
     """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it.
+
+    A log that began in contact shows no clearance; where all did, it is the datasheet's, of which half may be missing.
 
     Args:
         count_rad: the resolver's smallest step.
+        nominal_rad: the datasheet's clearance.
     """
     curves = stiffness.fit.curves
     found = np.concatenate([curve.clearances_rad for curve in curves])
     errors = np.concatenate([curve.clearance_sigmas_rad for curve in curves])
+    open_ = found > 0.0
+    notes = ()
+    if not open_.any():
+        found, errors, open_ = np.array([nominal_rad]), np.array([0.5 * nominal_rad]), np.array([True])
+        notes = ("every log begins in contact, and the clearance is the datasheet's; needed: a log that begins released",)
+    found, errors = found[open_], errors[open_]
     spread = float(np.std(found, ddof=1)) if len(found) > 1 else 0.0
-    contact = Contact(
-        clearance_rad=float(np.mean(found)),
-        clearance_sigma_rad=float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
-        walk_rad_per_sqrt_s=_walk(stiffness),
+    return Step(
+        values={
+            CLEARANCE: float(np.mean(found)),
+            "contact.clearance_sigma_rad": float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
+            "contact.walk_rad_per_sqrt_s": _walk(stiffness),
+        },
+        notes=notes,
     )
-    return Step(values={"contact": contact})
 
 
 def _walk(stiffness: StiffnessStep) -> float:
@@ -38,10 +49,12 @@ def _walk(stiffness: StiffnessStep) -> float:
     The scatter of each estimate is in it, so that it errs to the safe side.
     """
     squares, seconds = 0.0, 0.0
-    values = stiffness.fit.values
-    for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
+    fit = stiffness.fit
+    for pads, curve in zip(stiffness.pads, fit.curves, strict=True):
         for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
-            at, moved = (simulate(log, values, curve.coefficients, clearance + s) for s in (0.0, _STEP))
+            at, moved = (
+                simulate(log, fit.calibration, pads.thickness_mm, clearance + step, fit.delay_s) for step in (0.0, _STEP)
+            )
             slope, error = (moved - at) / _STEP, at - log.force_N
             shifts = []
             for start in range(0, len(error) - _ROWS + 1, _ROWS):

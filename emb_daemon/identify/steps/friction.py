@@ -8,6 +8,8 @@ from emb_daemon.calibration.types import FrictionTable
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID
 from emb_daemon.identify.recording import Recording, simulate
+from emb_daemon.identify.text import rounded
+from emb_daemon.offline.fit import left_out_covariance
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import Panel, Section, Trace, xy_figure
 from emb_daemon.report.figures import Style
@@ -41,16 +43,16 @@ class FrictionFit:
     """Friction coefficient.
 
     Attributes:
-        table: for the calibration. Its grid runs evenly from standstill, zero force and the coldest surface to a quarter
-            beyond the largest values measured; what lies outside of the data follows the smooth model, held between a third
-            of its value at the mean of the data and 1.
+        values: the table by the calibration's keys. Its grid runs evenly from standstill, zero force and the coldest surface
+            to a quarter beyond the largest values measured; what lies outside of the data follows the smooth model, held
+            between a third of its value at the mean of the data and 1.
         equation: the smooth model, for the report.
         sigma: standard deviation of the coefficient at a typical grid point inside the data, pieces of data left out in turn.
         force_N, speed_rad_per_s, temperature_C, measured, model: of each row that was fitted.
         rms: of measured minus model, weighted by force.
     """
 
-    table: FrictionTable
+    values: dict[str, float]
     equation: str
     sigma: float
     force_N: np.ndarray
@@ -93,9 +95,10 @@ class _Surface:
         error = {bent: self._left_out_error(terms, bent) for bent, terms in left_out.items()}
         self.bent = error[True] < _WORTH_IT * error[False]
         self.terms = self._solve(np.ones(len(force), bool), self.bent)
-        self.model = self._design(self.columns, self.bent) @ self.terms
-        deviation = self._design(self.columns, self.bent) @ (left_out[self.bent] - self.terms).T
-        self.sigma = float(np.sqrt((_PIECES - 1) * np.mean(deviation**2)))
+        design = self._design(self.columns, self.bent)
+        self.model = design @ self.terms
+        covariance = left_out_covariance(left_out[self.bent])
+        self.sigma = float(np.sqrt(np.mean(np.einsum("ti,ij,tj->t", design, covariance, design))))
 
     def _design(self, columns, bent):
         u = [(column - c) / w for column, c, w in zip(columns, self.centre, self.width, strict=True)]
@@ -116,19 +119,23 @@ class _Surface:
         predicted = np.sum(self._design(self.columns, bent) * terms[self.piece], axis=1)
         return rmse(predicted - self.coefficient, self.weight**2)
 
-    def table(self) -> FrictionTable:
+    def table(self) -> dict[str, float]:
         most, coldest = _BEYOND * self.columns.max(axis=1), float(self.columns[2].min())
         force, speed = np.linspace(0.0, most[0], FORCE_GRID), np.linspace(0.0, most[1], SPEED_GRID)
         hottest = coldest + _BEYOND * np.ptp(self.columns[2]) + 1.0
         temperature = np.linspace(coldest, hottest, TEMPERATURE_GRID)
         mesh = np.meshgrid(force, speed, temperature, indexing="ij")
-        values = np.clip(self._design(mesh, self.bent) @ self.terms, self.terms[0] / 3.0, 1.0)
-        return FrictionTable(
-            force_N=tuple(_short(force)),
-            disc_speed_rad_per_s=tuple(_short(speed)),
-            surface_temperature_C=tuple(_short(temperature)),
-            coefficient=tuple(tuple(tuple(_short(line)) for line in plane) for plane in values),
-        )
+        table = {
+            "force_N": force,
+            "disc_speed_rad_per_s": speed,
+            "surface_temperature_C": temperature,
+            "coefficient": np.clip(self._design(mesh, self.bent) @ self.terms, self.terms[0] / 3.0, 1.0),
+        }
+        return {
+            f"thermal.friction.{name}" + "".join(f"[{index}]" for index in at): rounded(value, 5)
+            for name, values in table.items()
+            for at, value in np.ndenumerate(values)
+        }
 
     def equation(self) -> str:
         slopes, centre = self.terms[1:4] / self.width, self.centre
@@ -164,7 +171,7 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
         raise InputError(f"{names}: {len(force)} moments of steady braking; at least {_LEAST_ROWS} are needed for friction")
     surface = _Surface(force, speed, temperature, coefficient)
     return FrictionFit(
-        table=surface.table(),
+        values=surface.table(),
         equation=surface.equation(),
         sigma=surface.sigma,
         force_N=force,
@@ -176,16 +183,12 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
     )
 
 
-def _short(values) -> list[float]:
-    return [float(f"{value:.5g}") for value in values]
-
-
 def constant_friction(coefficient: float) -> FrictionTable:
     """A table that holds one coefficient, for when no log tells more."""
     return FrictionTable(
-        force_N=tuple(_short(np.linspace(0.0, 3e4, FORCE_GRID))),
-        disc_speed_rad_per_s=tuple(_short(np.linspace(0.0, 50.0, SPEED_GRID))),
-        surface_temperature_C=tuple(_short(np.linspace(0.0, 400.0, TEMPERATURE_GRID))),
+        force_N=tuple(np.linspace(0.0, 3e4, FORCE_GRID).tolist()),
+        disc_speed_rad_per_s=tuple(np.linspace(0.0, 50.0, SPEED_GRID).tolist()),
+        surface_temperature_C=tuple(np.linspace(0.0, 400.0, TEMPERATURE_GRID).tolist()),
         coefficient=(((coefficient,) * TEMPERATURE_GRID,) * SPEED_GRID,) * FORCE_GRID,
     )
 

@@ -7,14 +7,15 @@ takes both from all logs, because the pads lend heat to the disc and take it bac
 from dataclasses import dataclass
 
 import numpy as np
-from msgspec.structs import replace
 
-from emb_daemon.calibration.types import Disc, Pad, Softening, Thermal, fill_thermal
+from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.types import Calibration, Disc, Pad, Softening, Thermal, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import DEPTHS_M, THERMAL
+from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import Datasheet
 from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.steps.friction import constant_friction
+from emb_daemon.identify.text import rounded
 from emb_daemon.offline.fit import Block, Free, fit
 
 #: Time between residuals. The model's errors, of the size of a thermocouple's noise (0.3 K), last for about a minute: each
@@ -44,22 +45,22 @@ class _Unknown:
     high: float = np.inf
 
 
-#: What is fitted, by key below ``thermal``. Datasheet values are told to 15 %, taken for two standard deviations; the rest is
+#: What is fitted, by key. Datasheet values are told to 15 %, taken for two standard deviations; the rest is
 #: hardly known before.
 UNKNOWNS = {
-    "pad.conductivity_W_per_mK": _Unknown(0.075),
-    "pad.conductivity_rise_per_K": _Unknown(1.0, scale=1e-3, low=-1e-3, high=4e-3),
-    "pad.specific_heat_J_per_kgK": _Unknown(0.075),
-    "pad.inner_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
-    "pad.outer_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
-    "pad.contact_conductance_W_per_m2K": _Unknown(1.0),
-    "pad.gap_conductance_W_per_m2K": _Unknown(1.0),
-    "pad.surface_cooling_per_speed_J_per_rad_m2K": _Unknown(3.0, scale=0.1),
-    "pad.backplate_conductance_W_per_m2K": _Unknown(1.0),
-    "disc.heat_capacity_J_per_K": _Unknown(0.075),
-    "disc.cooling_W_per_K": _Unknown(1.0),
-    "disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
-    "disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
+    "thermal.pad.conductivity_W_per_mK": _Unknown(0.075),
+    "thermal.pad.conductivity_rise_per_K": _Unknown(1.0, scale=1e-3, low=-1e-3, high=4e-3),
+    "thermal.pad.specific_heat_J_per_kgK": _Unknown(0.075),
+    "thermal.pad.inner_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
+    "thermal.pad.outer_heat_share": _Unknown(1.0, high=_MOST_HEAT_SHARE),
+    "thermal.pad.contact_conductance_W_per_m2K": _Unknown(1.0),
+    "thermal.pad.gap_conductance_W_per_m2K": _Unknown(1.0),
+    "thermal.pad.surface_cooling_per_speed_J_per_rad_m2K": _Unknown(3.0, scale=0.1),
+    "thermal.pad.backplate_conductance_W_per_m2K": _Unknown(1.0),
+    "thermal.disc.heat_capacity_J_per_K": _Unknown(0.075),
+    "thermal.disc.cooling_W_per_K": _Unknown(1.0),
+    "thermal.disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
+    "thermal.disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
 }
 
 
@@ -68,14 +69,11 @@ class HeatFit:
     """Pads and disc.
 
     Attributes:
-        thermal: with friction and softening as they were before.
-        parameters: THERMAL of it, shape (1,).
-        sigmas: by key below ``thermal``.
+        values, sigmas: by key (`UNKNOWNS`).
         unexcited: keys of values that the logs hardly moved from where they started.
     """
 
-    thermal: Thermal
-    parameters: np.ndarray
+    values: dict[str, float]
     sigmas: dict[str, float]
     unexcited: tuple[str, ...]
 
@@ -115,25 +113,9 @@ def nominal_thermal(sheet: Datasheet) -> Thermal:
     )
 
 
-def thermal_parameters(thermal: Thermal, pad_thickness_mm: float) -> np.ndarray:
+def thermal_parameters(calibration: Calibration) -> np.ndarray:
     """THERMAL, shape (1,)."""
-    parameters = np.zeros(1, THERMAL)
-    fill_thermal(parameters[0], thermal, 1e-3 * pad_thickness_mm)
-    return parameters
-
-
-def with_values(thermal: Thermal, values: dict[str, float]) -> Thermal:
-    """Values by key below ``thermal``, such as ``pad.inner_heat_share``, set."""
-    sections: dict[str, dict[str, float]] = {}
-    for key, value in values.items():
-        section, _, name = key.partition(".")
-        sections.setdefault(section, {})[name] = value
-    return replace(thermal, **{name: replace(getattr(thermal, name), **entries) for name, entries in sections.items()})
-
-
-def value_of(thermal: Thermal, key: str) -> float:
-    section, _, name = key.partition(".")
-    return getattr(getattr(thermal, section), name)
+    return np.atleast_1d(to_parameters(calibration)["thermal"])
 
 
 def check_excitation(r: Recording) -> None:
@@ -143,18 +125,17 @@ def check_excitation(r: Recording) -> None:
         raise InputError(f"{r.name}: pads rise by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
 
 
-def fit_heat(recordings: list[Recording], start: Thermal, pad_thickness_mm: float) -> HeatFit:
+def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
     """Pads and disc from recordings that heat and cool them.
 
     Residuals are strongly correlated and the equations are not quite the rig's, so that a whole log is one episode, or, of
     fewer than four logs, one sixth of each.
     """
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
-    blocks = [_block(r, start, pad_thickness_mm, pieces) for r in recordings]
+    blocks = [_block(r, start, pieces) for r in recordings]
     found = fit(blocks, {key: _free(unknown, value_of(start, key)) for key, unknown in UNKNOWNS.items()}, tolerance=1e-4)
-    thermal = with_values(start, {key: float(f"{value:.6g}") for key, value in found.values.items()})
     unexcited = tuple(key for key, share in found.from_prior.items() if share > _UNEXCITED)
-    return HeatFit(thermal, thermal_parameters(thermal, pad_thickness_mm), dict(found.sigmas), unexcited)
+    return HeatFit({key: rounded(value, 6) for key, value in found.values.items()}, found.sigmas, unexcited)
 
 
 def _free(unknown: _Unknown, start: float) -> Free:
@@ -164,15 +145,16 @@ def _free(unknown: _Unknown, start: float) -> Free:
     return Free(start, 1e-3 * unknown.scale, unknown.low, unknown.high, (start, unknown.spread * unknown.scale))
 
 
-def _block(r: Recording, start: Thermal, pad_thickness_mm: float, pieces: int) -> Block:
+def _block(r: Recording, start: Calibration, pieces: int) -> Block:
     every = max(round(_RESIDUAL_EVERY_S / r.step_s), 1)
     measured = r.measured[:, ::every].T
     known = np.isfinite(measured)
-    known[:, :8] &= np.tile(np.array(DEPTHS_M) <= 1e-3 * pad_thickness_mm, 2)
+    known[:, :8] &= np.tile(np.array(DEPTHS_M) <= 1e-3 * start.pad_thickness_mm, 2)
 
     def residual(values):
-        parameters = thermal_parameters(with_values(start, values), pad_thickness_mm)
-        return (simulate(parameters, r, every=every)[:, :9] - measured)[known] / _RESIDUAL_SIGMA_K
+        return (simulate(thermal_parameters(moved(start, values)), r, every=every)[:, :9] - measured)[
+            known
+        ] / _RESIDUAL_SIGMA_K
 
     count = int(known.sum())
     return Block(residual, tuple(UNKNOWNS), np.arange(count) * pieces // max(count, 1))

@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import Pads, fit_dynamics, in_service, is_slow, simulate
+from emb_daemon.identify.dynamics import DynamicsFit, Pads, fit_dynamics, is_slow, simulate
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.steps import stiffness as stiffness_step
-from emb_daemon.identify.steps import torque as torque_step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import Log
@@ -20,7 +19,7 @@ Errors = tuple[np.ndarray, np.ndarray]
 @dataclass(frozen=True, kw_only=True)
 class Fold(Step):
     """What is known of one thickness without its random logs: dynamics and torque path of the other thicknesses, curve and
-    contact of its own slow log. ``values`` holds those sections of a calibration.
+    contact of its own slow log.
 
     Attributes:
         judged: its random logs.
@@ -29,7 +28,6 @@ class Fold(Step):
     """
 
     pads: Pads
-    clearance_rad: float
     judged: tuple[Log, ...]
     errors: list[Errors] = field(repr=False)
     unexplained: list[Unexplained] = field(repr=False)
@@ -43,29 +41,27 @@ def identify(campaign: Campaign, stiffness: StiffnessStep) -> list[Fold]:
 
 
 def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
-    pads, chosen, joint = stiffness.pads[index], stiffness.chosen.effects, stiffness.fit
+    pads, joint = stiffness.pads[index], stiffness.fit
     others = [other for i, other in enumerate(stiffness.pads) if i != index]
-    curves = [curve for i, curve in enumerate(joint.curves) if i != index]
-    fit = fit_dynamics(others, chosen, start=joint.values, curves=curves)
-    slow = Pads(pads.thickness_mm, pads.slow)
-    own = fit_dynamics([slow], chosen, start=fit.values, curves=[joint.curves[index]], fixed=True)
+    shared = fit_dynamics(others, joint.calibration, joint.delay_s)
+    own = fit_dynamics([Pads(pads.thickness_mm, pads.slow)], shared.calibration, shared.delay_s, fixed=True)
     clearance = float(np.mean(own.curves[0].clearances_rad))
-    torque = fit_torque([log for other in others for log in other.logs], campaign.datasheet)
-    gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
-    force = stiffness.values["stiffness"].maximum_force_N
-    errors = []
-    for log in pads.random:
-        known = np.isfinite(log.force_N)
-        found = simulate(log, in_service(fit.values), own.curves[0].coefficients, clearance)
-        errors.append(((found - log.force_N)[known], log.force_N[known]))
+    torque = fit_torque([log for other in others for log in other.logs], joint.calibration, campaign.datasheet)
     return Fold(
-        values=stiffness_step.sections(own, force) | torque_step.sections(torque, campaign.datasheet),
+        values=own.values() | torque.physical() | {"pad_thickness_mm": pads.thickness_mm, CLEARANCE: max(clearance, 0.0)},
         pads=pads,
-        clearance_rad=clearance,
         judged=pads.random,
-        errors=errors,
-        unexplained=[unexplained_current(log, torque, gear_gain) for log in pads.random],
+        errors=[_errors(log, own, pads, clearance) for log in pads.random],
+        unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],
     )
+
+
+def _errors(log: Log, fit: DynamicsFit, pads: Pads, clearance: float, rows: slice = slice(None)) -> Errors:
+    """Of the stiffness path as the daemon has it: the delay of the rig's reference is none of the brake's."""
+    force = log.force_N[rows]
+    error = simulate(log, fit.calibration, pads.thickness_mm, clearance)[rows] - force
+    known = np.isfinite(error)
+    return error[known], force[known]
 
 
 def second_halves(stiffness: StiffnessStep) -> list[Errors]:
@@ -75,7 +71,5 @@ def second_halves(stiffness: StiffnessStep) -> list[Errors]:
     for pads, curve in zip(stiffness.pads, fit.curves, strict=True):
         for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
             rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
-            error = (simulate(log, in_service(fit.values), curve.coefficients, clearance) - log.force_N)[rows]
-            known = np.isfinite(error)
-            errors.append((error[known], log.force_N[rows][known]))
+            errors.append(_errors(log, fit, pads, clearance, rows))
     return errors

@@ -4,15 +4,22 @@ The daemon's standard deviation is judged against a reference instrument, so tha
 what is held out contains it too.
 """
 
-import msgspec
 import numpy as np
 
-from emb_daemon.calibration.types import Contact, Noise
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
-from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import TorqueStep, Unexplained, unexplained_current
+from emb_daemon.identify.steps.held_out import Fold, second_halves
+from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
+from emb_daemon.identify.steps.torque import (
+    INERTIA,
+    LOAD,
+    OFFSET,
+    TORQUE_CONSTANT,
+    TorqueStep,
+    Unexplained,
+    unexplained_current,
+)
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
@@ -33,8 +40,7 @@ def identify(
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
     """
     logs = [log for pads in stiffness.pads for log in pads.logs]
-    gear_gain = campaign.datasheet.actuator.gear_gain_m_per_rad
-    notes = []
+    known, notes = stiffness.fit.calibration, []
     speed = speed_noise(logs)
     if speed is None:
         speed = campaign.datasheet.resolver.count_rad / CYCLE_S
@@ -43,23 +49,43 @@ def identify(
         errors = [pair for fold in folds for pair in fold.errors]
         held_out = [left for fold in folds for left in fold.unexplained]
     else:
-        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, gear_gain) for log in logs]
+        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, known) for log in logs]
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
             "levels come from the second halves of the random logs."
         )
-    levels = noise_levels(errors, held_out, gear_gain, speed, interpolation)
+    gear_gain = known.motor.gear_gain_m_per_rad
+    floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
+    levels = {
+        "stiffness_N": floor,
+        "stiffness_relative": float(np.hypot(relative, interpolation)),
+        "stiffness_correlation_s": integral_time([error for error, _ in errors]),
+        **torque_levels(held_out, gear_gain, speed),
+    }
+    if not any(pads.random for pads in stiffness.pads):
+        levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign)))
+        notes.append(
+            "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
+        )
     # The daemon is not told how worn its gear is.
-    relative = float(np.hypot(levels.torque_relative, torque.gear_wear()))
-    return Step(values={"noise": msgspec.structs.replace(levels, torque_relative=relative)}, notes=tuple(notes))
+    levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
+    return Step(values={f"noise.{name}": value for name, value in levels.items()}, notes=tuple(notes))
+
+
+def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign) -> float:
+    """Relative force error of a lag that no log shows, in a clamp as hard as the motor can."""
+    travel = max(curve.travel_rad for curve in stiffness.fit.curves)
+    return USUAL_RELAXATION_S * campaign.datasheet.actuator.max_motor_speed_rad_per_s / travel
 
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
     """Covariance at lags 0 to ``lags``, shape (lags + 1,), over gap-free series of zero mean."""
-    return np.array([
-        sum(float(s[: len(s) - k] @ s[k:]) for s in series) / max(sum(len(s) - k for s in series), 1)
-        for k in range(lags + 1)
-    ])  # fmt: skip
+    total, count = np.zeros(lags + 1), np.zeros(lags + 1)
+    for s in series:
+        # By the spectrum, padded with as many zeros as no lag wraps around.
+        total += np.fft.irfft(np.abs(np.fft.rfft(s, 2 * len(s))) ** 2)[: lags + 1]
+        count += len(s) - np.arange(lags + 1)
+    return total / np.maximum(count, 1)
 
 
 def integral_time(series: list[np.ndarray]) -> float:
@@ -143,20 +169,20 @@ def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, flo
 
 
 def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
-    """Fields of `Noise` that belong to the torque path, from what fits leave on logs that they did not see."""
+    """Fields of ``noise`` that belong to the torque path, from what fits leave on logs that they did not see."""
     series, turning, excess, gains = [], [], [], []
     first = held_out[0].found
-    constant = first.values["torque_constant_Nm_per_A"]
-    white = np.sqrt(2.0) * first.values["inertia_kg_m2"] * speed_sigma / CYCLE_S / constant
+    constant = first.values[TORQUE_CONSTANT]
+    white = np.sqrt(2.0) * first.values[INERTIA] * speed_sigma / CYCLE_S / constant
     for left in held_out:
         values = left.found.values
         rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
-        torque = values["torque_constant_Nm_per_A"] * current
+        torque = values[TORQUE_CONSTANT] * current
         series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
         sliding = 1.0 - mean**2
-        turning.append((sliding * (values["offset_Nm"] + values["load_m_per_rad"] * np.maximum(force, 0.0))) ** 2)
+        turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < 0.1] ** 2))
-        load = (gear_gain + values["load_m_per_rad"] * mean) * force
+        load = (gear_gain + values[LOAD] * mean) * force
         # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
@@ -167,36 +193,13 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         "current_correlation_s": time,
         "speed_rad_per_s": speed_sigma,
         "presliding": float(np.sqrt(np.clip(share, 0.0, 1.0))),
-        "torque_relative": float(np.hypot(rmse(gains), first.sigmas["torque_constant_Nm_per_A"] / constant)),
+        "torque_relative": float(np.hypot(rmse(gains), first.sigmas[TORQUE_CONSTANT] / constant)),
     }
 
 
-def noise_levels(
-    stiffness: list[Errors],
-    torque: list[Unexplained],
-    gear_gain: float,
-    speed_sigma: float,
-    interpolation_relative: float = 0.0,
-) -> Noise:
-    """Noise for a calibration.
-
-    Args:
-        stiffness: for each held-out log (error of the stiffness path in N, reference force in N).
-        torque: for each held-out log, what a torque fit that did not see it leaves.
-        interpolation_relative: relative force error that a curve between two measured pad thicknesses adds.
-    """
-    errors = [e for e, _ in stiffness]
-    floor, relative = force_error_levels(np.concatenate(errors), np.concatenate([f for _, f in stiffness]))
-    return Noise(
-        stiffness_N=floor,
-        stiffness_relative=float(np.hypot(relative, interpolation_relative)),
-        stiffness_correlation_s=integral_time(errors),
-        **torque_levels(torque, gear_gain, speed_sigma),
-    )
-
-
-def section(page: Page, noise: Noise, contact: Contact) -> None:
+def section(page: Page, calibration: Calibration) -> None:
     """Noise levels in the report."""
+    noise, contact = calibration.noise, calibration.contact
     part = page.section(
         "Noise levels",
         "Noise levels come from residuals of data that did not fit the models; they contain the reference instrument's own "

@@ -6,12 +6,13 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
-from emb_daemon.calibration.types import Softening
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.offline import Log
+from emb_daemon.offline.fit import left_out_covariance
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import MODEL, Panel, Section, Trace, xy_figure
@@ -29,6 +30,9 @@ _WORTH_IT = 0.95
 _STEP_RAD = 0.01
 #: Residuals within a tenth of a second count once: samples of full rate in it.
 _TOGETHER = 25.0
+#: Where the calibration keeps the law and the temperature that it counts from.
+_LAW = tuple(f"thermal.softening.{name}" for name in ("per_K", "history_per_K", "history_time_s"))
+_HISTORY, _REFERENCE = _LAW[1], "thermal.softening.reference_C"
 _POINTS = Style("#1d2430", mode="markers")
 
 
@@ -37,8 +41,8 @@ class SofteningFit:
     """Softening, per burst where shapes are (bursts,).
 
     Attributes:
-        softening: for the calibration; fitted on every other burst from the first.
-        sigmas: ``per_K``, ``history_per_K``, ``history_time_s``, bursts left out in turn, and the residual's own part.
+        values: by the calibration's keys; fitted on every other burst from the first.
+        sigmas: likewise, bursts left out in turn, and the residual's own part.
         factor, factor_sigma: measured stiffness factor.
         modelled: factor by the first-order history.
         shift_rad: contact shift, were it free.
@@ -46,7 +50,7 @@ class SofteningFit:
         uncorrected_N: the same with cold stiffness throughout.
     """
 
-    softening: Softening
+    values: dict[str, float]
     sigmas: dict[str, float]
     time_s: np.ndarray
     rise_K: np.ndarray
@@ -63,7 +67,7 @@ class SofteningFit:
         return {f"{name}, kN": 1e-3 * self.ours_N, f"{name}, cold stiffness, kN": 1e-3 * self.uncorrected_N}
 
     def note(self) -> str:
-        kept = "first-order history" if self.softening.history_per_K else "no history: it does not help on bursts left out"
+        kept = "first-order history" if self.values[_HISTORY] else "no history: it does not help on bursts left out"
         return (
             f"softening: {kept}; fitted on bursts 1, 3, 5, ..., judged on the others; contact, if left free, would shift by "
             f"at most {1e3 * np.abs(self.shift_rad).max():.0f} mrad"
@@ -148,12 +152,13 @@ def _cold_curve(samples: np.ndarray, reference: np.ndarray, parameters: np.ndarr
     return float(clearance), solve(clearance)[0]
 
 
-def cold_bursts(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.ndarray) -> Bursts:
+def cold_bursts(log: Log, heat: Recording, calibration: Calibration) -> Bursts:
     """Bursts of a log, the curve refined on the first; arguments and errors as in `fit_softening`."""
+    stiffness = np.atleast_1d(to_parameters(calibration))
     rows = find_bursts(log)
     if len(rows) < _LEAST_BURSTS:
         raise InputError(f"{log.path}: {len(rows)} bursts of clamps; at least {_LEAST_BURSTS} are needed for softening")
-    mean_C = simulate(thermal, heat)[:, 11:13].mean(axis=1)
+    mean_C = simulate(stiffness["thermal"], heat)[:, 11:13].mean(axis=1)
     middle = np.array([log.time_s[part].mean() for part in rows])
     reference_C = float(np.interp(middle[0], heat.time_s, mean_C))
     rise = mean_C - reference_C
@@ -223,18 +228,17 @@ class _Law:
         return np.array([*solve(time_constant)[0], time_constant])
 
     def sigmas(self, x: np.ndarray, rows: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-        """Jackknife of ``left_out`` (bursts, 3); so few bursts leave it unsure, and the residual's own share comes on top."""
-        count = len(rows)
-        variance = (count - 1) / count * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0)
+        """From fits without one burst each, ``left_out`` (bursts, 3), which few leave unsure, and the residual's own part."""
+        variance = np.diag(left_out_covariance(left_out))
         steps = 1e-3 * np.maximum(np.abs(x), [1e-4, 1e-4, 1.0])
         slopes = np.array([(self.losses(x + step) - self.losses(x - step))[rows] for step in np.diag(steps)]).T / (2.0 * steps)
-        noise = np.sum((self.losses(x) - self.loss)[rows] ** 2) / max(count - 3, 1)
+        noise = np.sum((self.losses(x) - self.loss)[rows] ** 2) / max(len(rows) - 3, 1)
         unit = np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
         inverse = np.linalg.pinv((slopes / unit).T @ (slopes / unit), rcond=1e-10)
         return np.sqrt(variance + noise * np.diag(inverse) / unit**2)
 
 
-def fit_softening(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.ndarray) -> SofteningFit:
+def fit_softening(log: Log, heat: Recording, calibration: Calibration) -> SofteningFit:
     """Softening from a log with bursts of clamps on pads that heat up and cool down.
 
     The curve's scale is taken from the first, cold burst; then each burst has a stiffness factor, and these are explained by
@@ -242,13 +246,13 @@ def fit_softening(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.
 
     Args:
         heat: the same log.
-        thermal: THERMAL, shape (1,), pads and disc already identified.
-        stiffness: PARAMETERS, shape (1,): relaxation, effects and clearance; the curve is refined on the cold burst.
+        calibration: pads and disc already identified, relaxation, effects and clearance; the curve is refined on the cold
+            burst.
 
     Raises:
         InputError: too few bursts, or no heat between them.
     """
-    bursts = cold_bursts(log, heat, thermal, stiffness)
+    bursts = cold_bursts(log, heat, calibration)
     factor, factor_sigma, shift = _factors(bursts)
     law = _Law(bursts, 1.0 - factor)
     own, others = np.arange(0, len(factor), 2), np.arange(1, len(factor), 2)
@@ -262,12 +266,9 @@ def fit_softening(log: Log, heat: Recording, thermal: np.ndarray, stiffness: np.
     history = first_order_history(bursts.grid_rise_K, law.step_s, found[2])
     modelled = 1.0 - found[0] * bursts.grid_rise_K - found[1] * history
     errors = [bursts.error(i, np.interp(log.time_s[bursts.rows[i]], bursts.grid_s, modelled)) for i in others]
-    per_K, history_per_K, history_time_s = map(float, found)
     return SofteningFit(
-        softening=Softening(
-            reference_C=round(bursts.reference_C, 2), per_K=per_K, history_per_K=history_per_K, history_time_s=history_time_s
-        ),
-        sigmas=dict(zip(("per_K", "history_per_K", "history_time_s"), law.sigmas(found, own, left_out).tolist(), strict=True)),
+        values=dict(zip(_LAW, found.tolist(), strict=True)) | {_REFERENCE: round(bursts.reference_C, 2)},
+        sigmas=dict(zip(_LAW, law.sigmas(found, own, left_out).tolist(), strict=True)),
         time_s=bursts.time_s,
         rise_K=bursts.rise_K,
         factor=factor,

@@ -1,37 +1,41 @@
 """Characteristic curves and dynamics of all pads at once, and which effects the random logs ask for."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
-from emb_daemon.calibration.types import Stiffness
-from emb_daemon.identify.dynamics import DYNAMICS, DynamicsFit, Pads, fit_dynamics, is_slow, simulate
+from emb_daemon.calibration.parameters import moved, parameter
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.effects.base import Effect
+from emb_daemon.identify.dynamics import (
+    DELAY,
+    OPTIONAL,
+    RELAXATION,
+    DynamicsFit,
+    Pads,
+    curve_keys,
+    fit_dynamics,
+    is_slow,
+    simulate,
+    starting_point,
+)
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import Page, Panel, Section, Trace, shades, xy_figure
 from emb_daemon.report.figures import Style
 
+#: Relaxation of an ordinary brake, s, and as much its standard deviation where no log shows it: between pads whose force
+#: follows at once and those that need the time of a hard application.
+USUAL_RELAXATION_S = 0.03
 #: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
 _WORTH = 1.02
 #: Standard deviations by which an effect's amplitude must stand clear of zero.
 _CLEAR = 3.0
+_DELAY_TITLE = "reference later than resolver (not in the calibration)"
 #: Many measured points behind a line.
 _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
-_STRUCTURES = {
-    (): "one lag alone",
-    ("second_relaxation",): "+ second relaxation",
-    ("stiffness_hysteresis",): "+ hysteresis",
-    ("second_relaxation", "stiffness_hysteresis"): "+ second relaxation + hysteresis",
-}
-_UNITS = {
-    "relaxation_time_s": ("relaxation time τ", 1e3, "ms"),
-    "second_relaxation.share": ("second relaxation, share w", 1e2, "%"),
-    "second_relaxation.time_constant_s": ("second relaxation, time constant τ₂", 1e3, "ms"),
-    "stiffness_hysteresis.share": ("hysteresis, share h", 1e2, "%"),
-    "stiffness_hysteresis.slip_angle_rad": ("hysteresis, slip angle", 1.0, "rad"),
-    "signal_delay.delay_s": ("reference later than resolver (not in the calibration)", 1e3, "ms"),
-}
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Candidate:
         clear: every amplitude stands clear of zero.
     """
 
-    effects: tuple[str, ...]
+    effects: tuple[Effect, ...]
     fit: DynamicsFit
     held_out: list[tuple[np.ndarray, np.ndarray]]
     clear: bool
@@ -73,24 +77,37 @@ class StiffnessStep(Step):
     separate: list[DynamicsFit]
 
 
-def identify(pads: list[Pads], rated_force_N: float) -> StiffnessStep:
-    """Curves, dynamics and effects. ``pads`` in ascending order of thickness."""
-    candidates = [_candidate(pads, effects) for effects in _STRUCTURES]
+def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
+    """Curves, dynamics and effects.
+
+    Args:
+        pads: in ascending order of thickness, for each of which ``nominal`` has a curve.
+    """
+    if not any(own.random for own in pads):
+        return _quasistatic(pads, nominal)
+    effects = [combination for count in range(len(OPTIONAL) + 1) for combination in combinations(OPTIONAL, count)]
+    candidates = [_candidate(pads, nominal, combination) for combination in effects]
     chosen = _choose(candidates)
-    fit = fit_dynamics(pads, chosen.effects, start=chosen.fit.values, curves=chosen.fit.curves)
-    separate = [
-        fit_dynamics([own], chosen.effects, start=fit.values, curves=[curve])
-        for own, curve in zip(pads, fit.curves, strict=True)
-        if own.random
-    ]
+    fit = fit_dynamics(pads, chosen.fit.calibration, chosen.fit.delay_s)
+    separate = [fit_dynamics([own], fit.calibration, fit.delay_s) for own in pads if own.random]
+    return _step(pads, nominal, fit, candidates, chosen, separate)
+
+
+def _step(
+    pads: list[Pads],
+    nominal: Calibration,
+    fit: DynamicsFit,
+    candidates: list[Candidate],
+    chosen: Candidate,
+    separate: list[DynamicsFit],
+) -> StiffnessStep:
     reached = max(float(np.nanmax(log.force_N)) for own in pads for log in own.logs)
-    sigmas = {f"effects.{name}" if "." in name else f"stiffness.{name}": sigma for name, sigma in fit.sigmas.items()}
-    sigmas.pop("effects.signal_delay.delay_s", None)
-    for number, curve in enumerate(fit.curves):
-        for n, value in enumerate(np.sqrt(np.diag(curve.covariance))):
-            sigmas[f"stiffness.curves[{number}].coefficients[{n}]"] = float(value)
+    sigmas = {key: sigma for key, sigma in fit.sigmas.items() if key != DELAY} or {RELAXATION: USUAL_RELAXATION_S}
+    for curve in fit.curves:
+        keys = curve_keys(fit.calibration, curve.thickness_mm)
+        sigmas |= dict(zip(keys, np.sqrt(np.diag(curve.covariance)).tolist(), strict=True))
     return StiffnessStep(
-        values=sections(fit, max(reached, rated_force_N)),
+        values=fit.values() | {"stiffness.maximum_force_N": max(reached, nominal.stiffness.maximum_force_N)},
         sigmas=sigmas,
         pads=pads,
         fit=fit,
@@ -100,18 +117,22 @@ def identify(pads: list[Pads], rated_force_N: float) -> StiffnessStep:
     )
 
 
-def sections(fit: DynamicsFit, maximum_force_N: float) -> dict:
-    """Sections of the calibration that a fit fills."""
-    stiffness = Stiffness(
-        curves=tuple(curve.curve() for curve in fit.curves),
-        relaxation_time_s=float(fit.values["relaxation_time_s"]),
-        maximum_force_N=maximum_force_N,
-    )
-    return {"stiffness": stiffness, "effects": fit.effects()}
+def _quasistatic(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
+    """Curves alone: a slow clamp does not tell a lag from a loop. The dynamics keep what is usual, as uncertain as it is
+    large."""
+    start = moved(starting_point(pads, nominal, ()), {RELAXATION: USUAL_RELAXATION_S})
+    fit = fit_dynamics(pads, start, fixed=True)
+    held_out = [
+        (simulate(log, fit.calibration, own.thickness_mm, clearance) - log.force_N, log.force_N)
+        for own, curve in zip(pads, fit.curves, strict=True)
+        for log, clearance in zip(own.logs, curve.clearances_rad, strict=True)
+    ]
+    chosen = Candidate((), fit, held_out, clear=True)
+    return _step(pads, nominal, fit, [chosen], chosen, [])
 
 
-def _candidate(groups: list[Pads], effects: tuple[str, ...]) -> Candidate:
-    fit = fit_dynamics(groups, effects, fraction=0.5)
+def _candidate(groups: list[Pads], nominal: Calibration, effects: tuple[Effect, ...]) -> Candidate:
+    fit = fit_dynamics(groups, starting_point(groups, nominal, effects), fraction=0.5, search=True)
     any_random = any(pads.random for pads in groups)
     held_out = []
     for pads, curve in zip(groups, fit.curves, strict=True):
@@ -120,9 +141,9 @@ def _candidate(groups: list[Pads], effects: tuple[str, ...]) -> Candidate:
                 continue
             rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
             force = log.force_N[rows]
-            held_out.append((simulate(log, fit.values, curve.coefficients, clearance)[rows] - force, force))
-    shares = [f"{effect}.share" for effect in effects]
-    return Candidate(effects, fit, held_out, all(fit.values[s] > _CLEAR * fit.sigmas[s] for s in shares))
+            held_out.append((simulate(log, fit.calibration, pads.thickness_mm, clearance, fit.delay_s)[rows] - force, force))
+    amplitudes = [f"effects.{effect.name}.{amplitude.name}" for effect in effects for amplitude in effect.amplitudes]
+    return Candidate(effects, fit, held_out, all(fit.value(a) > _CLEAR * fit.sigmas[a] for a in amplitudes))
 
 
 def _choose(candidates: list[Candidate]) -> Candidate:
@@ -197,7 +218,7 @@ def _curve_table(section: Section, step: StiffnessStep) -> None:
 def _dynamics_tables(section: Section, step: StiffnessStep) -> None:
     rows = [
         [
-            _STRUCTURES[c.effects],
+            " + ".join(["one lag", *(effect.name.replace("_", " ") for effect in c.effects)]),
             f"{c.held_out_rmse:.1f}",
             "yes" if c.clear else "no",
             "chosen" if c is step.chosen else "",
@@ -206,12 +227,11 @@ def _dynamics_tables(section: Section, step: StiffnessStep) -> None:
     ]
     section.table(["structure", "held-out RMSE / N", "amplitudes clear of zero", ""], rows)
     rows = []
-    for name in DYNAMICS:
-        if name in step.fit.sigmas:
-            title, factor, unit = _UNITS[name]
-            each = [fit.values[name] * factor for fit in step.separate]
-            span = f"{min(each):.4g} – {max(each):.4g}" if each else "–"
-            rows.append([title, with_sigma(step.fit.values[name], step.fit.sigmas[name], factor), unit, span])
+    for key, sigma in step.fit.sigmas.items():
+        each = [fit.value(key) for fit in step.separate]
+        span = f"{min(each):.4g} – {max(each):.4g}" if each else "–"
+        title, unit = (key, parameter(step.fit.calibration, key).unit) if key != DELAY else (_DELAY_TITLE, "s")
+        rows.append([title, with_sigma(step.fit.value(key), sigma), unit, span])
     section.table(["shared dynamics", "all pads at once", "unit", "each pad alone"], rows)
     if len(step.separate) > 1:
         alone = rmse(np.concatenate([r for fit in step.separate for r in fit.residuals.values()]))

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from msgspec.structs import replace
 
-from emb_daemon.calibration.types import Calibration, Thermal, to_parameters
+from emb_daemon.calibration.parameters import keys, moved, value_of
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import Campaign
@@ -13,9 +13,9 @@ from emb_daemon.identify.recording import Recording, recording, simulate
 from emb_daemon.identify.steps import Step, cooling, friction, softening
 from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
 from emb_daemon.identify.steps.friction import FrictionFit, fit_friction
-from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat, nominal_thermal, thermal_parameters
+from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat, thermal_parameters
 from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
-from emb_daemon.identify.text import with_sigma
+from emb_daemon.identify.text import rounded, with_sigma
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import MODEL, PALE, Page, Panel, Trace, shades, time_figure
@@ -91,26 +91,22 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
             "thermal: no log heats the pads with their thermocouples recorded; needed: thermal.tune, braking with "
             "thermocouples in the pads; heat keeps the datasheet's nominal values and the force does not follow temperature"
         )
-        return ThermalStep(values={"thermal": cold.thermal}, fitted={}, temperatures={}, figures={}, residuals={})
-    thickness = cold.pad_thickness_mm
-    heat = fit_heat(list(recordings.values()), cold.thermal, thickness)
+        return ThermalStep(fitted={}, temperatures={}, figures={}, residuals={})
+    heat = fit_heat(list(recordings.values()), cold)
+    values, heated = dict(heat.values), moved(cold, heat.values)
     dense = [r for r in recordings.values() if r.dense]
-    rubbed = _attempt(campaign, fit_friction, dense, heat.parameters) if dense else None
+    rubbed = _attempt(campaign, fit_friction, dense, thermal_parameters(heated)) if dense else None
     softened = None
     if "pad_cooling" in recordings:
-        inputs = (logs["pad_cooling"], recordings["pad_cooling"], heat.parameters, np.array([to_parameters(cold)]))
-        softened = _attempt(campaign, fit_softening, *inputs)
-    thermal = replace(
-        heat.thermal,
-        friction=rubbed.table if rubbed else cold.thermal.friction,
-        softening=softened.softening if softened else cold.thermal.softening,
-    )
-    parameters = thermal_parameters(thermal, thickness)
+        softened = _attempt(campaign, fit_softening, logs["pad_cooling"], recordings["pad_cooling"], heated)
+    for found in (rubbed, softened):
+        values |= found.values if found else {}
     if dense:
+        parameters = thermal_parameters(moved(cold, values))
         spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
-        thermal = replace(thermal, sigma_K=float(f"{max(spread, _LEAST_SIGMA_K):.3g}"))
+        values["thermal.sigma_K"] = rounded(max(spread, _LEAST_SIGMA_K), 3)
     law = cooling_law([r for name, r in recordings.items() if name.startswith("disc_cooling")], campaign.datasheet.disc)
-    temperatures, figures, residuals = _judge(campaign, recordings, judged, replace(cold, thermal=thermal), parameters)
+    temperatures, figures, residuals = _judge(campaign, recordings, judged, moved(cold, values))
     if softened:
         figures |= softened.figures()
     if rubbed:
@@ -118,7 +114,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     if law:
         residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
     return ThermalStep(
-        values={"thermal": thermal},
+        values=values,
         sigmas=_sigmas(heat, rubbed, softened),
         notes=_notes(heat, law, rubbed, softened),
         fitted=recordings,
@@ -163,9 +159,9 @@ def _errors(parameters: np.ndarray, r: Recording, torque_known: bool = True) -> 
     return simulate(parameters, r, torque_known)[:, :9].T - r.measured
 
 
-def _judge(campaign, recordings, judged: dict[str, Log], calibration: Calibration, parameters: np.ndarray):
+def _judge(campaign, recordings, judged: dict[str, Log], calibration: Calibration):
     """(temperatures to draw, figures on logs that fitted nothing, residuals of those that did)."""
-    temperatures, figures, residuals = {}, {}, {}
+    temperatures, figures, residuals, parameters = {}, {}, {}, thermal_parameters(calibration)
     if "tune" in recordings:
         temperatures["tune"] = _compare("tune", recordings["tune"], parameters, residuals)
     for name, log in judged.items():
@@ -202,18 +198,13 @@ def _as_in_a_car(log: Log, calibration: Calibration) -> float:
 
 
 def _sigmas(heat: HeatFit, rubbed: FrictionFit | None, softened: SofteningFit | None) -> dict[str, float]:
-    sigmas = {f"thermal.{key}": value for key, value in heat.sigmas.items()}
-    if rubbed:
-        sigmas["thermal.friction.coefficient"] = rubbed.sigma
-    if softened:
-        sigmas |= {f"thermal.softening.{key}": value for key, value in softened.sigmas.items()}
-    return sigmas
+    friction_sigma = {"thermal.friction.coefficient": rubbed.sigma} if rubbed else {}
+    return heat.sigmas | friction_sigma | (softened.sigmas if softened else {})
 
 
 def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
     notes = [
-        f"thermal.{key}: these logs hardly tell it; the usual value, or the datasheet's, was mostly kept"
-        for key in heat.unexcited
+        f"{key}: these logs hardly tell it; the usual value, or the datasheet's, was mostly kept" for key in heat.unexcited
     ]
     if rubbed:
         notes.append(f"friction on the disc: {rubbed.equation}, residual {rubbed.rms:.4f}")
@@ -222,7 +213,7 @@ def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
     return (*notes, *([law.note()] if law else []), *([softened.note()] if softened else []))
 
 
-def section(page: Page, step: ThermalStep) -> None:
+def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
     """Heat in the report."""
     part = page.section("Pads and disc: heat")
     if step.heat is None:
@@ -235,7 +226,8 @@ def section(page: Page, step: ThermalStep) -> None:
         "Backing plate, pad, disc, pad, backing plate as one implicit chain (thesis 7.4 to 8.2). Known torque uses the rig's "
         "brake torque sensor; without it the heat comes from the estimated force and the friction map, as in a car."
     )
-    rows = [[key, with_sigma(value, step.sigmas.get(f"thermal.{key}"))] for key, value in _numbers(step.values["thermal"])]
+    numbers = [key for key in keys(calibration) if key.startswith("thermal.") and not key.startswith("thermal.friction.")]
+    rows = [[key, with_sigma(value_of(calibration, key), step.sigmas.get(key))] for key in numbers]
     part.table(["parameter", "value"], rows)
     part.items(list(step.notes))
     for name, found in step.temperatures.items():
@@ -248,14 +240,6 @@ def section(page: Page, step: ThermalStep) -> None:
     part.table(["residual of what was fitted", "value"], [[k, f"{v:.3g}"] for k, v in step.residuals.items()])
 
 
-def _numbers(thermal: Thermal):
-    for name in ("pad", "disc", "softening"):
-        struct = getattr(thermal, name)
-        for key in struct.__struct_fields__:
-            yield f"{name}.{key}", getattr(struct, key)
-    yield "sigma_K", thermal.sigma_K
-
-
 def _panels(found: Temperatures) -> list[Panel]:
     time, colours, grey = found.time_s, shades(4)[::-1], Style("#b3bcc7", 2.2)
     panels = []
@@ -266,13 +250,8 @@ def _panels(found: Temperatures) -> list[Panel]:
         panels.append(Panel(f"{name}, torque known", "°C", traces, 230))
     disc = [Trace("measured", time, found.measured[8], grey), Trace("model", time, found.known[8], MODEL)]
     errors = [
-        Trace(name, time, np.linalg.norm(modelled[:8] - found.measured[:8], axis=0) / np.sqrt(8.0), style)
+        Trace(name, time, np.array([rmse(error) for error in (modelled[:8] - found.measured[:8]).T]), style)
         for name, modelled, style in (("no torque sensor", found.unknown, PALE), ("torque known", found.known, MODEL))
     ]
     error = Panel("Error, RMS over the eight thermocouples", "K", errors, 180)
     return [*panels, Panel("Disc", "°C", disc, 180), error]
-
-
-def nominal(campaign: Campaign) -> Step:
-    """The datasheet's thermal section, to start from."""
-    return Step(values={"thermal": nominal_thermal(campaign.datasheet)})

@@ -14,13 +14,6 @@ from emb_daemon.report import Page, Panel, Trace, shades, xy_figure
 from emb_daemon.report.figures import Style
 
 _NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
-#: Laws for each coefficient a over thickness: (degree of the polynomial, what is straight, and back); None is the one used.
-LAWS = {
-    "1/a straight between neighbours (used)": None,
-    "1/a straight through all": (1, lambda a: 1.0 / a, lambda y: 1.0 / y),
-    "ln a quadratic through all": (2, np.log, np.exp),
-    "a straight through all": (1, lambda a: a, lambda y: y),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,11 +22,11 @@ class ThicknessStep(Step):
 
     Attributes:
         curves: one per thickness.
-        laws: `thickness_laws`.
+        left_out: `left_out_errors`.
     """
 
     curves: list[CurveFit]
-    laws: dict[str, np.ndarray]
+    left_out: np.ndarray
 
     def interpolation_error(self, thickness_mm: float) -> float:
         """Relative force error that interpolation adds at a thickness.
@@ -44,9 +37,8 @@ class ThicknessStep(Step):
         thicknesses = np.array([curve.thickness_mm for curve in self.curves])
         if len(thicknesses) < 3 or np.any(np.abs(thicknesses - thickness_mm) < 1e-6):
             return 0.0
-        left_out = self.laws[next(iter(LAWS))]
         spans = (thicknesses[1:-1] - thicknesses[:-2]) * (thicknesses[2:] - thicknesses[1:-1])
-        curvature = rmse(left_out / spans)
+        curvature = rmse(self.left_out / spans)
         upper = int(np.clip(np.searchsorted(thicknesses, thickness_mm), 1, len(thicknesses) - 1))
         return curvature * abs((thickness_mm - thicknesses[upper - 1]) * (thicknesses[upper] - thickness_mm))
 
@@ -75,7 +67,8 @@ def load_pads(campaign: Campaign) -> list[Pads]:
         raise InputError("\n".join([*campaign.faults, f"{campaign.path}: {error}"])) from None
     if not any(own.random for own in pads):
         campaign.fault(
-            f"random: no usable log, so that relaxation rests on slow clamps, which hardly show it; needed: {NEED_RANDOM}"
+            "random: no usable log, so that relaxation keeps what is usual of brakes, and sigma holds what that may do in a "
+            f"hard clamp; needed: {NEED_RANDOM}"
         )
     return pads
 
@@ -91,35 +84,18 @@ def _check_thickness(pads: list[Pads], thickness_mm: float) -> None:
 
 def identify(curves: list[CurveFit]) -> ThicknessStep:
     """``curves`` in ascending order of thickness."""
-    return ThicknessStep(curves=curves, laws=thickness_laws(curves))
+    return ThicknessStep(curves=curves, left_out=left_out_errors(curves))
 
 
-def thickness_laws(curves: list[CurveFit]) -> dict[str, np.ndarray]:
-    """Relative force error of each inner curve predicted from the others, weighted by force, by law.
-
-    Shape (curves - 2,); empty with fewer than three curves."""
-    found = {}
-    for name, law in LAWS.items():
-        errors = []
-        for index in range(1, len(curves) - 1):
-            target = curves[index]
-            predicted = predict_curve([c for c in curves if c is not target], target.thickness_mm, law)
-            x = np.linspace(0.05, 1.0, 50) * target.travel_rad
-            truth = target.force(x)
-            errors.append(rmse(powers(x) @ predicted - truth) / rmse(truth))
-        found[name] = np.array(errors)
-    return found
-
-
-def predict_curve(curves: list[CurveFit], thickness_mm: float, law=None) -> np.ndarray:
-    """Coefficients at a thickness from the curves of others, by one of `LAWS`; None is the calibration's own."""
-    coefficients = np.array([curve.coefficients for curve in curves])
-    if law is None or np.any(coefficients <= 0.0):
-        return curve_at(tuple(curve.curve() for curve in curves), thickness_mm)[:TERMS]
-    degree, forward, back = law
-    thicknesses = np.array([curve.thickness_mm for curve in curves])
-    degree = min(degree, len(curves) - 1)
-    return np.array([back(np.polyval(np.polyfit(thicknesses, forward(a), degree), thickness_mm)) for a in coefficients.T])
+def left_out_errors(curves: list[CurveFit]) -> np.ndarray:
+    """Relative force error of each inner curve predicted from the others, weighted by force; shape (curves - 2,)."""
+    errors = []
+    for target in curves[1:-1]:
+        predicted = curve_at(tuple(c.curve() for c in curves if c is not target), target.thickness_mm)[:TERMS]
+        x = np.linspace(0.05, 1.0, 50) * target.travel_rad
+        truth = target.force(x)
+        errors.append(rmse(powers(x) @ predicted - truth) / rmse(truth))
+    return np.array(errors)
 
 
 def section(page: Page, step: ThicknessStep, thickness_mm: float) -> None:
@@ -129,14 +105,11 @@ def section(page: Page, step: ThicknessStep, thickness_mm: float) -> None:
         return
     part = page.section(
         "Pad thickness",
-        "How the curve varies with thickness: each inner thickness predicted from the others, relative error of the force, "
-        "weighted by force. The gaps are then twice those that prediction has to bridge.",
+        "Each inner thickness predicted from the others, the compliance of every coefficient running straight: relative error "
+        "of the force, weighted by force. The gaps are then twice those that prediction has to bridge.",
     )
-    rows = [
-        [name, *(f"{100 * error:.2f}" for error in errors), f"{100 * rmse(errors):.2f}"] for name, errors in step.laws.items()
-    ]
-    inner = (f"{curve.thickness_mm:g} mm / %" for curve in curves[1:-1])
-    part.table(["law for each coefficient a", *inner, "RMS / %"], rows)
+    inner = [f"{curve.thickness_mm:g} mm / %" for curve in curves[1:-1]]
+    part.table([*inner, "RMS / %"], [[f"{100 * error:.2f}" for error in (*step.left_out, rmse(step.left_out))]])
     part.text(
         f"At {thickness_mm:g} mm interpolation is expected to add {100 * step.interpolation_error(thickness_mm):.2f} % of the "
         "force, which the noise level of the stiffness path contains."

@@ -13,10 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from emb_daemon.calibration.types import Friction, Motor
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, moved
+from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
+from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
+from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import Campaign, Datasheet
-from emb_daemon.identify.dynamics import EPISODE, Pads, with_dynamics
+from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.offline import Log
@@ -26,13 +30,16 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Parameters in the order of every covariance.
-NAMES = ("torque_constant_Nm_per_A", "inertia_kg_m2", "offset_Nm", "load_m_per_rad", "presliding_angle_rad")
-_KEYS = tuple(f"{'motor' if name in NAMES[:2] else 'friction'}.{name}" for name in NAMES)
+#: Parameters in the order of every covariance, with their least value that is physical.
+KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 1e-6}
 #: Variance of the friction state up to which it counts as known.
 _KNOWN = 0.01
 #: Step of the derivative by the logarithm of the presliding angle.
 _STEP = 1e-2
+#: Motor angle within which the friction of rolling gears turns over, rad, before a log has shown it: median, and standard
+#: deviation of its logarithm (rolling elements slide after micrometres to tens of them: Armstrong-Helouvry et al., Automatica
+#: 30(7), 1994, sec. 2.1, over a screw's micrometres per hundredth of a radian).
+_USUAL_PRESLIDING, _PRESLIDING_SPREAD = 0.03, 1.0
 _NEED_TRAINING = "clamp and release with the reference force, at full frame rate"
 
 
@@ -41,7 +48,7 @@ class TorqueFit:
     """Parameters of the torque path.
 
     Attributes:
-        values: by name (`NAMES`).
+        values: by the calibration's keys (`KEYS`).
         covariance: in their order.
         residuals: unexplained current by log path: (row of the log, A).
     """
@@ -52,17 +59,20 @@ class TorqueFit:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        return dict(zip(KEYS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def rms_A(self) -> float:
         """Of the current that stays unexplained."""
         return rmse(np.concatenate([residual for _, residual in self.residuals.values()]))
 
-    def friction(self) -> Friction:
-        """That section of the calibration; what noise pushed below what is physical stands at its least."""
-        least = {"load_m_per_rad": 0.0, "offset_Nm": 0.0, "presliding_angle_rad": 1e-6}
-        return Friction(**{name: max(self.values[name], low) for name, low in least.items()})
+    def physical(self) -> dict[str, float]:
+        """Values for a calibration; what noise pushed below what is physical stands at its least."""
+        return {key: max(self.values[key], least) for key, least in KEYS.items()}
+
+    def friction(self) -> dict[str, float]:
+        """Those of them that wear changes."""
+        return {key: value for key, value in self.physical().items() if key in (OFFSET, LOAD, PRESLIDING)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +90,12 @@ class TorqueStep(Step):
     gears: list[tuple[str, TorqueFit]]
 
     def gear_wear(self) -> float:
-        """Relative error of the torque path from not knowing how worn the gear is; its spread over the states measured."""
-        worn = [fit.values["load_m_per_rad"] for _, fit in self.gears]
-        return float(np.std(worn, ddof=1)) / self.values["motor"].gear_gain_m_per_rad if len(worn) > 1 else 0.0
+        """Spread of the load friction over the states of wear that were measured, m/rad."""
+        worn = [fit.values[LOAD] for _, fit in self.gears]
+        return float(np.std(worn, ddof=1)) if len(worn) > 1 else 0.0
 
 
-def identify(campaign: Campaign, pads: list[Pads]) -> TorqueStep:
+def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> TorqueStep:
     """Torque path from all logs with motor current, and each gear's from its training log.
 
     Raises:
@@ -95,44 +105,33 @@ def identify(campaign: Campaign, pads: list[Pads]) -> TorqueStep:
     logs = [log for own in pads for log in own.logs if log.samples["has_current"].any()]
     if not logs:
         raise InputError(f"{campaign.path}: curves, random: no log holds motor current; needed: EMB_*_Current frames")
-    found = fit_torque(logs, sheet)
-    for name in NAMES[:2]:
-        campaign.compare_with_datasheet(f"motor.{name}", found.values[name])
+    found = fit_torque(logs, nominal, sheet)
+    for key in (TORQUE_CONSTANT, INERTIA):
+        campaign.compare_with_datasheet(key, found.values[key])
     gears = []
     for entry in campaign.file.gear_wear:
         log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
         if log is not None:
-            gears.append((entry.training, fit_torque([log], sheet)))
+            gears.append((entry.training, fit_torque([log], nominal, sheet)))
     return TorqueStep(
-        values=sections(found, sheet),
-        sigmas=dict(zip(_KEYS, found.sigmas.values(), strict=True)),
+        values=found.physical(),
+        sigmas=found.sigmas,
         fit=found,
         log=pads[len(pads) // 2].logs[-1],
         gears=gears,
     )
 
 
-def sections(found: TorqueFit, sheet: Datasheet) -> dict:
-    """Sections of the calibration that a fit fills."""
-    motor = Motor(
-        torque_constant_Nm_per_A=found.values["torque_constant_Nm_per_A"],
-        inertia_kg_m2=found.values["inertia_kg_m2"],
-        gear_gain_m_per_rad=sheet.actuator.gear_gain_m_per_rad,
-        maximum_speed_rad_per_s=sheet.actuator.max_motor_speed_rad_per_s,
-    )
-    return {"motor": motor, "friction": found.friction()}
-
-
 class _Regression:
     """One log's part of the regression."""
 
-    def __init__(self, log: Log):
+    def __init__(self, log: Log, calibration: Calibration):
         samples = log.samples
         angle, speed = samples["angle"], samples["speed"]
         rows = np.arange(2, len(samples) - 1)
         full_rate = np.all([np.abs(samples["dt"][rows + k] - CYCLE_S) < 1e-6 for k in (-1, 0, 1)], axis=0)
         known = np.isfinite(log.force_N[rows]) & np.isfinite(log.force_N[rows - 1]) & samples["has_current"][rows]
-        self.log = log
+        self.log, self.calibration = log, calibration
         self.rows = r = rows[full_rate & known]
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
         self.current = samples["current_q"][r]
@@ -140,33 +139,42 @@ class _Regression:
         self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
 
     def matrices(self, presliding_angle: float):
-        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model."""
-        parameters = with_dynamics({})
-        parameters["presliding_angle"] = presliding_angle
+        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model, and
+        what not knowing it leaves in the other rows: regressors times the state's standard deviation."""
+        parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
         instruments = regressors.copy()
         instruments[:, 1] = self.of_angle
-        return regressors, instruments, paths["friction_variance"] < _KNOWN
+        known = paths["friction_variance"] < _KNOWN
+        spread = np.sqrt(paths["friction_variance"][~known, None]) * np.column_stack([np.ones(len(s)), self.force])[~known]
+        return regressors, instruments, known, spread
 
 
-def fit_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
+def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> TorqueFit:
     """Instrumental-variable regression with the presliding angle sought in one dimension.
 
-    The datasheet's torque constant and inertia are priors; its resolver count is what no turning over is known better than.
+    Of the calibration only the gear counts. The datasheet's torque constant and inertia are priors; its resolver count is what
+    no turning over is known better than. What logs do not excite keeps a wide prior, and a sigma that says so.
     """
-    parts = [_Regression(log) for log in logs]
+    parts = [_Regression(log, calibration) for log in logs]
+    nominal, precision = _wide_prior(sheet)
 
     def solve(presliding):
         matrices = [part.matrices(presliding) for part in parts]
-        left = sum(z[use].T @ x[use] for x, z, use in matrices)
-        right = sum(z[use].T @ part.current[use] for part, (_, z, use) in zip(parts, matrices, strict=True))
+        left = precision[:4, :4] + sum(z[use].T @ x[use] for x, z, use, _ in matrices)
+        right = precision[:4, :4] @ nominal
+        right += sum(z[use].T @ part.current[use] for part, (_, z, use, _) in zip(parts, matrices, strict=True))
         solution = np.linalg.solve(left, right)
-        return solution, matrices, [p.current[use] - x[use] @ solution for p, (x, _, use) in zip(parts, matrices, strict=True)]
+        residuals = [p.current[use] - x[use] @ solution for p, (x, _, use, _) in zip(parts, matrices, strict=True)]
+        return solution, matrices, residuals
 
     def cost(logarithm):
-        return float(np.mean(np.concatenate(solve(np.exp(logarithm))[2]) ** 2))
+        # A state that is unknown explains nothing: otherwise large angles would be rewarded for the rows that they leave out.
+        solution, matrices, residuals = solve(np.exp(logarithm))
+        left_over = np.concatenate([*residuals, *(spread @ solution[2:] for *_, spread in matrices)])
+        return float(left_over @ left_over + precision[4, 4] * (logarithm - np.log(_USUAL_PRESLIDING)) ** 2)
 
     # The grid finds the valley; below a resolver count the angle says nothing.
     grid = np.log(np.geomspace(1e-3, 1.0, 13))
@@ -174,20 +182,34 @@ def fit_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
     bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
     presliding = float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x))
     solution, matrices, residuals = solve(presliding)
-    covariance = _covariance(parts, matrices, residuals, solution, presliding)
+    covariance = _covariance(parts, matrices, residuals, solution, presliding, precision)
     physical, covariance = _physical(solution, presliding, covariance, sheet)
     physical, covariance = _with_priors(physical, covariance, sheet)
+    # What is known of the others moves it along a slope that holds near it alone.
+    physical[4] = np.clip(physical[4], 0.5 * presliding, 2.0 * presliding)
     left_over = {
         str(part.log.path): (part.rows[use], residual)
-        for part, (_, _, use), residual in zip(parts, matrices, residuals, strict=True)
+        for part, (_, _, use, _), residual in zip(parts, matrices, residuals, strict=True)
     }
-    return TorqueFit(dict(zip(NAMES, physical.tolist(), strict=True)), covariance, left_over)
+    return TorqueFit(dict(zip(KEYS, physical.tolist(), strict=True)), covariance, left_over)
 
 
-def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
+def _wide_prior(sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (4,) by the datasheet, and inverse covariance (5, 5) of them and the presliding angle's logarithm for a
+    current known to 1 A: torque constant and inertia to a third, friction no larger than what it rubs against."""
+    actuator = sheet.actuator
+    constant, gear = actuator.motor_torque_constant_Nm_per_A, actuator.gear_gain_m_per_rad
+    nominal = np.array([gear, actuator.lumped_inertia_kg_m2, 0.0, 0.0]) / constant
+    sigma = np.array(
+        [*(nominal[:2] / 3.0), gear * actuator.rated_clamp_force_N / constant, gear / constant, _PRESLIDING_SPREAD]
+    )
+    return nominal, np.diag(sigma**-2)
+
+
+def _covariance(parts, matrices, residuals, solution, presliding, precision) -> np.ndarray:
     """Of the four coefficients and the logarithm of the presliding angle, jackknife over seconds."""
     normals, scores = [], []
-    for part, (regressors, instruments, use), residual in zip(parts, matrices, residuals, strict=True):
+    for part, (regressors, instruments, use, _), residual in zip(parts, matrices, residuals, strict=True):
         moved = part.matrices(presliding * np.exp(_STEP))[0]
         sensitivity = (((moved - regressors) @ solution) / _STEP)[use, None]
         x, z = np.hstack([regressors[use], sensitivity]), np.hstack([instruments[use], sensitivity])
@@ -195,11 +217,11 @@ def _covariance(parts, matrices, residuals, solution, presliding) -> np.ndarray:
             rows = slice(start, start + EPISODE)
             normals.append(z[rows].T @ x[rows])
             scores.append(z[rows].T @ residual[rows])
-    return jackknife(np.array(normals), np.array(scores))
+    return jackknife(np.array(normals), np.array(scores), precision)
 
 
 def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
-    """`NAMES` from coefficients b: K_m = gamma / b0, J = b1 K_m, eta = b2 K_m, mu = b3 K_m."""
+    """`KEYS` from coefficients b: K_m = gamma / b0, J = b1 K_m, eta = b2 K_m, mu = b3 K_m."""
     constant = sheet.actuator.gear_gain_m_per_rad / solution[0]
     change = np.diag([-constant / solution[0], constant, constant, constant, presliding])
     change[1:4, 0] = -solution[1:] * constant / solution[0]
@@ -211,9 +233,9 @@ def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.nd
 
 def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
     """Values and covariance after the datasheet's torque constant and inertia, which its tolerances say how far to believe."""
-    stated = np.array([sheet.stated(f"motor.{name}") for name in NAMES[:2]])
+    stated = np.array([sheet.stated(key) for key in (TORQUE_CONSTANT, INERTIA)])
     sigma = stated[:, 0] * stated[:, 1] / 2.0
-    seen = np.eye(2, len(NAMES))
+    seen = np.eye(2, len(KEYS))
     gain = covariance @ seen.T @ np.linalg.inv(covariance[:2, :2] + np.diag(sigma**2))
     return values + gain @ (stated[:, 0] - values[:2]), covariance - gain @ seen @ covariance
 
@@ -236,11 +258,12 @@ class Unexplained:
     force_N: np.ndarray
 
 
-def unexplained_current(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
-    """Current of a log that a fit does not explain."""
-    part, values = _Regression(log), found.values
-    regressors, _, use = part.matrices(values["presliding_angle_rad"])
-    coefficients = np.array([gear_gain, *(values[name] for name in NAMES[1:4])]) / values["torque_constant_Nm_per_A"]
+def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
+    """Current of a log that a fit does not explain; of the calibration only the gear counts."""
+    part, values = _Regression(log, calibration), found.values
+    regressors, _, use, _ = part.matrices(values[PRESLIDING])
+    gear_gain = calibration.motor.gear_gain_m_per_rad
+    coefficients = np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET, LOAD))]) / values[TORQUE_CONSTANT]
     residual = part.current - regressors @ coefficients
     return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
 
@@ -264,8 +287,8 @@ def section(page: Page, step: TorqueStep) -> None:
     )
     fits = [step.fit, *(found for _, found in step.gears)]
     rows = [
-        [title, *(with_sigma(found.values[name], found.sigmas[name], factor) for found in fits)]
-        for name, (title, factor) in zip(NAMES, _ROWS, strict=True)
+        [title, *(with_sigma(found.values[key], found.sigmas[key], factor) for found in fits)]
+        for key, (title, factor) in zip(KEYS, _ROWS, strict=True)
     ]
     rows.append(["unexplained current / A", *(f"{found.rms_A:.3f}" for found in fits)])
     gears = [name.rsplit("/", 1)[-1].split(".log")[0] for name, _ in step.gears]

@@ -1,0 +1,24 @@
+"""Files of others, read so that none can hold the reader up or take the machine's memory."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Content of a regular file; nobody needs to write to it for the call to end.
+
+    Raises:
+        OSError: not readable, not a regular file, or larger than ``most_bytes``; ``strerror`` says which.
+    """
+    # A pipe without a writer would keep an open() waiting for one.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(handle, "rb") as file:
+        mode = os.fstat(handle).st_mode
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL, "not a regular file", str(path))
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
+    return content

@@ -1,0 +1,36 @@
+"""How a command reads logs: as they are, or through a mapping file."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+#: What a command that opens logs says of them.
+LOG_HELP = ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .parquet and measurements (.mf4)"
+
+
+def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    parser.add_argument(
+        "--mapping", type=Path, metavar="FILE", required=required, help="YAML that maps another rig's signals to ours"
+    )
+
+
+def open_mapping(path: Path):
+    """A `logs.mapping.Mapping`; what its rig does not measure is said on stderr."""
+    from emb_daemon.logs.mapping import Mapping
+
+    mapping = Mapping(path)
+    for note in mapping.notes:
+        print(note, file=sys.stderr)
+    return mapping
+
+
+def log_reader(mapping: Path | None) -> Callable:
+    """What gives a log's FRAME array by its path.
+
+    Raises:
+        InputErrors: the mapping file is faulty.
+    """
+    from emb_daemon.logs.read import read_frames
+
+    return open_mapping(mapping).read if mapping else read_frames

@@ -1,0 +1,24 @@
+"""What can be refused of an output before the work."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from emb_daemon.errors import InputError
+
+
+def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
+    """Refuse a file that cannot be written, that writing would replace although it is no file, or that is an input.
+
+    Raises:
+        InputError: with the path and what was expected.
+    """
+    from emb_daemon.logs.write import ending_of
+
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: no such folder: {path.absolute().parent}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no regular file, which writing would replace")
+    if path.resolve() in [given.resolve() for given in inputs if given]:
+        raise InputError(f"{path}: is one of the inputs, which it would overwrite")
+    if endings and ending_of(path) not in endings:
+        raise InputError(f"{path}: unknown ending, expected one of {', '.join(endings)}")

@@ -1,0 +1,338 @@
+"""Columns of any sampling rate as our frames.
+
+What another rig measured becomes our messages, E2E protected, with counters that count resolver cycles, so that the pipeline
+stays the only way into the estimator.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right
+from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
+from emb_daemon.wire.e2e import COUNTER_MODULO, protect
+from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+
+#: Deviation of a rig's sampling period from ours up to which its samples are taken as they are.
+_SAME_PERIOD = 0.05
+#: Sampling period from which the way between two samples is unknown, in cycles: such samples are taken as they are too, and
+#: the estimator bridges what lies between. A brake clamps in some fifty cycles.
+_SPARSE_CYCLES = 5
+#: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
+_CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
+#: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
+_LEAST_SAMPLES, _IN_TURN = 50, 0.9
+#: Signals of an E2E protected message that its protection fills.
+HEADER = ("CRC", "Counter", "Status")
+#: Cycle of a message whose DBC states none, ms.
+_SLOW_MS = 40
+
+
+@dataclass(frozen=True)
+class Series:
+    """One signal, in our unit: int64 nanoseconds, ascending, and float values, shape (n,).
+
+    Each value is the mean over ``span_ns`` about its time; 0 is the value at that time.
+    """
+
+    time_ns: np.ndarray
+    values: np.ndarray
+    span_ns: float = 0.0
+
+    @classmethod
+    def of(cls, time_ns: np.ndarray, values: np.ndarray) -> "Series":
+        """Values of the moment in any order; those that are no numbers are left out."""
+        known = np.isfinite(values)
+        order = np.argsort(time_ns[known], kind="stable")
+        return cls(time_ns[known][order], values[known][order])
+
+    def averaged(self, span_ns: float | None = None) -> "Series":
+        """The same taken for means over ``span_ns`` that end with their stamps; None is the sampling period."""
+        span_ns = self.period_ns if span_ns is None else span_ns
+        return Series(self.time_ns - round(0.5 * span_ns), self.values, span_ns)
+
+    @cached_property
+    def period_ns(self) -> float:
+        return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 2 else float(CYCLE_NS)
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is sampled at our rate."""
+        return abs(self.period_ns / CYCLE_NS - 1.0) <= _SAME_PERIOD
+
+    def held(self, at_ns: np.ndarray, cycle_ns: int) -> np.ndarray:
+        """The value last heard, NaN where that is too long ago."""
+        if not len(self.time_ns):
+            return np.full(len(at_ns), np.nan)
+        row = np.searchsorted(self.time_ns, at_ns, side="right") - 1
+        age = at_ns - self.time_ns[np.maximum(row, 0)]
+        fresh = (row >= 0) & (age <= max(_CARRIED_CYCLES * cycle_ns, _CARRIED_PERIODS * self.period_ns))
+        return np.where(fresh, self.values[np.maximum(row, 0)], np.nan)
+
+    def sampled(self, at_ns: np.ndarray) -> np.ndarray:
+        """The value at each time, straight between samples, NaN in gaps."""
+        return np.where(self._near(at_ns), self._between(at_ns), np.nan)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether the way between two samples is unknown."""
+        return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether it is sampled more slowly than we do."""
+        return self.period_ns > (1.0 + _SAME_PERIOD) * CYCLE_NS
+
+    def smoothed(self, at_ns: np.ndarray) -> np.ndarray:
+        """Of a slow signal: mean over a period about each time, NaN in gaps.
+
+        Its change over a cycle is then that of means over periods, straight between their middles, as `mean` has it of the
+        current: speed and current of a slow rig agree in what they say of the inertia.
+        """
+        half = round(0.5 * self.period_ns)
+        if not len(self.time_ns):
+            return np.full(len(at_ns), np.nan)
+        # Straight on either side of the one corner in the period.
+        corner = np.clip(self.time_ns[self.nearest(at_ns)], at_ns - half, at_ns + half)
+        share = (corner - at_ns + half) / (2.0 * half)
+        before, at, after = self._between(at_ns - half), self._between(corner), self._between(at_ns + half)
+        mean = 0.5 * (share * (before + at) + (1.0 - share) * (at + after))
+        return np.where(self._near(at_ns), mean, np.nan)
+
+    def mean(self, at_ns: np.ndarray) -> np.ndarray:
+        """Mean over the cycle that ends at each time, NaN in gaps.
+
+        A value that is sampled as fast as we do stands for its own period about its time, so that means over periods add up to
+        means over cycles; means of one that is sampled more slowly run straight from one to the next.
+        """
+        if not len(self.time_ns):
+            return np.full(len(at_ns), np.nan)
+        if self.is_slow and self.span_ns < 0.5 * self.period_ns and len(self.time_ns) > 1:
+            middles = self.time_ns[:-1] + np.diff(self.time_ns) // 2
+            return Series(middles, 0.5 * (self.values[1:] + self.values[:-1]), self.period_ns).mean(at_ns)
+        middle = at_ns - CYCLE_NS // 2
+        if self.is_slow:
+            # Simpson's rule: at most one corner of the straight lines lies in a cycle.
+            mean = (self._between(at_ns - CYCLE_NS) + 4.0 * self._between(middle) + self._between(at_ns)) / 6.0
+        else:
+            times = (self.time_ns - self.time_ns[0]).astype(float)
+            half = 0.5 * self.period_ns
+            edges = np.concatenate([[times[0] - half], 0.5 * (times[1:] + times[:-1]), [times[-1] + half]])
+            area = np.concatenate([[0.0], np.cumsum(self.values * np.diff(edges))])
+            end = (at_ns - self.time_ns[0]).astype(float)
+            start = np.clip(end - CYCLE_NS, *edges[[0, -1]])
+            end = np.clip(end, *edges[[0, -1]])
+            mean = (np.interp(end, edges, area) - np.interp(start, edges, area)) / np.maximum(end - start, 1.0)
+        if self.is_ours:
+            # A mean over our own cycle is one, whatever the jitter of its stamp.
+            nearest = self.nearest(middle)
+            mean = np.where(np.abs(self.time_ns[nearest] - middle) < CYCLE_NS // 4, self.values[nearest], mean)
+        return np.where(self._near(middle), mean, np.nan)
+
+    def derivative(self) -> "Series":
+        """Change per second, central over a cycle or over two periods, whichever is longer."""
+        half = max(CYCLE_NS // 2, round(self.period_ns))
+        first, last = (int(self.time_ns[0]), int(self.time_ns[-1])) if len(self.time_ns) else (0, 0)
+        after, before = np.minimum(self.time_ns + half, last), np.maximum(self.time_ns - half, first)
+        change = self._between(after) - self._between(before)
+        return Series(self.time_ns, change / np.maximum(1e-9 * (after - before), 1e-9))
+
+    def integral(self) -> "Series":
+        """Area under the signal since its first value."""
+        steps = 0.5 * (self.values[1:] + self.values[:-1]) * (1e-9 * np.diff(self.time_ns))
+        return Series(self.time_ns, np.concatenate([np.zeros(min(len(self.values), 1)), np.cumsum(steps)]))
+
+    def _between(self, at_ns: np.ndarray) -> np.ndarray:
+        if not len(self.time_ns):
+            return np.full(len(at_ns), np.nan)
+        origin = self.time_ns[0]
+        return np.interp((at_ns - origin).astype(float), (self.time_ns - origin).astype(float), self.values)
+
+    def _near(self, at_ns: np.ndarray) -> np.ndarray:
+        if not len(self.time_ns):
+            return np.zeros(len(at_ns), bool)
+        apart = np.abs(self.time_ns[self.nearest(at_ns)] - at_ns)
+        return apart <= max(CYCLE_NS, _CARRIED_PERIODS * self.period_ns)
+
+    def nearest(self, at_ns: np.ndarray) -> np.ndarray:
+        """Row of the value nearest to each time."""
+        after = np.clip(np.searchsorted(self.time_ns, at_ns), 0, len(self.time_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        return np.where(np.abs(self.time_ns[after] - at_ns) < np.abs(at_ns - self.time_ns[before]), after, before)
+
+
+#: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig has not.
+Signals = Mapping[str, Series | float | None]
+
+
+#: By the last word of a message's name: which of its signals may be missing, and what stands in for them.
+SUBSTITUTES = {
+    "Resolver": {
+        "MotorSpeed": "it is the change of MotorAngle",
+        "MotorAngle": "it is MotorSpeed added up, which drifts; force by the angle is not to be trusted for long",
+    },
+    "Thermocouple": {
+        "InnerBackplateTemp": "it is taken to be the outer one's, and a difference between the pads goes unseen",
+        "OuterBackplateTemp": "it is taken to be the inner one's, and a difference between the pads goes unseen",
+        "CaliperTemp": "it is taken to be the mean of the backing plates",
+    },
+}
+
+
+def completed(name: str, signals: Signals) -> Signals:
+    """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
+    if name.endswith("_Resolver"):
+        angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
+        angle = speed.integral() if angle is None else angle
+        return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
+    if name.endswith("_Thermocouple"):
+        plates = [signals[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in signals]
+        caliper = signals.get("CaliperTemp", _mean(plates[0], plates[-1]))
+        return {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": caliper}
+    return signals
+
+
+def _mean(first: Series | float, second: Series | float) -> Series | float:
+    """Of two temperatures, at the times of one that is measured."""
+    if not isinstance(first, Series):
+        first, second = second, first
+    if isinstance(first, Series):
+        other = second.sampled(first.time_ns) if isinstance(second, Series) else second
+        return Series(first.time_ns, 0.5 * (first.values + other))
+    return 0.5 * (first + second)
+
+
+def our_messages() -> dict[str, tuple]:
+    """cantools message and its database by name, of what the daemon receives and sends and what rigs add."""
+    databases = (load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc")))
+    return {message.name: (message, database) for database in databases for message in database.messages}
+
+
+def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
+    """FRAME array, in time order, of our messages by name.
+
+    The resolver's samples are the clock of their corner. A message's signals that are left out are sent as zero, or as absent
+    if a rig's instrument gives them.
+    """
+    ours = our_messages()
+    ticks = {}
+    for corner in CORNERS:
+        if resolver := messages.get(f"EMB_{corner}_Resolver"):
+            ticks[corner] = _clock(next(source for source in resolver.values() if isinstance(source, Series)))
+    heard = [times for times, _ in ticks.values() if len(times)]
+    if not heard:
+        return np.zeros(0, FRAME)
+    span = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
+    result = np.concatenate([_frames(*ours[name], signals, ticks, span) for name, signals in messages.items()])
+    # Stable: at one instant slow messages come first and the resolver last, as the pipeline pairs it with its current.
+    return result[np.argsort(result["time_ns"], kind="stable")]
+
+
+def at_our_rate(frames: np.ndarray) -> np.ndarray:
+    """Frames of a log in our own layout; if a resolver in it has another rate, above 50 Hz, all brought to ours.
+
+    Frames with a wrong CRC, or whose sender says not to use them, are then left out.
+    """
+    decoder = Decoder()
+    resolvers = [frames["can_id"] == decoder.can_id(f"EMB_{corner}_Resolver") for corner in CORNERS]
+    if not any(_has_another_rate(frames[mine]) for mine in resolvers):
+        return frames
+    right = crc_is_right(frames) & (frames["data"] >> np.uint64(12) & np.uint64(0xF) <= STATUS_DEGRADED)
+    rig, messages = Decoder("dbc/rig.dbc"), {}
+    for name in our_messages():
+        if name.startswith("RIG_"):
+            columns = rig.columns(frames, name)
+        elif name.startswith("VEH_") or is_received(name):
+            columns = decoder.columns(frames[right], name)
+        else:
+            continue
+        times = columns.pop("time_ns")
+        signals = {key: Series.of(times, values) for key, values in columns.items() if key not in HEADER}
+        signals = {key: series.averaged() if key == "CurrentQ" else series for key, series in signals.items()}
+        if known := {key: series for key, series in signals.items() if len(series.time_ns)}:
+            messages[name] = known
+    return frames_of(messages)
+
+
+def _has_another_rate(resolver: np.ndarray) -> bool:
+    """Whether one sender sends a corner's resolver frames at a rate of its own, that fills the way between two samples.
+
+    Two senders, or one whose frames are repeated, have no counter that goes up by one."""
+    if len(resolver) < _LEAST_SAMPLES:
+        return False
+    clock = Series(np.sort(resolver["time_ns"]), resolver["time_ns"])
+    counters = (resolver["data"] >> np.uint64(8) & np.uint64(0xF)).astype(int)
+    in_turn = np.mean(np.diff(counters) % COUNTER_MODULO == 1) > _IN_TURN
+    return bool(in_turn) and not (clock.is_ours or clock.is_sparse)
+
+
+def is_received(message: str) -> bool:
+    """Whether the daemon receives a corner's message."""
+    return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
+
+
+def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, int]) -> np.ndarray:
+    corner, kind = (*message.name.split("_"), "")[1:3]
+    if corner in ticks and kind in ("Resolver", "Current", "Force"):
+        times, cycles = ticks[corner]
+        columns = {key: _fast(key, source, times) for key, source in signals.items()}
+    else:
+        cycle_ns = (message.cycle_time or _SLOW_MS) * 1_000_000
+        times = np.arange(span[0], span[1] + 1, cycle_ns)
+        cycles = np.arange(len(times))
+        columns = {key: _slow(source, times, cycle_ns) for key, source in signals.items()}
+    is_reference = message.name.startswith("RIG_")
+    names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
+    payload, usable = np.zeros(len(times), np.uint64), np.ones(len(times), bool)
+    for layout, name in zip(signal_columns(database, message.name, names), names, strict=True):
+        start, length = np.uint64(layout["start"]), int(layout["length"])
+        source = columns.get(name, None if is_reference else 0.0)
+        absent = np.full(len(times), absent_raw(length) if is_reference else 0)
+        if source is None:
+            raw = absent
+        else:
+            column = np.broadcast_to(np.asarray(source, float), times.shape)
+            known = np.isfinite(column) & (column >= layout["low"]) & (column <= layout["high"])
+            raw = np.rint((np.where(known, column, layout["offset"]) - layout["offset"]) / layout["factor"]).astype(np.int64)
+            if is_reference:
+                raw = np.where(known, raw, absent)
+            else:
+                usable &= known
+        payload |= (raw.astype(np.uint64) & np.uint64((1 << length) - 1)) << start
+    frames = np.zeros(int(usable.sum()), FRAME)
+    frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
+    frames["data"] = payload[usable]
+    if not is_reference:
+        counters = cycles[usable] % COUNTER_MODULO
+        for frame, counter in zip(frames, counters.tolist(), strict=True):
+            frame["data"] = protect(message.frame_id, frame["data"], counter, 0)
+    return frames
+
+
+def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.ndarray | float | None:
+    if not isinstance(source, Series):
+        return source
+    if name.startswith("Current"):
+        return source.mean(times)
+    return source.smoothed(times) if name == "MotorSpeed" and source.is_slow else source.sampled(times)
+
+
+def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:
+    return source.held(times, cycle_ns) if isinstance(source, Series) else source
+
+
+def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the resolver samples and the cycle that each belongs to: the rig's own samples if its period is ours or too
+    long to fill, a grid of our period otherwise."""
+    times = angle.time_ns
+    if len(times) < 3:
+        return times, np.arange(len(times))
+    if angle.is_ours or angle.is_sparse:
+        steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
+        return times, np.concatenate([[0], np.cumsum(steps)])
+    grid = np.arange(int(times[0]), int(times[-1]) + 1, CYCLE_NS)
+    return grid, np.arange(len(grid))

@@ -1,0 +1,260 @@
+"""A rig that nobody here built, through every command that reads its logs: see `strangerkit`."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+import strangerkit
+
+import emb_daemon
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.write import write_frames
+from emb_daemon.offline import load_log
+from emb_daemon.wire.contract import E2E_ERROR
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return strangerkit.truth()
+
+
+def _replay(folder, log, capsys, *options):
+    arguments = ["replay", log, "--mapping", folder / "mapping.yaml", "--calibration", folder / "calibration.yaml", *options]
+    assert main([*map(str, arguments), "--json"]) == 0
+    said = capsys.readouterr()
+    return json.loads(said.out)["logs"][0], said.err
+
+
+@pytest.fixture(scope="module")
+def bus(truth, tmp_path_factory):
+    """The rig's CAN FD log at 500 Hz."""
+    folder = tmp_path_factory.mktemp("stranger")
+    strangerkit.write_rig(folder)
+    return strangerkit.write_log(folder / "stops.blf", strangerkit.sampled(truth, 500.0))
+
+
+def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
+    log = load_log(bus, read=Mapping(bus.parent / "mapping.yaml").read)
+    at = log.time_ns * 1e-9 - strangerkit.START_S
+    inside = at > 0.01
+    for name, true in (("angle", truth.angle), ("speed", truth.speed), ("current_q", truth.current)):
+        error = log.samples[name] - np.interp(at, truth.time_s, true)
+        assert np.abs(np.mean(error[inside])) < 0.05 and np.std(error[inside]) < 0.6, name
+    assert np.nanstd(log.force_N - np.interp(at, truth.time_s, truth.force)) < 25.0
+    assert log.samples["inner_backplate"][100] == pytest.approx(22.0, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["cut.log", "cut.asc"])
+def test_every_format_keeps_payloads_beyond_eight_octets(bus, truth, name):
+    columns = {key: values[:40] for key, values in strangerkit.sampled(truth, 500.0).items()}
+    mapping = Mapping(bus.parent / "mapping.yaml")
+    log = load_log(strangerkit.write_log(bus.parent / name, columns), read=mapping.read)
+    expected = load_log(strangerkit.write_log(bus.parent / "cut.blf", columns), read=mapping.read)
+    for key in ("angle", "speed", "current_q"):
+        assert (
+            np.abs(log.samples[key] - expected.samples[key]).max() < 0.03 < np.ptp(log.samples[key]) + 1.0 * (key == "angle")
+        )
+
+
+def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):
+    figures, said = _replay(bus.parent, bus, capsys)
+    assert figures["force_N"]["fused"]["rmse"] < 40.0 and figures["force_N"]["inside_two_sigma"] > 0.93
+    assert figures["temperature_K"] == {} and figures["invalid"] == 0.0
+    assert "OuterBackplateTemp is not measured: it is taken to be the inner one's" in said
+    options = ["--mapping", str(bus.parent / "mapping.yaml"), "--calibration", str(bus.parent / "calibration.yaml")]
+    assert main(["replay", str(bus), *options]) == 0
+    assert "of the samples" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("rate_Hz", "means"), [(100, True), (100, False), (250, False), (400, True), (500, False), (1000, True)]
+)
+def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, means):
+    """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate."""
+    figures = []
+    for rate, as_means in ((250, True), (rate_Hz, means)):
+        text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
+        strangerkit.write_rig(tmp_path, text)
+        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, rate, as_means))
+        figures.append(_replay(tmp_path, table, capsys)[0]["force_N"])
+    ours, theirs = figures
+    assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 500.0
+    assert theirs["fused"]["rmse"] < ours["fused"]["rmse"] + 5.0 < 45.0
+    assert theirs["inside_two_sigma"] > 0.93
+
+
+@pytest.mark.parametrize("rate_Hz", [100, 500, 1000])
+def test_our_own_layout_may_be_logged_at_any_rate(truth, tmp_path, capsys, rate_Hz):
+    columns = {key: values[: 4 * rate_Hz] for key, values in strangerkit.sampled(truth, rate_Hz).items()}
+    frames = strangerkit.our_frames(columns)
+    write_frames(tmp_path / "ours.log", frames)
+    samples = load_log(tmp_path / "ours.log").samples
+    assert "sampled at another rate than every 4 ms" in capsys.readouterr().err
+    at = samples["time_ns"] * 1e-9 - strangerkit.START_S
+    assert np.all(samples["dt"][1:] == 0.004) and not (samples["reasons"] & E2E_ERROR).any()
+    assert np.abs(samples["angle"] - np.interp(at, truth.time_s, truth.angle)).max() < 0.05
+    assert np.abs((samples["current_q"] - np.interp(at - 0.002, truth.time_s, truth.current))[2:].mean()) < 0.05
+    twice = np.concatenate([frames, frames])
+    write_frames(tmp_path / "repeated.log", twice[np.argsort(twice["time_ns"], kind="stable")])
+    assert (load_log(tmp_path / "repeated.log").samples["reasons"] & E2E_ERROR).any(), "no rate, but repetition"
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["stops.csv", "stops.parquet", "stops.1.mf4"])
+def test_columns_and_channels_are_logs(truth, tmp_path, name):
+    if name.endswith("mf4"):
+        pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    text = strangerkit.COLUMNS if not name.endswith("mf4") else strangerkit.COLUMNS.replace("time: {signal: time_s}\n", "")
+    strangerkit.write_rig(tmp_path, text)
+    columns = {key: values[:500] for key, values in strangerkit.sampled(truth, 250.0).items()}
+    samples = load_log(strangerkit.write_table(tmp_path / name, columns), read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert len(samples) == 500 and np.abs(samples["angle"] - columns["angle_rad"]).max() < 1.1e-4
+    start_s = strangerkit.START_S if name.endswith("mf4") else 0.0
+    assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("a.csv", "time_s,angle_rad\n0,0\n", "current_A: no such column; the table has time_s, angle_rad"),
+        ("a.csv", "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n0,x,0,0,0,0\n", "expected a column of numbers"),
+        ("a.csv", "", "not readable"),
+        ("a.parquet", "no parquet", "not readable"),
+        ("a.mf4", "no measurement", "not readable as a measurement"),
+        ("a.blf", "", "expected a table"),
+    ],
+)
+def test_a_faulty_table_is_refused_in_one_line(tmp_path, capsys, name, content, expected):
+    if name.endswith("mf4"):
+        pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    strangerkit.write_rig(tmp_path, strangerkit.COLUMNS)
+    (tmp_path / name).write_text(content)
+    assert main(["replay", str(tmp_path / name), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
+    *_notes, line = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"{tmp_path / name}: ") and expected in line, line
+
+
+def _without(text: str, *words: str) -> str:
+    return "".join(line for line in text.splitlines(keepends=True) if not any(word in line for word in words))
+
+
+@pytest.mark.parametrize(
+    ("left_out", "said", "reasons", "most_N"),
+    [
+        ("CurrentQ", "EMB_FL_Current is not mapped: the force rests on the motor angle alone", {"current lost"}, 30.0),
+        ("MotorSpeed", "MotorSpeed is not measured: it is the change of MotorAngle", set(), 30.0),
+        ("MotorAngle", "MotorAngle is not measured: it is MotorSpeed added up, which drifts", set(), 60.0),
+        ("Thermocouple", "EMB_FL_Thermocouple is not mapped", {"thermocouple lost", "pad temperature uncertain"}, 30.0),
+        ("WheelSpeed", "VEH_WheelSpeed is not mapped: the disc may be turning", {"wheel speed lost"}, 120.0),
+    ],
+)
+def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, left_out, said, reasons, most_N):
+    """As far as the physics allows, and with a sigma that holds."""
+    strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, left_out))
+    table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, 250.0))
+    figures, notes = _replay(tmp_path, table, capsys)
+    assert said in notes
+    assert {word for word, share in figures["reasons"].items() if share > 0.9} == reasons
+    assert figures["invalid"] < 0.01
+    assert figures["force_N"]["fused"]["rmse"] < most_N and figures["force_N"]["inside_two_sigma"] > 0.93
+
+
+def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
+    strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, "RIG_"))
+    table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, 250.0))
+    out = tmp_path / "out.parquet"
+    figures, _ = _replay(tmp_path, table, capsys, "--output", out)
+    assert figures["force_N"] == {} and figures["temperature_K"] == {}
+    assert not [name for name in pyarrow.parquet.read_table(out).column_names if "_ref_" in name]
+
+
+@pytest.mark.parametrize(
+    ("left_out", "expected"),
+    [
+        (("Resolver",), "expected EMB_c_Resolver.MotorAngle, MotorSpeed or both"),
+        (("ParkBrake",), "VEH_Status.ParkBrake: missing"),
+    ],
+)
+def test_what_nothing_can_stand_in_for_is_a_fault(tmp_path, left_out, expected):
+    with pytest.raises(InputErrors, match=expected):
+        Mapping(strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, *left_out)))
+
+
+def test_an_angle_that_starts_anew_each_turn_is_put_together(truth, tmp_path):
+    columns = {key: values[:3000] for key, values in strangerkit.sampled(truth, 500.0).items()}
+    samples = []
+    for name, period in (("whole", None), ("turn", 360.0)):
+        degrees = np.degrees(columns["angle_rad"]) - 90.0
+        mapped = "angle_rad, unit: deg" + (f", period: {period:g}" if period else "")
+        strangerkit.write_rig(tmp_path, strangerkit.COLUMNS.replace("angle_rad, unit: rad", mapped))
+        table = columns | {"angle_rad": degrees % period if period else degrees}
+        path = strangerkit.write_table(tmp_path / f"{name}.parquet", table)
+        samples.append(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples["angle"])
+    assert np.ptp(samples[0]) > 4.0 * np.pi and np.allclose(np.diff(samples[0]), np.diff(samples[1]), atol=4e-4)
+
+
+def test_a_caliper_is_no_pad(tmp_path):
+    text = strangerkit.COLUMNS.replace("InnerBackplateTemp", "CaliperTemp")
+    with pytest.raises(InputErrors, match="EMB_FL_Thermocouple: expected InnerBackplateTemp or OuterBackplateTemp"):
+        Mapping(strangerkit.write_rig(tmp_path, text))
+
+
+def test_arrays_are_a_log(truth):
+    columns = strangerkit.sampled(truth, 100.0)
+    time_s, force_N = columns["time_s"], columns["force_N"]
+    motion = (columns["angle_rad"], columns["speed_rad_per_s"], columns["current_A"])
+    log = emb_daemon.log_of_arrays(time_s, *motion, inner_backplate_C=22.0, wheel_speed_rad_per_s=0.0, force_N=force_N)
+    estimates = emb_daemon.run(log, strangerkit.calibration())
+    error = (estimates["force"] - log.force_N)[1:]
+    assert np.sqrt(np.nanmean(error**2)) < 40.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.93
+    without = emb_daemon.log_of_arrays(time_s, columns["angle_rad"])
+    assert not without.samples["has_current"].any() and np.isnan(without.force_N).all()
+    for wrong, expected in (
+        ({"current_mA": motion[2]}, "current_mA: no such column; expected one of angle_rad"),
+        ({"force_N": force_N[:5]}, "force_N: expected as many values as times"),
+        ({"caliper_C": 20.0}, "expected inner_backplate_C or outer_backplate_C"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            emb_daemon.log_of_arrays(time_s, *motion, **wrong)
+    with pytest.raises(InputError, match="expected one of them"):
+        emb_daemon.log_of_arrays(time_s, current_A=motion[2])
+
+
+def test_a_log_of_other_ids_is_told_by_them(bus, capsys):
+    assert main(["replay", str(bus)]) == 2
+    said = capsys.readouterr().err
+    assert "no frame of id 0x100, the resolver of corner FL; found 0x18feef01, 0x18feef02; " in said and "--mapping" in said
+
+
+def test_a_converted_log_is_replayed_alike(bus, capsys):
+    out, mapping = bus.parent / "ours.log", bus.parent / "mapping.yaml"
+    assert main(["convert", str(bus), "--mapping", str(mapping), "--output", str(out)]) == 0
+    assert f"{out}: " in capsys.readouterr().out
+    assert np.array_equal(load_log(out).samples["angle"], load_log(bus, read=Mapping(mapping).read).samples["angle"])
+    assert main(["convert", str(bus), "--mapping", str(mapping), "--output", str(bus)]) == 2
+    assert "is one of the inputs" in capsys.readouterr().err
+
+
+def test_a_part_of_a_log_is_that_part_of_the_whole(bus, capsys):
+    tables = []
+    for name, options in (("whole", []), ("part", ["--from", "2.5", "--to", "4"])):
+        out = bus.parent / f"{name}.parquet"
+        figures, _ = _replay(bus.parent, bus, capsys, "--output", out, *options)
+        tables.append(pyarrow.parquet.read_table(out).to_pandas())
+    whole, part = tables
+    start = whole["time_s"][0]
+    inside = whole[(whole["time_s"] >= start + 2.5) & (whole["time_s"] <= start + 4.0)].reset_index(drop=True)
+    assert figures["samples"] == len(part) == pytest.approx(375, abs=1) and abs(len(inside) - len(part)) <= 1
+    count = min(len(inside), len(part))
+    assert inside["clamp_force_N"][:count].equals(part["clamp_force_N"][:count])
+    arguments = ["replay", str(bus), "--mapping", str(bus.parent / "mapping.yaml")]
+    sent = bus.parent / "sent.log"
+    assert main([*arguments, "--from", "2.5", "--to", "4", "--output", str(sent)]) == 0
+    assert read_frames(sent)["time_ns"][0] >= 1e9 * (start + 2.49)
+    for wrong in (["--from", "5", "--to", "4"], ["--from", "-1"], ["--to", "nan"], ["--from", "99"]):
+        assert main([*arguments, *wrong]) == 2
+        assert "--from" in capsys.readouterr().err

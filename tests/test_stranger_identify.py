@@ -1,0 +1,77 @@
+"""`identify` on what a stranger has: a calibration of whatever there is, as good as it says, and a word on what is missing."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import strangerkit
+
+import emb_daemon
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.cli.main import main
+from emb_daemon.logs.mapping import Mapping
+
+_PAGE = Path(__file__).parent.parent / "docs" / "own_actuator.md"
+
+
+def _clamp_only() -> np.ndarray:
+    motion = strangerkit.slow()
+    return motion[: int(np.argmax(motion))]
+
+
+def _in_contact() -> np.ndarray:
+    """From a clamped brake to a clamped one."""
+    motion = strangerkit.slow()
+    return motion[round(4.0 / strangerkit.FINE_S) : round(20.0 / strangerkit.FINE_S)]
+
+
+@pytest.mark.parametrize(
+    ("motions", "said", "most_N"),
+    [
+        ({"curve": strangerkit.slow, "random": strangerkit.random}, "thermal: no log heats the pads", 30.0),
+        ({"random": strangerkit.random}, "thermal: no log heats the pads", 30.0),
+        ({"curve": strangerkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0),
+        ({"curve": _clamp_only}, "random: no usable log", 500.0),
+        ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0),
+    ],
+    ids=["both", "random alone", "one slow curve", "apply alone", "no clearance"],
+)
+def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N):
+    campaign = strangerkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})
+    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
+    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 0
+    assert said in capsys.readouterr().err
+    found = load_calibration(output)
+    for name, angle in (("stops", None), ("random_2", strangerkit.random(seed=2))):
+        table = strangerkit.write_table(tmp_path / f"{name}.parquet", strangerkit.sampled(strangerkit.truth(angle), 500.0))
+        log = emb_daemon.load_log(table, read=Mapping(mapping).read)
+        estimates = emb_daemon.run(log, found)
+        error = (estimates["force"] - log.force_N)[1:]
+        inside = np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:])
+        assert np.sqrt(np.mean(error**2)) < most_N and inside > 0.9, name
+
+
+def test_a_misspelt_log_is_an_error(tmp_path, capsys):
+    campaign = strangerkit.write_campaign(tmp_path)
+    campaign.write_text(campaign.read_text().replace("curves: []", "curves: [{log: slwo.parquet}]"))
+    assert main(["identify", str(campaign), "--output", str(tmp_path / "found.yaml")]) == 2
+    assert "curves[0].log: " in capsys.readouterr().err
+
+
+def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
+    """The commands of the page, on the example that the first of them writes."""
+    hour = _PAGE.read_text(encoding="utf-8").partition("## A first hour")[2].partition("\n1. ")[0]
+    commands = [shlex.split(line) for line in re.findall(r"^    (emb-daemon .+)$", hour, re.MULTILINE)]
+    assert [command[1] for command in commands] == ["identify", "identify", "replay"]
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert main(command[1:]) == 0, command
+    said = capsys.readouterr().out
+    assert float(re.search(r"fused +RMSE +([0-9.]+) N", said)[1]) < 40.0
+    assert (tmp_path / "my_rig/stops.html").is_file() and (tmp_path / "my_rig/report/report.html").is_file()
+    assert main(["identify", "--example", "my_rig"]) == 2
+    assert "expected an empty folder" in capsys.readouterr().err
+    assert main(["identify"]) == 2
+    assert "expected CAMPAIGN.yaml and --output" in capsys.readouterr().err

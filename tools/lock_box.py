@@ -1,0 +1,47 @@
+"""Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`.
+
+    python tools/lock_box.py [--check]
+
+Run it where all of requirements.lock is installed (`make lock` does): what a package depends on is read from its metadata,
+whatever Python or system it is for.
+"""
+
+import contextlib
+import re
+import sys
+import tomllib
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def _name(requirement: str) -> str:
+    return re.sub(r"[-_.]+", "-", _NAME.match(requirement)[0]).lower()
+
+
+def box_lock() -> str:
+    """The file's content."""
+    blocks = re.split(r"(?m)^(?=\S)", (ROOT / "requirements.lock").read_text())
+    pinned: dict[str, str] = {}
+    for block in blocks:
+        # A package may stand there once for each range of Pythons.
+        if _NAME.match(block):
+            pinned[_name(block)] = pinned.get(_name(block), "") + block
+    waiting = [_name(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
+    needed: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name not in needed and name in pinned:
+            needed.add(name)
+            with contextlib.suppress(PackageNotFoundError):
+                waiting += [_name(line) for line in requires(name) or () if "extra ==" not in line]
+    return "".join(pinned[name] for name in sorted(needed))
+
+
+if __name__ == "__main__":
+    path = ROOT / "requirements-box.lock"
+    if sys.argv[1:] == ["--check"]:
+        sys.exit(0 if path.read_text() == box_lock() else f"{path}: out of date, run python tools/lock_box.py")
+    path.write_text(box_lock())
