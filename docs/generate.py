@@ -173,14 +173,14 @@ def pages() -> dict[str, str]:
             "Mapping file",
             "Where our signals come from in the logs of another rig: `--mapping FILE` of the commands that read logs. "
             "[How it is used](formats.md#another-rigs-signals); [an example](own_actuator.md).",
-            mapping.MappingFile, mapping,
+            mapping.MappingFile,
         ),
         "campaign.md": _structs(
             "Campaign and datasheet",
             "What `emb-daemon identify` reads: which log plays which part, and what the supplier states. "
             "[What to record, and why](own_actuator.md).",
-            campaign.CampaignFile, campaign,
-        ) + "\n# Datasheet\n\n" + _structs("", "", campaign.Datasheet, campaign).split("\n", 4)[4],
+            campaign.CampaignFile,
+        ) + "\n# Datasheet\n\n" + _structs("", "", campaign.Datasheet).split("\n", 4)[4],
         "catalogue.md": _catalogue(),
         "safety.md": _safety(),
     }  # fmt: skip
