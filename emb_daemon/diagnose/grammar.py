@@ -131,7 +131,7 @@ def _wanted(selection: Selection, channel: str) -> bool:
     model, screening = selection.model, selection.screening
     residual, square = model.residual[channel], model.noise(channel)
     known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
-    noise = 0.5 * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) ** 2
+    noise = _noise(residual)
     if is_beyond(np.sqrt(square), known) or square - noise > _STRUCTURED * square:
         return True
     ceiling = model.rms(screening.rival(model, channel, {})[0], channel)
@@ -149,6 +149,11 @@ class Prospect:
     def is_of(self, other: "Prospect") -> bool:
         """Whether it says the same of port and signal."""
         return (self.form.port, self.form.signal) == (other.form.port, other.form.signal)
+
+
+def _noise(residual: np.ndarray) -> float:
+    """Mean square of what differs from sample to sample."""
+    return 0.5 * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) ** 2
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
@@ -213,15 +218,18 @@ class _Search:
         self.scores = _screened(self.screen, self.forms, self.sensitivities, signals)
 
     def prospects(self) -> list[Prospect]:
-        """The best forms, through the estimator, those worth their length first."""
+        """The best forms, through the estimator, that shorten the description, the choice among all forms included; best
+        first."""
         model, own = self.model, self.model.own(self.channel)
         best = [*_shortlisted(self.forms, self.scores), *_ripples(self)]
         exact = [_probed(model, self.channel, form) for form in best]
         found = [Prospect(form, own, model.evidence(self.channel, own)) for form, own in zip(best, exact, strict=True)]
         moments = model.moments(self.channel, [model.columns[c] for c in own])
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
+        alone -= model.counted(self.channel) * _noise(model.residual[self.channel])
         kept = [p for p in found if p.evidence.p_value < UNSURE and p.evidence.gain > 0.0 and _stays_in_bounds(p)]
-        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+        length = {id(p): _length(p, alone, model.bench.episodes) + np.log(len(self.forms)) for p in kept}
+        return sorted((p for p in kept if length[id(p)] < 0.0), key=lambda p: length[id(p)])
 
     def chance(self, best: Prospect) -> float:
         """That of the best among all forms; a ripple's is that of its order among as many."""
@@ -379,9 +387,9 @@ def _stays_in_bounds(prospect: Prospect) -> bool:
 
 
 def _length(prospect: Prospect, alone: float, episodes: int) -> float:
-    """Description length of what is left and of the term, in nats; an episode counts as one observation.
+    """What the term adds to the description length of what is left, in nats; an episode counts as one observation.
 
-    ``alone``: squared error of left-out episodes without the term."""
+    ``alone``: squared error of left-out episodes without the term, less the noise that no term explains."""
     left = max(1.0 - prospect.evidence.gain / max(alone, 1e-300), 1e-3)
     return 0.5 * episodes * np.log(left) + 0.5 * prospect.form.numbers * np.log(episodes)
 
