@@ -96,6 +96,10 @@ def test_another_rigs_log_gives_the_same_samples(foreign, log, tmp_path):
 
 
 def test_another_rigs_log_is_judged_like_ours(foreign, log, tmp_path, capsys):
+    # A bench says that its disc stands, and that nobody brakes or parks.
+    status = "".join(f"  VEH_Status.{name}: {{value: 0.0}}\n" for name in ("VehicleSpeed", "ParkBrake", "BrakeRequest"))
+    status += "  VEH_Status.AmbientTemp: {value: 22.0}\n"
+    (tmp_path / "mapping.yaml").write_text(_MAPPING + status)
     figures = []
     for arguments in ([str(log)], [str(foreign), "--mapping", str(tmp_path / "mapping.yaml")]):
         assert main(["replay", *arguments, "--json"]) == 0

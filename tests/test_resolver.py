@@ -37,7 +37,7 @@ def _rmse(estimates, force, rows):
     return np.sqrt(np.mean((estimates["force"] - force)[rows] ** 2))
 
 
-@pytest.mark.parametrize("jump_rad", [-2.0, -1.0, 1.0, 2.0])
+@pytest.mark.parametrize("jump_rad", [-1.5, -1.0, 1.0, 1.5])
 @pytest.mark.parametrize("begin", [_RELEASED, _HOLDING])
 def test_an_angle_that_jumps_without_speed_moves_the_zero_and_not_the_force(begin, jump_rad):
     def change(samples):
@@ -105,4 +105,5 @@ def test_an_offset_of_the_current_between_two_strokes_leaves_the_contact_angle(o
     estimates, force = _estimates(change)
     good, _ = _estimates(lambda _samples: None)
     assert abs(estimates["contact_angle"][-1] - good["contact_angle"][-1]) < 0.15
-    assert _rmse(estimates, force, slice(2600, None)) < _rmse(good, force, slice(2600, None)) + 100.0
+    silent = (estimates["reasons"] == 0) & (np.abs(estimates["force"] - force) > 4.0 * estimates["sigma"])
+    assert np.count_nonzero(silent) <= 25, "said within a tenth of a second"

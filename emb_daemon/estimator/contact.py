@@ -62,10 +62,10 @@ def follow_zero(s, p, m):
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     slip = jump - 0.5 * (m.speed + s.speed) * m.dt
     unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
-    if seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
-        moved, sigma = slip, _ZERO_RAD
-    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
+    if abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
         moved, sigma = jump, reach
+    elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
+        moved, sigma = slip, _ZERO_RAD
     elif seen and max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
         s.drifted = s.stood_s = 0.0
     elif seen:

@@ -70,7 +70,7 @@ _LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Share of the largest force by which an unproven jump must move the force to be told.
 _NOTED = 0.003
 #: Part of a sample by which current and angle may be apart in time.
-_LATE = 0.75
+_LATE = 0.3
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
 _TELLING = 0.1
 #: Share of the clearance that the motor must have gone back through before a jump is proven.

@@ -51,9 +51,8 @@ _GROWTH_ODDS = -8.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
-#: Time after which an unproven jump is looked for anew, s: while the pads touch, and in the clearance, where a stroke may
-#: begin at any time.
-_OPENED_S, _RELEASED_S = 1.0, 0.05
+#: Time after which an unproven jump is looked for anew, s.
+_OPENED_S = 1.0
 #: Time after which the stronger of two proven alternatives is taken though they are alike, and a merely suspected one given up
 #: at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
@@ -248,7 +247,7 @@ def settle(s, p, released, dt):
             s.drive += a.shift
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
-    if given_up or (not suspected(s) and s.open_s > (_RELEASED_S if released else _OPENED_S)):
+    if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
         open_again(s, p)
     return False
 
