@@ -146,6 +146,10 @@ class Screening:
         if not own:
             return Candidate(effect, None)
         channel = next(iter(own.values())).channel
+        low, high = np.quantile(self.signals[effect.signal], (0.05, 0.95))
+        if low == high:
+            # Where its signal stays the same nothing tells an effect from a constant.
+            return Candidate(effect, channel)
         parts = _parts(effect, [own[p.name] for p in effect.amplitudes])
         best = Candidate(effect, channel, tuple(parts[-1]))
         for shape in shapes:
