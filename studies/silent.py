@@ -160,7 +160,7 @@ def _print_families(table: list[dict]) -> None:
         )
 
 
-def _write_table(page: Path, table: list[dict], seed: int) -> None:
+def _write_table(page: Path, table: list[dict], options: str) -> None:
     """The section of a page between its two `detection times` comments, anew.
 
     Raises:
@@ -178,7 +178,7 @@ def _write_table(page: Path, table: list[dict], seed: int) -> None:
         for row in table
     ]
     lines = [
-        f"Written by `python -m studies.silent grid --seed {seed} --table {page}`.",
+        f"Written by `python -m studies.silent grid {options} --table {page}`.",
         "",
         "| fault or change | flagged | first flag, median s | latest, s | failing phases | beyond 1 kN | worst unflagged, N |",
         "|---|---|---|---|---|---|---|",
@@ -219,7 +219,9 @@ def grid(arguments: argparse.Namespace) -> int:
     table = _tabulate(reports)
     failing, total = sum(row["failing_phases"] for row in table), sum(row["phases"] for row in table)
     if arguments.table:
-        _write_table(arguments.table, table, arguments.seed)
+        drawn = {"count": arguments.count, "pairs": arguments.pairs, "seed": arguments.seed}
+        options = " ".join(f"--{name} {value}" for name, value in drawn.items() if value is not None)
+        _write_table(arguments.table, table, options)
     if arguments.json:
         figures = {"seed": arguments.seed, "failing": failing, "phases": total, "families": table, "drives": reports}
         _print_json(figures)
