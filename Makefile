@@ -54,7 +54,8 @@ mutation: $(READY)
 # Is the estimate ever silently wrong? A short form for CI: one drive of each family whose promises are kept; fails if one is not.
 # All of it, 900 drives with one fault and 100 with two: $(VENV)/bin/python -m studies.silent grid
 SILENT ?= nominal,torque_constant,friction_scale,viscous,resolver_frozen_last,current_frozen,current_zero,current_lost,$\
-thermocouple_stuck,thermocouple_stuck_noise,ambient_cold,power_cycle,bursts_lost
+thermocouple_stuck,thermocouple_stuck_noise,ambient_cold,power_cycle,bursts_lost,$\
+current_offset,power_on_hot,wheel_pulses_pause,stribeck,start_latched,gear_wear,wheel_speed_zero
 silent: $(READY)
 	$(VENV)/bin/python -m studies.silent grid --faults $(SILENT) --count 1 --processes 1 --strict
 

@@ -57,8 +57,8 @@ def remember(c, innovation, sigma, dt):
 def forget(c):
     """Begin anew: what was left unexplained has been explained."""
     c.seen_s = 0.0
-    c.square[:] = 0.0
-    c.expected[:] = 0.0
+    for i in range(HORIZONS):
+        c.square[i] = c.expected[i] = 0.0
 
 
 @njit

@@ -63,7 +63,7 @@ def _start_heat(s, t, m):
 @njit
 def _begin_watch(s, m):
     s.plate[0], s.plate[1] = m.inner_backplate, m.outer_backplate
-    s.plate_mean[:] = s.mean
+    s.plate_mean[0], s.plate_mean[1] = s.mean[0], s.mean[1]
     s.ambient = m.ambient if m.has_status else s.disc
     s.temperature_known = True
 

@@ -37,6 +37,7 @@ from emb_daemon.models.fusion import (
     SLOW,
     STATES,
     VISCOUS,
+    copy_errors,
     force_variance,
     update_errors,
     variance_along,
@@ -86,8 +87,7 @@ ALTERNATIVE = np.dtype(
 @njit
 def _open(s, p, kind):
     a = s.alternatives[kind]
-    a.error[:] = s.error
-    a.covariance[:, :] = s.covariance
+    copy_errors(a.error, a.covariance, s.error, s.covariance)
     if kind == STIFFNESS_JUMP:
         add_stiffness_jumps(a.covariance, p)
     elif kind == TORQUE_JUMP:
@@ -176,7 +176,8 @@ def place(s, a, p, factor, warmth):
 @njit
 def to_force(h, spread, slope, force, warmth):
     """Sensitivity of the clamp force to the states."""
-    h[:] = 0.0
+    for i in range(STATES):
+        h[i] = 0.0
     h[FAST], h[CONTACT], h[SCALE], h[GROWTH] = spread, -slope, force, slope * warmth
 
 
@@ -241,8 +242,7 @@ def settle(s, p, released, dt):
         a = s.alternatives[kind]
         margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
         if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
-            s.error[:] = a.error
-            s.covariance[:, :] = a.covariance
+            copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
             s.drive += a.shift
             return True

@@ -20,7 +20,7 @@ from emb_daemon.estimator.unknown import (
     set_priors,
 )
 from emb_daemon.jit import njit
-from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES
+from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
 
 #: Kelvin per second by which a disc may have heated while nobody looked, and at most: hard braking from motorway speed.
@@ -63,8 +63,7 @@ def take_snapshot(s, p, snapshot):
     snapshot.clearance = p.clearance + s.contact_angle - s.contact_anchor
     snapshot.clearance_sigma = s.covariance[CONTACT, CONTACT] ** 0.5
     snapshot.scale, snapshot.growth, snapshot.growth_start = s.scale, s.growth, s.growth_start
-    snapshot.error[:] = s.error
-    snapshot.covariance[:, :] = s.covariance
+    copy_errors(snapshot.error, snapshot.covariance, s.error, s.covariance)
     snapshot.winding, snapshot.housing = s.winding, s.housing
     snapshot.temperature_known = s.temperature_known
     snapshot.pads[:, :] = s.pads
@@ -109,8 +108,7 @@ def resume(s, p, snapshot, elapsed_s):
     s.resumed = True
     s.clearance, s.clearance_sigma = snapshot.clearance, snapshot.clearance_sigma
     s.scale, s.growth, s.growth_start = snapshot.scale, snapshot.growth, snapshot.growth_start
-    s.error[:] = snapshot.error
-    s.covariance[:, :] = snapshot.covariance
+    copy_errors(s.error, s.covariance, snapshot.error, snapshot.covariance)
     for i in range(STATES):
         for own in (FAST, NOISE):
             s.covariance[own, i] = s.covariance[i, own] = 0.0

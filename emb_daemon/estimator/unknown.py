@@ -109,7 +109,9 @@ def add_softening(P, p, rise, sigma):
 @njit
 def set_priors(P, p):
     """Covariance at power-on of a brake that is as its calibration says."""
-    P[:, :] = 0.0
+    for i in range(len(P)):
+        for j in range(len(P)):
+            P[i, j] = 0.0
     P[FAST, FAST] = 1.0
     P[CONTACT, CONTACT] = p.clearance_sigma**2
     P[GAIN, GAIN] = _GAIN**2

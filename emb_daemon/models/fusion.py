@@ -44,6 +44,15 @@ def maximum_likelihood(stiffness, stiffness_sigma, torque, torque_sigma):
 
 
 @njit
+def copy_errors(x, P, from_x, from_P):
+    """Into ``x`` and ``P``. Loops, because each assignment of a whole array costs the compiler a tenth of a second."""
+    for i in range(STATES):
+        x[i] = from_x[i]
+        for j in range(STATES):
+            P[i, j] = from_P[i, j]
+
+
+@njit
 def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
     """Time update of the error state and its covariance.
 

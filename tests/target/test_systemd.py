@@ -33,7 +33,7 @@ FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
 PERIOD_S = 0.004
 PAIRING_S = 0.002
 
-COLD_START_S = 420  # all kernels compiled
+COLD_START_S = 560  # all kernels compiled
 WARM_START_S = 30
 MAXIMAL_EXPOSURE = 3.0
 
