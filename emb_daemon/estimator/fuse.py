@@ -101,21 +101,21 @@ def needed_torque(s, p, m, mean_force, leverage):
 
 
 @njit
-def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
-    """All hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``.
-
-    Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
-    torque."""
-    factor = s.factor * s.scale
-    warmth = s.disc - s.growth_start if s.temperature_known else 0.0
-    known = p.clearance_sigma == 0.0
+def _spread(s, p):
+    """Standard deviation (N) of what is fast in the stiffness path's error."""
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
     relative = hypot(relative, s.effects.terms.doubt)
     relative = hypot(relative, s.slope * effects.thickness_doubt(s.effects) / p.gear_gain)
-    spread = sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
+    return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
+
+
+@njit
+def _predict(s, p, m, spread, warmth, known):
+    """Time update of all hypotheses, then of the motor's heat."""
     current_torque = p.torque_constant * p.current_sigma
+    noise = current_torque * current_torque
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
-    h, walked = s.sensitivity[0], s.sensitivity[1]
+    walked = s.sensitivity[1]
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.winding, s.housing, softening, m.dt)
     # What has just become uncertain of the pads' heat is uncertain of the stiffness from now on.
@@ -123,11 +123,11 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     s.softening = softening
     if known:
         walked[CONTACT] = walked[SCALE] = 0.0
-    predict_errors(s.error, s.covariance, decay, noise_decay, current_torque * current_torque, walked)
+    predict_errors(s.error, s.covariance, decay, noise_decay, noise, walked)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
-        predict_errors(a.error, a.covariance, decay, noise_decay, current_torque * current_torque, walked)
-        place(s, a, p, factor, warmth)
+        predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
+        place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         s.covariance[FAST, FAST] += (lag_error / spread) ** 2
@@ -136,49 +136,73 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     s.winding += (1.0 - exp(-m.dt / WINDING_S)) * (for_ever - s.winding)
     s.housing += (1.0 - exp(-m.dt / HOUSING_S)) * (for_ever - s.housing)
 
-    mean_force = 0.5 * (force_before + s.force)
-    friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
+
+@njit
+def _moving_variance(s, p, m):
+    """Variance, (N m)^2, of one torque from noise of the speeds and from current and angle that are apart in time."""
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
     late = _LATE * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
-    moving = 2.0 * speed_torque * speed_torque + late * late
+    return 2.0 * speed_torque * speed_torque + late * late
+
+
+@njit
+def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out):
+    """What each hypothesis learns of one torque, and how likely each makes it; fills torque sigma and innovation of ``out``.
+
+    Returns the standard deviation of the torque (N m) but for what is not known of the friction state."""
+    h, speed, s_mean = s.sensitivity[0], 0.5 * (m.speed + s.speed), s.friction_mean
+    moving = _moving_variance(s, p, m)
+    friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
     white = moving + friction_torque * friction_torque * friction_variance
-    s.current_before, s.had_current = m.current_q, m.has_current
+    out.torque_sigma = sqrt(white) / leverage
+    # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
+    white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
+    slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
+    to_force(h, spread, s.slope, s.force, warmth)
+    to_torque(h, leverage, s_mean, mean_force, speed, slow_friction, accelerating, needed, s.winding, s.housing)
+    fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
+    unexplained = torque - leverage * mean_force
+    first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
+    slow = max(variance - white - fast, 0.0)
+    out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
+    out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
+    for kind in range(ALTERNATIVES if not known else 0):
+        a = s.alternatives[kind]
+        to_force(h, spread, a.slope, s.force + a.shift, warmth)
+        taken, force = needed + leverage * a.shift, mean_force + a.shift
+        to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
+        second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
+        if trusted:
+            weigh(a, least_odds(kind), first, variance, second, variance_a)
+        if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
+            out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
+    return sqrt(moving + slow)
+
+
+@njit
+def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
+    """All hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``.
+
+    Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
+    torque."""
+    warmth = s.disc - s.growth_start if s.temperature_known else 0.0
+    known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p)
+    _predict(s, p, m, spread, warmth, known)
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
-    bare = np.inf
+    out.torque_sigma = torque_sigma = np.inf
     if np.isfinite(torque):
-        out.torque_sigma = sqrt(white) / leverage
-        # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
-        white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
-        speed, s_mean = 0.5 * (m.speed + s.speed), s.friction_mean
-        slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
-        to_torque(h, leverage, s_mean, mean_force, speed, slow_friction, accelerating, needed, s.winding, s.housing)
-        h[FAST] = leverage * spread
-        fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
         trusted = s.plausibility.verdict == AGREE and not s.unknown
         if trusted != s.trusted:
             # What the alternatives saw around a sensor's fault tells nothing of the brake.
             open_all(s, p)
             s.trusted = trusted
-        unexplained = torque - leverage * mean_force
-        first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
-        slow = max(variance - white - fast, 0.0)
-        bare = sqrt(moving + slow)
-        out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
-        out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
-        for kind in range(ALTERNATIVES if not known else 0):
-            a = s.alternatives[kind]
-            to_force(h, spread, a.slope, s.force + a.shift, warmth)
-            taken = needed + leverage * a.shift
-            force = mean_force + a.shift
-            to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
-            second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
-            if trusted:
-                weigh(a, least_odds(kind), first, variance, second, variance_a)
-            if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
-                out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
+        mean_force = 0.5 * (force_before + s.force)
+        torque_sigma = _take_torque(
+            s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out
+        )
         # At rest friction's error stays what it is: no noise, and no news.
         if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
@@ -190,8 +214,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             forget(s.consistency)
             forget_level(s.contact)
     else:
-        out.torque_sigma = np.inf
         s.torque_age += m.dt
+    s.current_before, s.had_current = m.current_q, m.has_current
     if s.plausibility.verdict == TORQUE_FROZEN:
         # Nothing has jumped: until it was found out, a frozen current spoke for every jump.
         open_again(s, p)
@@ -200,7 +224,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     if out.force < 0.0:
         out.force = 0.0
     out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
-    return bare
+    return torque_sigma
 
 
 @njit
