@@ -12,6 +12,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
 from emb_daemon.wire.contract import E2E_ERROR
@@ -278,3 +279,15 @@ def test_a_part_of_a_log_is_that_part_of_the_whole(bus, capsys):
     for wrong in (["--from", "5", "--to", "4"], ["--from", "-1"], ["--to", "nan"], ["--from", "99"]):
         assert main([*arguments, *wrong]) == 2
         assert "--from" in capsys.readouterr().err
+
+
+def test_the_delays_of_a_busy_machine_are_no_other_rate(rig):
+    """A queue that empties in bursts: most frames come early, the rest late, all of them every 4 ms in the mean."""
+    frames = read_frames(rig / "static" / "training_5mm.log.gz")
+    resolver = np.flatnonzero(frames["can_id"] == 0x100)
+    late_ns = np.where(np.arange(len(resolver)) % 5 < 3, 0, 400_000) + 600_000 * (np.arange(len(resolver)) % 5)
+    frames["time_ns"][resolver] += late_ns[: len(resolver)]
+    frames = frames[np.argsort(frames["time_ns"], kind="stable")]
+    times = frames["time_ns"][frames["can_id"] == 0x100]
+    assert abs(np.median(np.diff(times)) / 4e6 - 1.0) > 0.05
+    assert at_our_rate(frames) is frames

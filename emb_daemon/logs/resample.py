@@ -26,6 +26,8 @@ _SPARSE_CYCLES = 5
 _CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
+#: Periods from which a step of time is a pause.
+_PAUSE = 10
 #: Signals of an E2E protected message that its protection fills.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
@@ -260,10 +262,15 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
     Two senders, or one whose frames are repeated, have no counter that goes up by one."""
     if len(resolver) < _LEAST_SAMPLES:
         return False
-    clock = Series(np.sort(resolver["time_ns"]), resolver["time_ns"])
     counters = (resolver["data"] >> np.uint64(8) & np.uint64(0xF)).astype(int)
-    in_turn = np.mean(np.diff(counters) % COUNTER_MODULO == 1) > _IN_TURN
-    return bool(in_turn) and not (clock.is_ours or clock.is_sparse)
+    in_turn = np.diff(counters) % COUNTER_MODULO == 1
+    if np.mean(in_turn) <= _IN_TURN:
+        return False
+    steps = np.diff(resolver["time_ns"])[in_turn]
+    # The mean, but for pauses: a busy machine's delays cancel in it, and not in the median.
+    middle = np.median(steps)
+    cycles = np.mean(steps[steps <= max(_PAUSE * middle, _PAUSE * CYCLE_NS)]) / CYCLE_NS
+    return abs(cycles - 1.0) > _SAME_PERIOD and middle < (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
 
 
 def is_received(message: str) -> bool:
