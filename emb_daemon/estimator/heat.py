@@ -19,8 +19,8 @@ TOUCHING_N = 200.0
 _BEHIND_PLATES = 4.0
 #: By which thermocouples of a brake at rest differ: their tolerance (IEC 60584, class 1: 1.5 K each) and noise, K.
 _PLATES_SPREAD_K = 3.0
-#: Time by which a vehicle status that is sent at all has been heard, s: with its ambient temperature a start tells whether the
-#: plates are warm.
+#: Time by which a vehicle status that is sent at all has been heard, s: its cycle and half as much. Its ambient temperature
+#: tells whether the plates were warm at the start.
 _HEARD_S = 0.15
 #: Disc speed that is assumed where nothing tells of it, for what it may have heated, rad/s: 110 km/h.
 _UNSEEN_RAD_PER_S = 100.0
@@ -50,14 +50,18 @@ def _start_heat(s, t, m):
         share = t.node_position[node] / t.thickness
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-    # Plates that are not as warm as all around them tell of heat on its way, and nothing of how long it has been.
-    around = m.ambient if m.has_status else m.caliper
-    apart = max(abs(s.disc - m.caliper), abs(s.disc - around))
-    s.temperature_sigma = s.history_sigma = _BEHIND_PLATES * max(apart - _PLATES_SPREAD_K, 0.0)
+    _doubt_start(s, m.caliper)
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     s.factor = stiffness_factor(t, s.history, s.history)
+
+
+@njit
+def _doubt_start(s, around):
+    """Plates that are not as warm as what is ``around`` them (degC) tell of heat on its way, not of how long it has been."""
+    doubt = _BEHIND_PLATES * max(abs(s.disc - around) - _PLATES_SPREAD_K, 0.0)
+    s.temperature_sigma, s.history_sigma = max(s.temperature_sigma, doubt), max(s.history_sigma, doubt)
 
 
 @njit
@@ -139,9 +143,13 @@ def heat(s, p, m):
     wheel_speed, speed_sigma = disc_speed(s.wheel, m)
     if not s.temperature_known:
         s.factor = 1.0
-        if m.has_thermocouple and (m.has_status or m.cycle * CYCLE_S > _HEARD_S):
+        if m.has_thermocouple:
             _start_heat(s, t, m)
         return
+    if m.has_status and not s.ambient_heard:
+        s.ambient_heard = True
+        if m.cycle * CYCLE_S < _HEARD_S and not s.resumed:
+            _doubt_start(s, m.ambient)
     touching = s.fused > TOUCHING_N
     if touching != s.touching and s.heat_time > 0.0:
         _flow(s, t, p.effects, m)

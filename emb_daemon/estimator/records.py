@@ -128,6 +128,7 @@ STATE = np.dtype(
         # What of the stiffness they left open at the last sample, share.
         ("softening", "f8"),
         ("temperature_known", "?"),
+        ("ambient_heard", "?"),
         # Backing plates: last readings, degC, the pads' mean temperatures when they last moved, what these have gained
         # since over time, K s, and whether a reading is stuck.
         ("plate", "f8", (2,)),
