@@ -3,39 +3,19 @@
 The brake is the simulated one, not the estimator's own model.
 """
 
-import functools
-
+import city
 import numpy as np
 import pytest
+from city import BEFORE_RELEASE, CLAMPING, HOLDING, RELEASED, drive, estimated
 
-from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.types import to_parameters
-from emb_daemon.offline import estimate, log_of
-from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import city_drive, simulate_log
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 
-#: Rows of the simulated city drive: standing released, clamping, holding 7 kN, holding until it is released at 2150.
-_RELEASED, _CLAMPING, _HOLDING, _BEFORE_RELEASE = 400, 1300, 1500, 2000
 _LASTING = 500
-
-
-@functools.cache
-def _drive(seed=0):
-    """Samples of fifteen seconds of a simulated unit, and the true clamp force."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
-    frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), 15.0, seed=seed)
-    log = log_of(frames)
-    return log.samples, log.force_N
 
 
 def _with(begin, change):
     """Estimates and true force of the drive whose samples from ``begin`` for two seconds went through ``change``."""
-    samples, force = _drive()
-    samples = samples.copy()
-    change(samples[begin : begin + _LASTING])
-    return estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml")))), force
+    return city.changed(lambda samples: change(samples[begin : begin + _LASTING]))
 
 
 def _freeze(*names):
@@ -79,12 +59,12 @@ def _recovered(estimates, force):
 @pytest.mark.parametrize("seed", range(4))
 def test_no_alarm_on_a_good_brake(seed):
     """Units that scatter about their calibration."""
-    samples, _ = _drive(seed)
-    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    samples, _ = drive(seed)
+    estimates = estimated(samples)
     assert not len(_alarm(estimates)) and not np.any(estimates["reasons"] & r.STUCK)
 
 
-@pytest.mark.parametrize("begin", [_CLAMPING, _HOLDING, _BEFORE_RELEASE])
+@pytest.mark.parametrize("begin", [CLAMPING, HOLDING, BEFORE_RELEASE])
 def test_dead_current_is_named_and_stiffness_goes_on(begin):
     """A current that repeats while the motor is clamped: Stuck within a twentieth of a second, StiffnessOnly, and the force
     is as
@@ -103,7 +83,7 @@ def test_current_with_an_offset_is_detected(offset_A):
     """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second,
     covered
     by sigma as long as nothing tells which path is wrong, and over once the clearance has told."""
-    begin = _HOLDING
+    begin = HOLDING
     estimates, force = _with(begin, _current(offset_A))
     alarm = _alarm(estimates)
     assert begin < alarm[0] < begin + 25 and len(alarm) > 400 and not np.any(estimates["reasons"] & r.STUCK)
@@ -115,15 +95,15 @@ def test_current_with_an_offset_is_detected(offset_A):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("begin", [0, _HOLDING, 2300])
+@pytest.mark.parametrize("begin", [0, HOLDING, 2300])
 @pytest.mark.parametrize("offset_A", [-6.0, -4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 6.0])
 def test_a_lasting_offset_of_the_current_is_covered_or_said(offset_A, begin, seed):
     """From power-on, under load, or from the second clearance on: at every tick the force is within three sigma, a model's
     rare outlier aside, or the status says that it is degraded."""
-    samples, force = _drive(seed)
+    samples, force = drive(seed)
     samples = samples.copy()
     samples["current_q"][begin:] += offset_A
-    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    estimates = estimated(samples)
     beyond = np.abs(estimates["force"] - force) / estimates["sigma"] * (estimates["reasons"] == 0)
     assert np.all(beyond < 4.0) and np.mean(beyond > 3.0) < 0.002
 
@@ -131,12 +111,11 @@ def test_a_lasting_offset_of_the_current_is_covered_or_said(offset_A, begin, see
 @pytest.mark.parametrize("offset_A", [-1.0, 1.0])
 def test_an_offset_from_power_on_is_learned_in_the_clearance(offset_A):
     """Of an ordinary current sensor: the first stroke shows it before the pads touch, and the force is as good as without."""
-    samples, force = _drive()
-    parameters = to_parameters(load_calibration(resource("config/calibration.yaml")))
-    good = estimate(samples, parameters)
+    samples, force = drive()
+    good = estimated(samples)
     samples = samples.copy()
     samples["current_q"] += offset_A
-    estimates = estimate(samples, parameters)
+    estimates = estimated(samples)
     clamped = force > 2000.0
     assert np.abs(estimates["force"] - good["force"])[clamped].max() < 0.5 * good["sigma"][clamped].min()
     assert np.all(np.abs(estimates["sigma"] / good["sigma"] - 1.0)[clamped] < 0.1)
@@ -147,10 +126,10 @@ def test_an_offset_from_power_on_is_learned_in_the_clearance(offset_A):
 def test_a_large_offset_at_power_on_may_be_a_clamped_brake(offset_A):
     """A released motor needs none of it: the contact is unknown until the brake has stood released for a second. Then it is an
     offset, said as long as it lasts if no healthy sensor has it."""
-    samples, force = _drive()
+    samples, force = drive()
     samples = samples.copy()
     samples["current_q"] += offset_A
-    estimates = estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    estimates = estimated(samples)
     unknown = slice(30, 240)
     assert np.all(estimates["reasons"][unknown] & r.CONTACT_UNCERTAIN) and np.all(
         estimates["source"][unknown] == r.TORQUE_ONLY
@@ -165,10 +144,10 @@ def test_a_large_offset_at_power_on_may_be_a_clamped_brake(offset_A):
 
 
 @pytest.mark.parametrize("names", [("angle", "speed"), ("angle",)])
-@pytest.mark.parametrize("begin", [_CLAMPING, _BEFORE_RELEASE])
+@pytest.mark.parametrize("begin", [CLAMPING, BEFORE_RELEASE])
 def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
     """Frozen while the motor turns: TorqueOnly within 60 ms of motion, with the sigma of torque that knows no direction."""
-    samples, force = _drive()
+    samples, force = drive()
     estimates, _ = _with(begin, _freeze(*names))
     turned = np.abs(samples["angle"] - samples["angle"][begin]) > 0.6
     moved = begin + np.argmax(turned[begin:])
@@ -182,29 +161,29 @@ def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
 
 def test_resolver_that_stands_still_with_noise_is_no_fault():
     """A motor at rest may read the same angle for ever, as long as its speed reads zero."""
-    samples, _ = _drive()
-    rows = np.repeat(samples[_RELEASED : _RELEASED + 1], 600)
+    samples, _ = drive()
+    rows = np.repeat(samples[RELEASED : RELEASED + 1], 600)
     rows["dt"], rows["speed"] = 0.004, 0.0
     rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
-    estimates = estimate(rows, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    estimates = estimated(rows)
     assert not np.any(estimates["reasons"] & (r.STUCK | r.PATHS_DISAGREE))
 
 
 def test_resolver_that_flickered_and_repeats_is_stuck():
     """Speed noise of a motor at rest does not repeat: twelve samples, also while no torque tells."""
-    estimates, force = _with(_RELEASED, _freeze("angle", "speed"))
+    estimates, force = _with(RELEASED, _freeze("angle", "speed"))
     stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
-    assert _RELEASED + 10 < stuck[0] < _RELEASED + 15 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
-    assert _honest(estimates, force, slice(_RELEASED, None)) and _recovered(estimates, force)
+    assert RELEASED + 10 < stuck[0] < RELEASED + 15 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
+    assert _honest(estimates, force, slice(RELEASED, None)) and _recovered(estimates, force)
 
 
 def test_resolver_that_never_flickered_and_repeats_a_speed_is_stuck():
     """From power-on: nothing is known of its noise, so it takes fifty samples of a speed that is not zero."""
-    samples, _ = _drive()
-    rows = np.repeat(samples[_RELEASED : _RELEASED + 1], 200)
+    samples, _ = drive()
+    rows = np.repeat(samples[RELEASED : RELEASED + 1], 200)
     rows["dt"], rows["speed"] = 0.004, 0.7
     rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
-    estimates = estimate(rows, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    estimates = estimated(rows)
     stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
     assert 45 < stuck[0] < 55 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
 
@@ -214,7 +193,7 @@ def test_stuck_resolver_and_no_current_leaves_nothing():
         _freeze("angle", "speed")(rows)
         rows["has_current"] = False
 
-    estimates, force = _with(_CLAMPING, both)
-    dead = slice(_CLAMPING + 60, _CLAMPING + _LASTING)
+    estimates, force = _with(CLAMPING, both)
+    dead = slice(CLAMPING + 60, CLAMPING + _LASTING)
     assert np.all(estimates["source"][dead] == r.INVALID) and np.all(estimates["mode"][dead] == r.FAULT)
     assert _recovered(estimates, force)

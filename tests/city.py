@@ -1,0 +1,37 @@
+"""Fifteen seconds of the simulated city drive, and the estimator over it with something changed."""
+
+import functools
+
+import numpy as np
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import city_drive, simulate_log
+from emb_daemon.resources import resource
+
+#: Rows: standing released, clamping, holding 7 kN, holding until it is released at `OPENED`; the second clearance.
+RELEASED, CLAMPING, HOLDING, BEFORE_RELEASE, OPENED, SECOND_CLEARANCE = 400, 1300, 1500, 2000, 2150, 2600
+
+
+@functools.cache
+def drive(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of a simulated unit, and the true clamp force."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), 15.0, seed=seed)
+    log = log_of(frames)
+    return log.samples, log.force_N
+
+
+def estimated(samples: np.ndarray) -> np.ndarray:
+    """ESTIMATE rows with the shipped calibration."""
+    return estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+
+
+def changed(change=lambda samples: None, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates and true force of the drive whose samples went through ``change``."""
+    samples, force = drive(seed)
+    samples = samples.copy()
+    change(samples)
+    return estimated(samples), force
