@@ -6,7 +6,7 @@ inspection schemes", Biometrika 41, 1954): a few samples far off or many less fa
 end it. Which path is wrong is decided by what only one of them uses:
 
     resolver   angle and speed repeat to the bit although torque or speed must turn the motor, the angle alone while the torque
-               changes by more than friction at rest can carry, or the angle does not follow the speed
+               swings up and down by more than friction at rest can carry, or the angle does not follow the speed
     current    repeats to the bit, or asks for force while the pads do not touch
 
 Otherwise it stays open; then stiffness goes on, and its standard deviation covers the difference.
@@ -23,7 +23,8 @@ from emb_daemon.jit import njit
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``held_low``, ``held_high``: between
-#: what it has been since the angle moved last.
+#: what it has been since the angle moved last or the torque last swung, ``swings`` times since the angle moved, upwards
+#: (``swing`` 1) or downwards (-1).
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -41,6 +42,8 @@ PLAUSIBILITY = np.dtype(
         ("torque_variance", "f8"),
         ("held_low", "f8"),
         ("held_high", "f8"),
+        ("swing", "i8"),
+        ("swings", "i8"),
     ],
     align=True,
 )
@@ -149,16 +152,23 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 @njit
 def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
-    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque changed by more than
-    friction at rest carries in both directions, under a clamp force of ``force`` N.
+    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque went up and down again, or
+    down and up, by more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may be
+    an offset of the current.
 
     ``moved``: whether the angle did at this sample; ``sigma``: standard deviation of the torque, N m."""
     if moved:
         c.held_low = c.held_high = c.torque_mean
+        c.swing = c.swings = 0
         return False
     c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
     carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
-    return c.held_high - c.held_low > 2.0 * carried + _CERTAIN * sigma
+    if c.held_high - c.held_low > 2.0 * carried + _CERTAIN * sigma:
+        way = 1 if c.torque_mean > 0.5 * (c.held_low + c.held_high) else -1
+        c.swings += way != c.swing
+        c.swing = way
+        c.held_low = c.held_high = c.torque_mean
+    return c.swings > 1
 
 
 @njit
