@@ -9,15 +9,18 @@ import pytest
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     DISC_GROWTH,
+    DRIFT,
     PRIOR_ODDS,
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     mix,
+    most_odds,
     open_again,
     open_all,
     settle,
     suspected,
     to_force,
+    unproven,
     weigh,
 )
 from emb_daemon.estimator.records import new_state
@@ -187,8 +190,8 @@ def clamped(p):
 
 
 def test_mixture_is_the_law_of_total_variance(p, clamped):
-    """Mean and variance of four hypotheses by their probabilities, forces and own variances; the first's own is what is
-    left."""
+    """Mean and variance of all hypotheses by their probabilities, forces and own variances; the first's own is what is left.
+    The brake that drifts counts in the variance about what is told and does not move it."""
     state, _, _ = clamped
     s, rng = state[0], np.random.default_rng(3)
     h, spread = np.zeros(STATES), 40.0
@@ -203,7 +206,8 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
         variances.append(force_variance(a["covariance"], h))
         odds.append(np.exp(a["log_odds"]))
     weights = np.array(odds) / np.sum(odds)
-    mean = weights @ forces
+    apart = np.array(forces) - forces[0]
+    mean = forces[0] + weights[: 1 + DRIFT] @ apart[: 1 + DRIFT]
     variance = weights @ variances + weights @ (np.array(forces) - mean) ** 2
     assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
     assert s["alternatives"]["share"] == pytest.approx(weights[1:])
@@ -260,14 +264,14 @@ def _weighed(log_odds, first, second, times=1):
     a = new_state()["alternatives"][0, 0]
     a["log_odds"] = log_odds
     for _ in range(times):
-        weigh(a, PRIOR_ODDS, first, 1.0, second, 1.0)
+        weigh(a, PRIOR_ODDS, 100.0, first, 1.0, second, 1.0)
     return float(a["log_odds"])
 
 
 def test_odds_are_likelihood_ratios_of_the_same_torque():
     assert _weighed(0.0, 2.0, 1.0) == pytest.approx(1.5)
     a = new_state()["alternatives"][0, 0]
-    weigh(a, PRIOR_ODDS, 1.0, 4.0, 1.0, 1.0)
+    weigh(a, PRIOR_ODDS, 100.0, 1.0, 4.0, 1.0, 1.0)
     assert a["log_odds"] == pytest.approx(0.125 - 0.5 + 0.5 * np.log(4.0))
 
 
@@ -307,6 +311,14 @@ def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):
     assert not settle(s, p, False, 0.004)
     assert settle(s, p, True, 0.004)
     assert np.array_equal(s["covariance"], s["alternatives"][TORQUE_JUMP]["covariance"])
+
+
+def test_a_brake_that_drifts_is_never_proven(p, opened):
+    """What it explains, a torque constant or a friction within their priors explains as well."""
+    s = opened[0]
+    s["alternatives"]["log_odds"][DRIFT] = most_odds(DRIFT)
+    assert not suspected(s) and unproven(s) == 0.0
+    assert not settle(s, p, True, 30.0) and s["alternatives"]["log_odds"][DRIFT] == most_odds(DRIFT)
 
 
 def test_two_that_are_alike_wait_for_more_strokes(p, opened):

@@ -8,10 +8,12 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
+    DRIFT,
     fold,
     learn,
     least_odds,
     mix,
+    most_odds,
     open_again,
     open_all,
     place,
@@ -35,7 +37,15 @@ from emb_daemon.estimator.status import (
     RESOLVER_IMPLAUSIBLE,
     TORQUE_OLD,
 )
-from emb_daemon.estimator.unknown import HOUSING_S, SLOW_RAD_PER_S, WINDING_S, set_walks, softening_sigma, torque_offset
+from emb_daemon.estimator.unknown import (
+    HOUSING_S,
+    SLOW_RAD_PER_S,
+    WINDING_S,
+    add_drift_walks,
+    set_walks,
+    softening_sigma,
+    torque_offset,
+)
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
@@ -126,6 +136,8 @@ def _predict(s, p, m, spread, warmth, known):
     predict_errors(s.error, s.covariance, decay, noise_decay, noise, walked)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
+        if kind == DRIFT and not known:
+            add_drift_walks(walked, p, m.wheel_speed != 0.0, m.dt)
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
         place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
@@ -174,7 +186,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
-            weigh(a, least_odds(kind), first, variance, second, variance_a)
+            weigh(a, least_odds(kind), most_odds(kind), first, variance, second, variance_a)
         if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     return sqrt(moving + slow)

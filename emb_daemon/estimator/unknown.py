@@ -66,6 +66,11 @@ _MISSED, _MISSED_S = 0.3, 10.0
 #: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
 #: that moved), m; stiffness (thinnest pads, another compound) and motor torque, shares.
 _CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
+#: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
+#: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
+#: it stands, m per root of a second; stiffness and its walk, shares.
+_DRIFT_CONTACT_M, _DRIFT_WALK_M_PER_SQRT_S, _DRIFT_STANDING = 20e-6, 6e-6, 0.3
+_DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S = 0.03, 0.03 / 60.0
 #: Bounds of what can be learned: beyond them it is a fault.
 LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
@@ -189,6 +194,21 @@ def add_stiffness_jumps(P, p):
 def add_growth(P, p):
     """A disc that grows with heat, which the calibration does not know."""
     P[GROWTH, GROWTH] += (_GROWTH_JUMP_M_PER_K / p.gear_gain) ** 2
+
+
+@njit
+def add_drift(P, p):
+    """What a brake in service may differ by from its calibration without anything having happened to it."""
+    P[CONTACT, CONTACT] += (_DRIFT_CONTACT_M / p.gear_gain) ** 2
+    P[SCALE, SCALE] += _DRIFT_SCALE**2
+
+
+@njit
+def add_drift_walks(walked, p, turning, dt):
+    """Variance that such a brake's contact and stiffness gain in ``dt`` s beside `set_walks`; ``turning``: the disc."""
+    contact = _DRIFT_WALK_M_PER_SQRT_S / p.gear_gain * (1.0 if turning else _DRIFT_STANDING)
+    walked[CONTACT] += contact * contact * dt
+    walked[SCALE] += _DRIFT_SCALE_WALK_PER_SQRT_S**2 * dt
 
 
 @njit

@@ -152,9 +152,9 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 @njit
 def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
-    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque went up and down again, or
-    down and up, by more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may be
-    an offset of the current.
+    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque went up and down again,
+    or down and up, by more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may
+    be an offset of the current.
 
     ``moved``: whether the angle did at this sample; ``sigma``: standard deviation of the torque, N m."""
     if moved:
