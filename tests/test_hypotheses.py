@@ -13,8 +13,8 @@ from emb_daemon.estimator.hypotheses import (
     PRIOR_ODDS,
     STIFFNESS_JUMP,
     TORQUE_JUMP,
+    drift_odds,
     mix,
-    most_odds,
     open_again,
     open_all,
     settle,
@@ -316,9 +316,17 @@ def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):
 def test_a_brake_that_drifts_is_never_proven(p, opened):
     """What it explains, a torque constant or a friction within their priors explains as well."""
     s = opened[0]
-    s["alternatives"]["log_odds"][DRIFT] = most_odds(DRIFT)
+    s["alternatives"]["log_odds"][DRIFT] = drift_odds(s)[1]
     assert not suspected(s) and unproven(s) == 0.0
-    assert not settle(s, p, True, 30.0) and s["alternatives"]["log_odds"][DRIFT] == most_odds(DRIFT)
+    assert not settle(s, p, True, 30.0) and s["alternatives"]["log_odds"][DRIFT] == drift_odds(s)[1] > 5.0
+
+
+def test_a_drift_stays_possible_beside_a_change_that_is_all_but_certain(p, opened):
+    """A torque that has jumped explains what a stiffness that drifts would: until it is proven, one in five is left."""
+    s = opened[0]
+    s["alternatives"]["log_odds"][TORQUE_JUMP] = 50.0
+    least, most = drift_odds(s)
+    assert 0.1 < np.exp(least - 50.0) < 0.3 and most > 50.0
 
 
 def test_two_that_are_alike_wait_for_more_strokes(p, opened):

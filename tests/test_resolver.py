@@ -84,8 +84,8 @@ def test_an_offset_of_the_current_between_two_strokes_leaves_the_contact_angle(o
 
 @pytest.mark.parametrize("gain", [0.982, 1.018])
 def test_a_gain_error_of_the_resolver_is_covered_though_a_torque_constant_would_explain_it(gain):
-    """2 % of the angle are 4 % of the force and as much of the motor torque: nothing tells them apart, so sigma says it (beyond it: 6 %;
-    99 % without the hypothesis of a drift)."""
+    """2 % of the angle are 4 % of the force and as much of the motor torque: nothing tells them apart, so sigma says it.
+    Without the hypothesis of a drift 99 % lie beyond it."""
 
     def change(samples):
         samples["angle"] = samples["angle"][0] + gain * (samples["angle"] - samples["angle"][0])

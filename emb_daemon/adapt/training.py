@@ -13,6 +13,7 @@ from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import settle_paths
+from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
@@ -148,17 +149,18 @@ def apply_learned(s, p, scratch, rows, learned, a):
     path models to the last of ``rows``.
 
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that."""
-    kept, known = True, s.covariance[CONTACT, CONTACT]
+    angle is weighed against that, unless the pads have moved."""
+    known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
+    kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
         kept = kept and learned.curve[i] == p.curve[i]
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
-    contact, scale, gain = s.contact_angle, s.scale if kept else 1.0, s.error[GAIN]
+    scale, gain = s.scale if kept else 1.0, s.error[GAIN]
     gain_variance = s.covariance[GAIN, GAIN]
     first = max(0, len(rows) - _RUN_UP)
     scratch[0] = s
     t = scratch[0]
-    t.contact_angle = contact + weight * (a.contact_angle - contact)
+    t.contact_angle += weight * moved
     settle_paths(t, learned, rows[first], rows[first].factor)
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])

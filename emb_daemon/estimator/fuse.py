@@ -8,12 +8,13 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
+    CERTAIN_ODDS,
     DRIFT,
+    drift_odds,
     fold,
     learn,
     least_odds,
     mix,
-    most_odds,
     open_again,
     open_all,
     place,
@@ -186,7 +187,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
-            weigh(a, least_odds(kind), most_odds(kind), first, variance, second, variance_a)
+            least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), CERTAIN_ODDS)
+            weigh(a, least, most, first, variance, second, variance_a)
         if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     return sqrt(moving + slow)

@@ -62,7 +62,7 @@ _DRIFT_ODDS = -1.5
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
 #: Log odds that are as good as certainty.
-_CERTAIN_ODDS = 100.0
+CERTAIN_ODDS = 100.0
 #: Time after which an unproven jump is looked for anew, s.
 _OPENED_S = 1.0
 #: Time after which the stronger of two proven alternatives is taken though they are alike, and a merely suspected one given up
@@ -152,16 +152,18 @@ def _share_out(s):
 
 @njit
 def least_odds(kind):
-    """Log odds below which an alternative cannot fall, or a later change would have to make up for the past."""
+    """Log odds below which a change cannot fall, or a later one would have to make up for the past."""
     if kind == DRIFT:
         return _DRIFT_ODDS
     return _GROWTH_ODDS if kind == DISC_GROWTH else PRIOR_ODDS
 
 
 @njit
-def most_odds(kind):
-    """Log odds above which it cannot rise: a drift that has ended would have to make up for them."""
-    return -PRIOR_ODDS if kind == DRIFT else _CERTAIN_ODDS
+def drift_odds(s):
+    """Log odds between which those of a drift stay. Whatever is the likeliest, it may be what drifts that makes it so: until
+    that is proven, a share of it stays. And a drift that has ended would have to make up for too high ones."""
+    likeliest = max(_strongest(s, -1), 0.0)
+    return likeliest + _DRIFT_ODDS, likeliest - PRIOR_ODDS
 
 
 @njit

@@ -82,6 +82,12 @@ def torque_offset(p):
 
 
 @njit
+def contact_jump(p):
+    """Standard deviation of what the contact angle moves by at once, rad."""
+    return _CONTACT_JUMP_M / p.gear_gain
+
+
+@njit
 def thickening(caliper):
     """Factor by which friction's prior is wider at ``caliper`` degC than at the calibration's temperature."""
     return exp(min(max(_WARM_C - caliper, 0.0), 80.0) / _THICKENS_K)
@@ -186,7 +192,7 @@ def stay_possible(x, P, gain, p, contact_distance, scale, growth, faded):
 @njit
 def add_stiffness_jumps(P, p):
     """What may have changed at once between motor angle and force."""
-    P[CONTACT, CONTACT] += (_CONTACT_JUMP_M / p.gear_gain) ** 2
+    P[CONTACT, CONTACT] += contact_jump(p) ** 2
     P[SCALE, SCALE] += _SCALE_JUMP**2
 
 
