@@ -207,7 +207,7 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
         odds.append(np.exp(a["log_odds"]))
     weights = np.array(odds) / np.sum(odds)
     apart = np.array(forces) - forces[0]
-    mean = forces[0] + weights[: 1 + DRIFT] @ apart[: 1 + DRIFT]
+    mean = forces[0] + weights[: 1 + DRIFT] @ apart[: 1 + DRIFT] / (1.0 - weights[1 + DRIFT])
     variance = weights @ variances + weights @ (np.array(forces) - mean) ** 2
     assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
     assert s["alternatives"]["share"] == pytest.approx(weights[1:])

@@ -189,7 +189,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         if trusted:
             least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), CERTAIN_ODDS)
             weigh(a, least, most, first, variance, second, variance_a)
-        if abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
+        if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     return sqrt(moving + slow)
 
@@ -256,7 +256,8 @@ def take_sides(s, p, m, torque_sigma, out):
         spread = hypot(p.gear_gain * out.stiffness_sigma, torque_sigma)
         beyond = beyond_friction(torque, s.force, spread, p.gear_gain, load, coulomb)
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
-    if m.has_current and hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb):
+    swings = hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb) if m.has_current else 0
+    if swings > 1:
         disbelieve_resolver(c)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
     if s.torque_age >= _OLD_S:
@@ -288,6 +289,9 @@ def take_sides(s, p, m, torque_sigma, out):
         return facts | RESOLVER_IMPLAUSIBLE | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = hypot(out.sigma, out.innovation)
+    if swings > 0 and c.verdict == AGREE:
+        out.sigma = hypot(out.sigma, force - out.force)
+        facts |= PATHS_CONTRADICT
     if c.verdict == TORQUE_FROZEN:
         facts |= CURRENT_IMPLAUSIBLE
     elif c.verdict != AGREE:

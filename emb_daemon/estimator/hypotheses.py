@@ -174,11 +174,11 @@ def suspected(s):
 
 @njit
 def unproven(s):
-    """How far unproven alternatives may move the force, N: the largest of probability times difference."""
+    """How far unproven changes move the force, N: the largest of probability, if nothing drifts, times difference."""
     most = 0.0
     for kind in range(DRIFT):
         most = max(most, s.alternatives[kind].share * abs(s.alternatives[kind].shift))
-    return most
+    return most / (1.0 - s.alternatives[DRIFT].share)
 
 
 @njit
@@ -318,6 +318,7 @@ def mix(s, h, spread, warmth):
         variance += w * force_variance(a.covariance, h)
     to_force(h, spread, s.slope, s.force, warmth)
     variance += rest * force_variance(s.covariance, h)
-    # About what is told, which is the mean of all but one.
+    # About what is told, which is the mean if nothing drifts.
+    told /= 1.0 - s.alternatives[DRIFT].share
     square += told * (told - 2.0 * mean)
     return s.force + first + told, sqrt(variance + max(square, 0.0))

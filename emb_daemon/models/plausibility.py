@@ -152,15 +152,15 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 @njit
 def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
-    """Whether the motor must have turned though the angle has repeated to the bit: the smoothed torque went up and down again,
-    or down and up, by more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may
-    be an offset of the current.
+    """How often the motor must have turned though the angle has repeated to the bit: the smoothed torque went up or down by
+    more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may be an offset of
+    the current, there and back is none.
 
     ``moved``: whether the angle did at this sample; ``sigma``: standard deviation of the torque, N m."""
     if moved:
         c.held_low = c.held_high = c.torque_mean
         c.swing = c.swings = 0
-        return False
+        return 0
     c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
     carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
     if c.held_high - c.held_low > 2.0 * carried + _CERTAIN * sigma:
@@ -168,7 +168,7 @@ def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
         c.swings += way != c.swing
         c.swing = way
         c.held_low = c.held_high = c.torque_mean
-    return c.swings > 1
+    return c.swings
 
 
 @njit
