@@ -194,8 +194,7 @@ class Estimator:
 
         Args:
             angle_rad: motor angle, multi-turn, any zero; the pads are released and the motor stands for the first 0.1 s, or
-            the
-                contact counts as unknown until both are seen.
+                the contact counts as unknown until both are seen.
             speed_rad_per_s: motor speed, both at the sample.
             current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
             dt_s: time since the last sample; without meaning at the first call.
