@@ -46,7 +46,7 @@ def read_file(path: Path) -> bytes:
         raise InputError(f"{path}: {error.strerror}") from None
 
 
-def unpacked(path: Path, raw: bytes) -> bytes:
+def unpack_gzip(path: Path, raw: bytes) -> bytes:
     """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
     if raw[:2] != b"\x1f\x8b":
         return raw
@@ -148,7 +148,7 @@ def read_log(path: str | Path) -> Recorded:
     if ending != ".log" and ending not in _PYTHON_CAN:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
     raw = read_file(path)
-    content = unpacked(path, raw)
+    content = unpack_gzip(path, raw)
     frames, octets = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     if not len(frames):
         raise InputError(f"{path}: holds no frames")

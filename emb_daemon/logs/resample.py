@@ -175,7 +175,7 @@ SUBSTITUTES = {
 }
 
 
-def completed(name: str, signals: Signals) -> Signals:
+def fill_missing(name: str, signals: Signals) -> Signals:
     """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")

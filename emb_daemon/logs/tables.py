@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpacked
+from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
@@ -25,7 +25,7 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     """
     raw = read_file(path)
     ending = log_ending(path)
-    content, digest = unpacked(path, raw), hashlib.sha256(raw).hexdigest()
+    content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
     if ending in _MEASUREMENTS:
         return _channels(path, content, names), digest
     if ending not in (".csv", ".parquet"):

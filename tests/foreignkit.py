@@ -75,7 +75,7 @@ class Truth:
 
 
 def calibration() -> Calibration:
-    """The shipped calibration without effects: the stranger's brake has none."""
+    """The shipped calibration without effects: this brake has none."""
     return msgspec.structs.replace(emb_daemon.shipped_calibration(), effects={})
 
 
@@ -152,7 +152,7 @@ def write_campaign(folder: Path, **motions: np.ndarray) -> Path:
     (folder / "datasheet.yaml").write_text(sheet)
     parts = {"curves": [n for n in motions if n.startswith("curve")], "random": [n for n in motions if n.startswith("random")]}
     lines = [f"{part}: [{', '.join(f'{{log: {name}.parquet}}' for name in names)}]" for part, names in parts.items()]
-    (folder / "campaign.yaml").write_text("rig: stranger\ndatasheet: datasheet.yaml\n" + "\n".join(lines))
+    (folder / "campaign.yaml").write_text("rig: foreign\ndatasheet: datasheet.yaml\n" + "\n".join(lines))
     return folder / "campaign.yaml"
 
 
