@@ -18,7 +18,7 @@ from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, load_database
+from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
 from emb_daemon.wire.units import UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
@@ -138,6 +138,12 @@ class Mapping:
         signals = self._messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
+            [layout] = signal_columns(self._ours[message_name][1], message_name, (signal_name,))
+            if not layout["low"] <= mapped.value <= layout["high"]:
+                # No frame could carry it, and the message would never be heard.
+                self._fault(
+                    name, f"value: {mapped.value:g}; expected {layout['low']:g} to {layout['high']:g} {ours.unit or ''}"
+                )
             return None
         try:
             stated = self._their_unit(mapped.signal)
