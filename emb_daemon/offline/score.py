@@ -71,14 +71,16 @@ def is_turning(samples: np.ndarray) -> np.ndarray:
 
 
 def first_known(estimates: np.ndarray) -> int:
-    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing."""
+    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing. The first
+    of all if none does: then there is nothing else to judge."""
     return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
 
 
 def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
     """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference.
 
-    The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before."""
+    The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before, or all if the contact angle
+    is never known."""
     if not np.isfinite(reference_N).any():
         return {}
     masks, first = conditions(samples, estimates, reference_N), first_known(estimates)
@@ -91,7 +93,8 @@ def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.nd
             "conditions": {name: figures(error[mask]) for name, mask in masks.items() if mask.any()}
         }
     result["inside_two_sigma"] = share_inside(estimates["force"] - reference_N, estimates["sigma"])
-    result["unknown_samples"] = first
+    never = bool(np.all(estimates["reasons"] & CONTACT_UNCERTAIN))
+    result["unknown_samples"] = len(estimates) if never else first
     return result
 
 
