@@ -9,7 +9,7 @@ demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
 
 test: $(READY) lint
-	$(VENV)/bin/pytest -q
+	$(VENV)/bin/pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)

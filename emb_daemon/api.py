@@ -19,7 +19,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping as Mapping
-from emb_daemon.logs.resample import Series, completed, frames_of
+from emb_daemon.logs.resample import Series, fill_missing, frames_of
 from emb_daemon.offline import Log, corner_index, estimate, log_of
 from emb_daemon.offline import load_log as load_log
 from emb_daemon.resources import resource
@@ -132,7 +132,7 @@ def log_of_arrays(
     thermocouple = messages.get(f"EMB_{corner}_Thermocouple", {})
     if set(thermocouple) == {"CaliperTemp"}:
         raise InputError("caliper_C: expected inner_backplate_C or outer_backplate_C beside it")
-    return log_of(frames_of({name: completed(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
+    return log_of(frames_of({name: fill_missing(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
 
 
 def _series(name: str, time_ns: np.ndarray, values: np.ndarray) -> Series:
@@ -194,8 +194,7 @@ class Estimator:
 
         Args:
             angle_rad: motor angle, multi-turn, any zero; the pads are released and the motor stands for the first 0.1 s, or
-            the
-                contact counts as unknown until both are seen.
+                the contact counts as unknown until both are seen.
             speed_rad_per_s: motor speed, both at the sample.
             current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
             dt_s: time since the last sample; without meaning at the first call.

@@ -116,17 +116,17 @@ def main() -> None:
     attacks.append((f"{_FLOOD_PER_S} valid frames/s of any counter on one id", flood(frames, rng)))
     print(f"seed {arguments.seed}, {arguments.seconds:g} s\n")
     print("| attack | frames | taken | usable | off by over 3 sigma, N | off without a reason, N |\n|---|---|---|---|---|---|")
-    for name, strangers in attacks:
-        mixed = np.concatenate([frames, strangers])
+    for name, foreign in attacks:
+        mixed = np.concatenate([frames, foreign])
         order = np.argsort(mixed["time_ns"], kind="stable")
         taken = _taken(mixed[order], order >= len(frames), new_reception(), default_layout())
         estimates = _estimates(mixed[order])
-        estimates = estimates[estimates["time_ns"] >= strangers["time_ns"][0]]
+        estimates = estimates[estimates["time_ns"] >= foreign["time_ns"][0]]
         usable = estimates[estimates["mode"] != FAULT]
         off = np.abs(usable["force"] - np.interp(usable["time_ns"], good["time_ns"], good["force"]))
         wrong = off[off > 3.0 * usable["sigma"]]
         unsaid = off[usable["reasons"] == 0]
-        figures = (len(strangers), taken, len(usable) / len(estimates), wrong.max(initial=0.0), unsaid.max(initial=0.0))
+        figures = (len(foreign), taken, len(usable) / len(estimates), wrong.max(initial=0.0), unsaid.max(initial=0.0))
         print("| {} | {} | {} | {:.0%} | {:.0f} | {:.0f} |".format(name, *figures))
 
 

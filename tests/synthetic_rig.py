@@ -4,14 +4,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 
 from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.identify.calibration import nominal
-from emb_daemon.identify.campaign import Actuator, Datasheet, DiscNominal, PadNominal, Resolver
+from emb_daemon.identify.campaign import Actuator, Datasheet, Resolver
 from emb_daemon.identify.dynamics import RELAXATION, Pads, curve_keys, simulate
+from emb_daemon.identify.example import DATASHEET
 from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, PRESLIDING, TORQUE_CONSTANT
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
@@ -71,34 +74,19 @@ def draw(rng: np.random.Generator, thicknesses=(4.0, 9.0)) -> Truth:
 
 def datasheet(torque_constant: float, inertia: float, tolerance: float = 0.3) -> Datasheet:
     """Of an actuator with the synthetic rig's geometry, and of usual pads and disc."""
-    return Datasheet(
-        actuator=Actuator(
-            gear_gain_m_per_rad=GEAR_GAIN,
-            motor_torque_constant_Nm_per_A=torque_constant,
-            motor_torque_constant_tolerance=tolerance,
-            lumped_inertia_kg_m2=inertia,
-            lumped_inertia_tolerance=tolerance,
-            max_motor_speed_rad_per_s=200.0,
-            rated_clamp_force_N=20e3,
-            pad_clearance_rad=5.0,
-        ),
-        resolver=Resolver(counts_per_revolution=round(2.0 * np.pi / COUNT_RAD)),
-        pad=PadNominal(
-            thickness_mm=10.0,
-            frontal_area_m2=0.0046,
-            density_kg_per_m3=2450.0,
-            specific_heat_J_per_kgK=1200.0,
-            conductivity_W_per_mK=1.2,
-        ),
-        disc=DiscNominal(
-            mass_kg=5.6,
-            specific_heat_J_per_kgK=480.0,
-            effective_radius_m=0.131,
-            cooling_area_m2=0.19,
-            conductivity_W_per_mK=50.0,
-        ),
-        friction_coefficient=0.39,
+    actuator = Actuator(
+        gear_gain_m_per_rad=GEAR_GAIN,
+        motor_torque_constant_Nm_per_A=torque_constant,
+        motor_torque_constant_tolerance=tolerance,
+        lumped_inertia_kg_m2=inertia,
+        lumped_inertia_tolerance=tolerance,
+        max_motor_speed_rad_per_s=200.0,
+        rated_clamp_force_N=20e3,
+        pad_clearance_rad=5.0,
     )
+    usual = load_yaml(Path("example"), Datasheet, DATASHEET)
+    resolver = Resolver(counts_per_revolution=round(2.0 * np.pi / COUNT_RAD))
+    return msgspec.structs.replace(usual, actuator=actuator, resolver=resolver)
 
 
 def _slow(travel: float, seconds: float = 24.0) -> np.ndarray:

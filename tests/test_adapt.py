@@ -101,24 +101,27 @@ def test_the_estimate_goes_on_during_training(drives):
     assert not estimates["adapt_request"].any()
 
 
-def test_replay_gives_the_same_bytes_again(rig, tmp_path):
-    log = rig / "static" / "gear_new_training.log.gz"
-    sent, files = [], []
-    for name in ("one", "two"):
-        replay = Replay(adaptkit.shipped(pad_thickness_mm=9.5), state=tmp_path / name)
-        sent.append(np.concatenate(list(replay.frames(log))))
-        files.append((tmp_path / name / "adaptation-FL.json").read_bytes())
-    assert np.array_equal(sent[0], sent[1])
-    assert files[0] == files[1]
+def replayed(rig, folder):
+    """Frames sent in a training on a new gear with too thin pads in the calibration, and the state file's bytes."""
+    replay = Replay(adaptkit.shipped(pad_thickness_mm=9.5), state=folder)
+    sent = np.concatenate(list(replay.frames(rig / "static" / "gear_new_training.log.gz")))
+    return sent, (folder / "adaptation-FL.json").read_bytes()
 
 
-def test_the_helper_thread_changes_no_byte(rig, tmp_path):
+@pytest.fixture(scope="module")
+def once(rig, tmp_path_factory):
+    return replayed(rig, tmp_path_factory.mktemp("once"))
+
+
+def test_replay_gives_the_same_bytes_again(rig, once, tmp_path):
+    sent, file = replayed(rig, tmp_path)
+    assert np.array_equal(sent, once[0]) and file == once[1]
+
+
+def test_the_helper_thread_changes_no_byte(rig, once, tmp_path):
     """The daemon's way, evaluation in another thread, in batches of another size, against replay's."""
     frames = read_frames(rig / "static" / "gear_new_training.log.gz")
     calibration = adaptkit.shipped(pad_thickness_mm=9.5)
-    expected = np.concatenate(
-        list(Replay(calibration, state=tmp_path / "replay").frames(rig / "static" / "gear_new_training.log.gz"))
-    )
     parameters = np.zeros(4, PARAMETERS)
     parameters[0] = to_parameters(calibration)
     learner = Adaptation({"FL": calibration}, Memory(tmp_path / "thread"), int, threaded=True)
@@ -136,7 +139,7 @@ def test_the_helper_thread_changes_no_byte(rig, tmp_path):
             while not adapter["evaluation_ready"] and learner._done.empty() and time.monotonic() < patience:
                 time.sleep(0.01)
     learner.close(pipeline.states, pipeline.parameters)
-    assert np.array_equal(np.concatenate(sent), expected)
+    assert np.array_equal(np.concatenate(sent), once[0])
     assert learner.current("FL") is not None
     assert Memory(tmp_path / "thread").read("FL").current is not None
 

@@ -58,7 +58,7 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_key_of_the_files_has_a_meaning():
-    for name in ("calibration.md", "configuration.md"):
+    for name in ("calibration.md", "configuration.md", "mapping.md", "campaign.md"):
         rows = [line for line in (_ROOT / "docs" / name).read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
         assert len(rows) > 8 and all(row.split(" | ")[-1].strip(" |") for row in rows)
 

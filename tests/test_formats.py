@@ -148,6 +148,7 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
         ("EMB_FL_Resolver.MotorAngle", "EMB_FL_Resolver.Angle", "no such signal to map"),
         ("VEH_WheelSpeed.WheelSpeedFL: {value: 0.0}", "VEH_Status.AmbientTemp: {value: 20.0}", "ParkBrake: missing"),
         ("dbc: their.dbc", "dbc: none.dbc", "no such file"),
+        ("{value: 0.0}", "{value: 400.0}", "signals.VEH_WheelSpeed.WheelSpeedFL: value: 400; expected 0 to 204.75 rad/s"),
     ],
 )
 def test_a_faulty_mapping_is_refused_with_its_key(tmp_path, old, new, expected):

@@ -33,9 +33,9 @@ def undisturbed(car):  # noqa: F811
     return _run(car, _merged(_good()))[0]
 
 
-def _undisturbed_by(car, strangers, undisturbed, detected=r.E2E_ERROR):  # noqa: F811
-    """Run with ``strangers`` among the frames; every sample's numbers must be the same to the bit. Returns the estimates."""
-    estimates, _ = _run(car, _merged(_good(), *strangers))
+def _undisturbed_by(car, foreign, undisturbed, detected=r.E2E_ERROR):  # noqa: F811
+    """Run with ``foreign`` among the frames; every sample's numbers must be the same to the bit. Returns the estimates."""
+    estimates, _ = _run(car, _merged(_good(), *foreign))
     assert np.all(estimates["is_sample"]) and len(estimates) == len(undisturbed)
     for name in ("cycle", "counter", "force", "sigma", "stiffness_force", "torque_force", "contact_angle", "disc", "mean"):
         assert estimates[name].tobytes() == undisturbed[name].tobytes(), name
@@ -56,8 +56,8 @@ _KNOWN = range(135, 380)
 @pytest.mark.parametrize("ahead", [1, 2])
 def test_spoofed_frames_with_the_next_counter_come_too_early(car, undisturbed, ahead, delay_ms):  # noqa: F811
     """Valid CRC, the counter that is expected next: refused, and the genuine frame after it is taken."""
-    strangers = [_spoof(cycle, round(delay_ms * MS), cycle + ahead) for cycle in _KNOWN]
-    _undisturbed_by(car, strangers, undisturbed)
+    foreign = [_spoof(cycle, round(delay_ms * MS), cycle + ahead) for cycle in _KNOWN]
+    _undisturbed_by(car, foreign, undisturbed)
 
 
 @pytest.mark.parametrize("message", ["EMB_FL_Resolver", "EMB_FL_Current"])
@@ -125,8 +125,8 @@ def test_flood_of_ten_thousand_frames_a_second(car, undisturbed):  # noqa: F811
 def test_flood_with_valid_protection(car, undisturbed):  # noqa: F811
     """Every counter in turn, four within each cycle's first half: none comes when it may."""
     counters = itertools.count()
-    strangers = [_spoof(c, delay, next(counters)) for c in _KNOWN for delay in (300_000, 700_000, 1_100_000, 1_500_000)]
-    _undisturbed_by(car, strangers, undisturbed)
+    foreign = [_spoof(c, delay, next(counters)) for c in _KNOWN for delay in (300_000, 700_000, 1_100_000, 1_500_000)]
+    _undisturbed_by(car, foreign, undisturbed)
 
 
 @pytest.mark.parametrize("promise", [promises.noise, promises.hostile])
@@ -137,8 +137,8 @@ def test_promises_among_thousands_of_random_frames(promise, seed):
 
 
 def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811
-    strangers = [wirekit.frame("EMB_FL_ClampForce", cycle * CYCLE_NS + MS, cycle % 15) for cycle in _KNOWN]
-    _undisturbed_by(car, strangers, undisturbed, r.SECOND_SENDER)
+    foreign = [wirekit.frame("EMB_FL_ClampForce", cycle * CYCLE_NS + MS, cycle % 15) for cycle in _KNOWN]
+    _undisturbed_by(car, foreign, undisturbed, r.SECOND_SENDER)
 
 
 @pytest.mark.parametrize("first", [0, 200])

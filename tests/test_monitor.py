@@ -147,7 +147,8 @@ def test_a_script_gets_json_from_a_bus(capsys):
     assert list(corners) == ["FL"] and corners["FL"]["clamp_force_kN"] == 5.0 and corners["FL"]["forces_per_s"] > 0
 
 
-def test_nobody_there_is_said_and_the_status_is_1(capsys):
+def test_nobody_there_is_said_and_the_status_is_1(capsys, monkeypatch):
+    monkeypatch.setattr("emb_daemon.monitor.terminal._WAIT_S", 0.2)
     assert main(["monitor", "-i", "virtual", "-c", "nobody", "--once"]) == 1
     error = capsys.readouterr().err
     assert "no broadcast of a daemon" in error and error.count("\n") == 1

@@ -10,11 +10,13 @@ from synthetic_rig import draw, pads
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE
 from emb_daemon.offline import estimate
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.run import held, run_paths, run_step, stiffness_force
-from emb_daemon.offline.score import EpisodeErrors, figures, rmse, share_inside
+from emb_daemon.offline.score import EpisodeErrors, figures, force_figures, rmse, share_inside
 from emb_daemon.resources import resource
+from emb_daemon.wire import contract
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +146,16 @@ def test_a_given_derivative_does_what_difference_quotients_do():
 
 
 # -- score ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("known", "unknown"), [((), 10), ((4, 5, 6, 7, 8, 9), 4), (range(10), 0)])
+def test_samples_before_the_contact_is_known_are_counted_and_not_judged(known, unknown):
+    estimates, reference = np.zeros(10, ESTIMATE), np.full(10, 1000.0)
+    estimates["reasons"], estimates["source"] = contract.CONTACT_UNCERTAIN, contract.TORQUE_ONLY
+    estimates["reasons"][list(known)], estimates["source"][list(known)] = 0, contract.FUSED
+    found = force_figures(np.zeros(10, SAMPLE), estimates, reference)
+    assert found["unknown_samples"] == unknown
+    assert found["fused"]["samples"] == (10 - unknown if known else 10)
 
 
 def test_figures_of_known_errors():

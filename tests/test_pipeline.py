@@ -194,11 +194,11 @@ def test_after_a_tenth_of_a_second_of_silence_the_force_is_a_fault_until_the_nex
 
 def test_somebody_else_who_sends_our_messages_is_reported(car):
     log = _log()
-    stranger = np.zeros(1, FRAME)
-    stranger["can_id"], stranger["length"], stranger["time_ns"] = 0x200, 8, log["time_ns"][len(log) // 2]
-    estimates, _ = _run(car, np.insert(log, len(log) // 2, stranger))
+    foreign = np.zeros(1, FRAME)
+    foreign["can_id"], foreign["length"], foreign["time_ns"] = 0x200, 8, log["time_ns"][len(log) // 2]
+    estimates, _ = _run(car, np.insert(log, len(log) // 2, foreign))
     shown = (estimates["reasons"] & r.SECOND_SENDER) != 0
-    at = np.searchsorted(estimates["time_ns"], stranger["time_ns"][0], side="right")
+    at = np.searchsorted(estimates["time_ns"], foreign["time_ns"][0], side="right")
     assert shown[at] and not shown[: at - 1].any(), "from the next sample on"
     plain, _ = _run(car, log)
     assert np.array_equal(plain["force"], estimates["force"]), "and changes no force"

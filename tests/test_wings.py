@@ -20,8 +20,6 @@ _BOX = (
 _ABOVE = ("cli", "api", "__init__")
 #: Libraries of the extra `offline`.
 _OFFLINE = {"scipy", "pyarrow", "matplotlib", "plotly"}
-#: Arrows that are being taken out.
-_LEAVING: set[tuple[str, str]] = set()
 
 
 def _imports() -> dict[tuple[str, str], set[str]]:
@@ -45,7 +43,7 @@ def _imports() -> dict[tuple[str, str], set[str]]:
                     found[part, to].add(str(file.relative_to(_PACKAGE)))
                 if package in _OFFLINE | {"tests", "studies"}:
                     found[part, package].add(str(file.relative_to(_PACKAGE)))
-    return {edge: files for edge, files in found.items() if edge not in _LEAVING}
+    return found
 
 
 def test_the_box_knows_nothing_of_the_bench_and_each_floor_only_those_below():

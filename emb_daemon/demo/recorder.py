@@ -7,10 +7,10 @@ import numpy as np
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
-from emb_daemon.wire.contract import INVALID
+from emb_daemon.wire.contract import INVALID, STATUS_DEGRADED, STATUS_NOT_AVAILABLE
 from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, default_layout
+from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, PAD_TEMP, default_layout
 
 #: An answer that is this late belongs to a later sample with the same counter.
 _LATEST_CYCLES = COUNTER_MODULO - 1
@@ -89,17 +89,17 @@ class Recorder:
         return (data >> start & (1 << length) - 1) * factor + offset
 
     def status(self, row: int) -> int:
-        """Status of the clamp force as last heard, 15 before."""
+        """Status of the clamp force as last heard, not available before."""
         data = self.latest.get(int(self._ids[CLAMP_FORCE, CORNERS.index(self.corners[row])]))
-        return 15 if data is None else int(status_of(np.uint64(data)))
+        return STATUS_NOT_AVAILABLE if data is None else int(status_of(np.uint64(data)))
 
     def progress(self, row: int) -> float:
         """Progress of adaptation in percent while the daemon asks for training motion, NaN otherwise."""
         return self.value(ADAPT_REQUEST, row, 1) if self.value(ADAPT_REQUEST, row, 0) == 1.0 else np.nan
 
-    def recent_responses(self, row: int, cycles: int = 500) -> np.ndarray:
-        """Response times (s) of the last estimates of one corner."""
-        start = max(self.count - cycles * len(self.corners) * 2, 0)
+    def recent_responses(self, row: int) -> np.ndarray:
+        """Response times (s) of one corner's estimates of the last two seconds or so."""
+        start = max(self.count - 1000 * len(self.corners), 0)
         return self._matched(row, start, self.count)[3]
 
     def _matched(self, row: int, start: int, stop: int):
@@ -129,7 +129,7 @@ class Recorder:
             sigma_N=1e3 * columns["ClampForceSigma"][answers],
             true_N=self.truth["force"][at, row][answers],
             response_s=response[answers],
-            usable=(status <= 1)[answers] & (columns["ForceSource"] != INVALID)[answers],
+            usable=(status <= STATUS_DEGRADED)[answers] & (columns["ForceSource"] != INVALID)[answers],
             samples=int(np.count_nonzero(self.sent_ns)),
         )
 
@@ -137,8 +137,8 @@ class Recorder:
         """Pad temperatures that one corner's daemon broadcast: (time in s, columns in degC), where they were usable."""
         frames, cycle = self.frames[: self.count], self.frame_cycle[: self.count]
         columns = Decoder().columns(frames, f"EMB_{self.corners[row]}_PadTemp")
-        cycle = cycle[np.isin(frames["can_id"], self._ids[1, CORNERS.index(self.corners[row])])]
-        usable = (columns["Status"] <= 1) & (cycle > 0)
+        cycle = cycle[np.isin(frames["can_id"], self._ids[PAD_TEMP, CORNERS.index(self.corners[row])])]
+        usable = (columns["Status"] <= STATUS_DEGRADED) & (cycle > 0)
         at = cycle[usable] - 1
         time = 1e-9 * (self.truth["time_ns"][at, row] - self.truth["time_ns"][0, row])
         return time, {name: values[usable] for name, values in columns.items()}

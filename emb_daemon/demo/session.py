@@ -27,14 +27,16 @@ from emb_daemon.wire.layout import CORNERS
 
 _VIEW_S, _LINE_S = 0.25, 3.0
 _DAEMON_PRIORITY = 60
+#: Of the brakes' tolerances and of all noise.
+_SEED = 1
 
 
 class _LastMessages(logging.Handler):
     """The daemon's last log lines, for the view."""
 
-    def __init__(self, count: int = 4):
+    def __init__(self):
         super().__init__()
-        self.lines: deque[str] = deque(maxlen=count)
+        self.lines: deque[str] = deque(maxlen=4)
 
     def emit(self, record: logging.LogRecord) -> None:
         self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
@@ -46,14 +48,13 @@ class Session:
     Args:
         corners: 1 to 4, FL first.
         seconds: length of the drive.
-        seed: of the brakes' tolerances and of all noise.
 
     Attributes:
         recorder: truth and broadcasts.
         daemon, live: the daemon and the car, for their counts.
     """
 
-    def __init__(self, corners: int, seconds: float, seed: int = 1):
+    def __init__(self, corners: int, seconds: float):
         self.seconds = seconds
         names = CORNERS[:corners]
         self._folder = tempfile.TemporaryDirectory(prefix="emb-daemon-demo-")
@@ -62,11 +63,11 @@ class Session:
         config = Path(self._folder.name) / "emb.yaml"
         config.write_text("\n".join(["format: 1", "corners:", *lines, ""]), encoding="utf-8")
         setup = Setup(config)
-        plants = np.array([plant_from_calibration(setup.calibrations[name], seed + row) for row, name in enumerate(names)])
+        plants = np.array([plant_from_calibration(setup.calibrations[name], _SEED + row) for row, name in enumerate(names)])
         ours, theirs = socket_pair()
         self._buses = (ours, theirs)
         self.daemon = Daemon(setup, theirs)
-        self.live = LiveCar(Car(plants, names, seed), ours, city_drive())
+        self.live = LiveCar(Car(plants, names, _SEED), ours, city_drive())
         self.recorder = Recorder(names, seconds)
         self._stop = threading.Event()
         self._failures: list[BaseException] = []

@@ -9,12 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.wire.contract import MODES, PARK_RELEASED, SOURCES, reason_words
+from emb_daemon.monitor.view import STATUS_COLOURS
+from emb_daemon.wire.contract import MODES, PARK_RELEASED, SOURCES, STATUSES, reason_words
 from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
-_STATUS = {0: "ok", 1: "degraded", 2: "fault", 15: "n/a"}
-_STATUS_COLOURS = {0: "green", 1: "yellow", 2: "red", 15: "dim"}
 
 
 def phase(truth: np.void) -> str:
@@ -74,23 +73,9 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
         return Panel("starting", title="emb-daemon demo")
     truth = recorder.truth[recorder.cycles - 1]
     table = Table(box=None, header_style="bold", padding=(0, 1))
-    for heading in (
-        "",
-        "clamp force",
-        "",
-        "± 2σ",
-        "true*",
-        "source",
-        "status",
-        "mode",
-        "surface",
-        "mean",
-        "true*",
-        "adapting",
-    ):
-        table.add_column(
-            heading, justify="left" if heading in ("", "source", "status", "mode", "remark") else "right", no_wrap=True
-        )
+    for heading in ("", "clamp force", "", "± 2σ", "true*", "source", "status", "mode", "surface", "mean", "true*", "remark"):
+        justify = "left" if heading in ("", "source", "status", "mode", "remark") else "right"
+        table.add_column(heading, justify=justify, no_wrap=True)
     for row, corner in enumerate(recorder.corners):
         force = recorder.value(CLAMP_FORCE, row, 0)
         source, mode = recorder.value(CLAMP_FORCE, row, 3), recorder.value(ESTIMATOR_STATUS, row, 0)
@@ -103,7 +88,7 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
             f"{2.0 * recorder.value(CLAMP_FORCE, row, 1):.2f}",
             Text(f"{1e-3 * true['force']:.2f}", style="dim"),
             "" if math.isnan(source) else SOURCES.get(int(source), "?"),
-            Text(_STATUS.get(status, "?"), style=_STATUS_COLOURS.get(status, "red")),
+            Text(word := STATUSES.get(status, "?"), style=STATUS_COLOURS.get(word, "red")),
             "" if math.isnan(mode) else MODES[int(mode)],
             f"{recorder.value(PAD_TEMP, row, 0):.0f} °C",
             f"{recorder.value(PAD_TEMP, row, 1):.0f} °C",

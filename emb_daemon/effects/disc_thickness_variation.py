@@ -10,7 +10,8 @@ import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo
 from emb_daemon.jit import njit
-from emb_daemon.models.wheel import PULSE_MODULO, PULSES_PER_TURN, WHEEL, track
+from emb_daemon.models.wheel import WHEEL, track
+from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
 ORDERS = 4
 #: Those that discs commonly have.

@@ -8,9 +8,9 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.jit import njit
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 from emb_daemon.models.torque import friction_state, slid_angle, unexplained_torque
+from emb_daemon.wire.contract import CYCLE_S
 
-#: The current is averaged over this time before its sample (wire contract), s.
-CYCLE_S = 0.004
+#: Time between two samples up to which none is missing, s.
 ONE_CYCLE_S = 1.5 * CYCLE_S
 #: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
 DISSOLVING_PER_S = 0.05

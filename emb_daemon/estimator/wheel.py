@@ -5,8 +5,8 @@ from math import exp, pi
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
-PULSES_PER_TURN, PULSE_MODULO = 96, 4096
 #: Speed above which a wheel turns, rad/s, and a vehicle moves, m/s: sensors' noise at standstill stays below.
 TURNING_RAD_PER_S, _MOVING_M_PER_S = 0.5, 0.5
 #: Time over which pulses are counted into a speed, s.

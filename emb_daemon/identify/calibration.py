@@ -13,6 +13,7 @@ from emb_daemon.identify.judge import Judged
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.heat import nominal_thermal
 from emb_daemon.identify.text import rounded
+from emb_daemon.offline.score import PATHS
 
 
 def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: Sequence[float]) -> Calibration:
@@ -68,7 +69,7 @@ def provenance(
     now = datetime.datetime.fromtimestamp(int(epoch), datetime.UTC) if epoch else datetime.datetime.now(datetime.UTC)
     figures = {}
     for one in judged:
-        for path in ("stiffness", "torque", "maximum_likelihood", "fused"):
+        for path in PATHS:
             figures[f"{one.name}: {path} rmse_N"] = one.rmse_N(path)
         figures[f"{one.name}: inside_two_sigma"] = one.figures["inside_two_sigma"]
     sigmas = {key: sigma for step in steps for key, sigma in step.sigmas.items()}

@@ -16,9 +16,9 @@ from emb_daemon.calibration.types import Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
 from emb_daemon.logs.read import read_with_digest
-from emb_daemon.models.wheel import PULSES_PER_TURN
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import PULSES_PER_TURN
 from emb_daemon.wire.layout import load_database
 
 #: Relative tolerance of a datasheet's values where it states none: two standard deviations.
@@ -42,14 +42,18 @@ class Trial(Struct, kw_only=True):
 class Sine(Trial, kw_only=True):
     """Motor angle a sinusoid."""
 
+    #: Of the sinusoid.
     frequency_Hz: Positive
 
 
 class Training(Struct, kw_only=True):
     """Park brake training, and a log to judge on what is known then."""
 
+    #: Slow clamp and release with a small fast sinusoid on top, relative to the campaign.
     training: str
+    #: Random motor angle, to judge by.
     judge: str | None = None
+    #: The campaign's if it is left out.
     pad_thickness_mm: Positive | None = None
 
 

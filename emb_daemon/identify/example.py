@@ -27,7 +27,7 @@ BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "VFrameFormat" BO_ 2566844161 5;
 """
 
-_MAPPING = """# Where each of our signals comes from; see docs/mapping.md. What is left out is not measured, and is said.
+MAPPING = """# Where each of our signals comes from; see docs/mapping.md. What is left out is not measured, and is said.
 format: 1
 dbc: rig.dbc
 signals:
@@ -60,7 +60,7 @@ random:                       # a new motor angle every 100 ms
   - {log: random_2.log}
 """
 
-_DATASHEET = """# What the supplier states; see docs/campaign.md. Identification may find other values, within the tolerances.
+DATASHEET = """# What the supplier states; see docs/campaign.md. Identification may find other values, within the tolerances.
 actuator:
   gear_gain_m_per_rad: 3.98e-5        # clamp travel per radian of the motor
   motor_torque_constant_Nm_per_A: 0.052
@@ -95,7 +95,7 @@ def write_example(folder: Path) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: expected an empty folder, or none yet")
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {"rig.dbc": _DBC, "mapping.yaml": _MAPPING, "campaign.yaml": _CAMPAIGN, "datasheet.yaml": _DATASHEET}
+    texts = {"rig.dbc": _DBC, "mapping.yaml": MAPPING, "campaign.yaml": _CAMPAIGN, "datasheet.yaml": DATASHEET}
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
     plant = plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed=7)

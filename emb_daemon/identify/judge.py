@@ -11,12 +11,11 @@ from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, Campaign
 from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.offline import Log, estimate
-from emb_daemon.offline.score import force_figures
+from emb_daemon.offline.score import PATHS, force_figures
 from emb_daemon.report import BAND, MODEL, PALE, REFERENCE, Page, Panel, Trace, time_figure
 
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 _NEED_INTEGRATED = "training and braking heat at full frame rate"
-_PATHS = ("stiffness", "torque", "maximum_likelihood", "fused")
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def rows(judged: list[Judged]) -> list[list[str]]:
     return [
         [
             one.name,
-            *(f"{one.rmse_N(path):.0f}" for path in _PATHS),
+            *(f"{one.rmse_N(path):.0f}" for path in PATHS),
             f"{one.figures['fused']['bias']:+.0f}",
             f"{100 * one.figures['inside_two_sigma']:.1f}",
         ]

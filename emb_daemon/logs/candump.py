@@ -3,7 +3,7 @@
 import numpy as np
 
 from emb_daemon.jit import njit
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITTED
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _SPACE, _NEWLINE, _HASH = ord(" "), ord("\n"), ord("#")
 
@@ -90,8 +90,6 @@ def _parse_line(text, start, stop, frame, octets):
             at += 2
     if at < stop and text[at] == _SPACE:
         at += 1
-        if at < stop and text[at] == 84:  # T
-            flags |= TRANSMITTED
         while at < stop and text[at] != _SPACE:
             at += 1
     if at < stop or length > (64 if flags & FD else 8):
@@ -133,11 +131,11 @@ def parse_candump(text: bytes, octets: np.ndarray = _NOWHERE) -> tuple[np.ndarra
     return frames[:count], bad_line, unfinished
 
 
-def format_candump(frames: np.ndarray, interface: str = "can0") -> str:
-    """The same format back; classic data frames only, as the daemon sends them."""
+def format_candump(frames: np.ndarray) -> str:
+    """The same format back; classic data frames only, as the daemon sends them, on an interface called can0."""
     lines = []
     for frame in frames:
         seconds, fraction = divmod(int(frame["time_ns"]), 1_000_000_000)
         payload = int(frame["data"]).to_bytes(8, "little")[: frame["length"]].hex().upper()
-        lines.append(f"({seconds}.{fraction // 1000:06d}) {interface} {int(frame['can_id']):03X}#{payload}\n")
+        lines.append(f"({seconds}.{fraction // 1000:06d}) can0 {int(frame['can_id']):03X}#{payload}\n")
     return "".join(lines)

@@ -4,9 +4,13 @@ import numpy as np
 
 from emb_daemon.jit import njit
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import load_database, signal_columns, unpack
+
+#: How far a reference's frame may be from a sample that it belongs to: half a cycle.
+_NEAR_NS = CYCLE_NS // 2
 
 
 @njit
@@ -64,6 +68,21 @@ def absent_raw(length: int) -> int:
     return -(1 << (length - 1))
 
 
+def nearest(time_ns: np.ndarray, at_ns: np.ndarray) -> np.ndarray:
+    """Row of the ascending times that is nearest to each of ``at_ns``; there has to be one."""
+    after = np.clip(np.searchsorted(time_ns, at_ns), 0, len(time_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(time_ns[after] - at_ns) < np.abs(at_ns - time_ns[before]), after, before)
+
+
+def latest(time_ns: np.ndarray, values: np.ndarray, at_ns: np.ndarray) -> np.ndarray:
+    """Of values at ascending times the last one at or before each of ``at_ns``, NaN before the first."""
+    if not len(values):
+        return np.full(len(at_ns), np.nan)
+    row = np.searchsorted(time_ns, at_ns, side="right") - 1
+    return np.where(row >= 0, values[np.maximum(row, 0)], np.nan)
+
+
 class References:
     """What a rig's instruments measured at one corner; empty arrays where it has none, NaN where one of a message's
     instruments is missing. Identifies and judges only."""
@@ -81,18 +100,13 @@ class References:
             depths = np.array([pad[f"{side}PadTemp{depth}mm"] for depth in (2, 4, 6, 8)])
             self.pads[side.lower()] = (pad["time_ns"], depths)
 
-    def at(self, time_ns: np.ndarray, values: np.ndarray, tolerance_ns: int = 2_000_000) -> np.ndarray:
+    def at(self, time_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Force-rate reference ``values`` at sample times: those whose frame is the nearest, NaN where none is near."""
         if not len(self.time_ns):
             return np.full(len(time_ns), np.nan)
-        after = np.clip(np.searchsorted(self.time_ns, time_ns), 1, max(len(self.time_ns) - 1, 1))
-        after = np.minimum(after, len(self.time_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        nearer = np.where(np.abs(self.time_ns[after] - time_ns) < np.abs(self.time_ns[before] - time_ns), after, before)
-        near = np.abs(self.time_ns[nearer] - time_ns) <= tolerance_ns
-        return np.where(near, values[nearer], np.nan)
+        row = nearest(self.time_ns, time_ns)
+        return np.where(np.abs(self.time_ns[row] - time_ns) <= _NEAR_NS, values[row], np.nan)
 
     def latest(self, time_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Force-rate reference ``values`` last heard at each time, NaN before the first."""
-        row = np.searchsorted(self.time_ns, time_ns, side="right") - 1
-        return np.where(row >= 0, values[np.maximum(row, 0)], np.nan) if len(values) else np.full(len(time_ns), np.nan)
+        return latest(self.time_ns, values, time_ns)

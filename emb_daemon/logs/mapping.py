@@ -15,10 +15,10 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import NonNegative, Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
-from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, completed, frames_of, is_received, our_messages
+from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, load_database
+from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
 from emb_daemon.wire.units import UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
@@ -121,7 +121,7 @@ class Mapping:
         self._messages: dict[str, dict[str, _Source | float]] = {}
         for name, mapped in self._file.signals.items():
             self._add(name, mapped)
-        self._complete()
+        self._check_complete()
         if self._faults:
             raise InputErrors(self._faults)
 
@@ -138,6 +138,12 @@ class Mapping:
         signals = self._messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
+            [layout] = signal_columns(self._ours[message_name][1], message_name, (signal_name,))
+            if not layout["low"] <= mapped.value <= layout["high"]:
+                # No frame could carry it, and the message would never be heard.
+                self._fault(
+                    name, f"value: {mapped.value:g}; expected {layout['low']:g} to {layout['high']:g} {ours.unit or ''}"
+                )
             return None
         try:
             stated = self._their_unit(mapped.signal)
@@ -168,7 +174,7 @@ class Mapping:
         message, _, name = signal.rpartition(".")
         return self._theirs.get_message_by_name(message).get_signal_by_name(name).unit or ""
 
-    def _complete(self) -> None:
+    def _check_complete(self) -> None:
         """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
         corners = [corner for corner in CORNERS if self._sources(f"EMB_{corner}_Resolver")]
         if not corners and not self._faults:
@@ -213,7 +219,7 @@ class Mapping:
             raw, digest = read_table(path, sorted(wanted), self._file.time)
         else:
             recorded = read_log(path)
-            raw, digest = self._decoded(recorded, wanted), recorded.digest
+            raw, digest = self._decode(recorded, wanted), recorded.digest
         messages = {
             name: {
                 key: source.converted(*raw[source.name]) if isinstance(source, _Source) else source
@@ -221,7 +227,7 @@ class Mapping:
             }
             for name, signals in self._messages.items()
         }
-        frames = frames_of({name: completed(name, signals) for name, signals in messages.items()})
+        frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
         return frames, digest
@@ -234,7 +240,7 @@ class Mapping:
         messages = {name: self._theirs.get_message_by_name(name.rpartition(".")[0]) for name in names}
         return ", ".join(f"{name} ({message.frame_id:#x})" for name, message in messages.items())
 
-    def _decoded(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _decode(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Times and values of the rig's signals; one in a frame too short for it is left out."""
         found, frames = {}, recorded.frames
         by_message: dict[str, list[str]] = {}

@@ -16,7 +16,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, TRANSMITTED
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
 
@@ -24,6 +24,16 @@ _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".
 def _most_bytes() -> int:
     """Bytes of a log that this machine can hold, with what is made of them: a quarter of its memory."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
+def log_ending(path: Path) -> str:
+    """What decides a log's format: its last ending, before .gz."""
+    return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+
+
+def needs_extra(path: Path, error: ImportError) -> InputError:
+    """The error for a format of which a library is not installed."""
+    return InputError(f"{path}: this format needs an extra: pip install emb_daemon[mf4] ({error})")
 
 
 def read_file(path: Path) -> bytes:
@@ -36,7 +46,7 @@ def read_file(path: Path) -> bytes:
         raise InputError(f"{path}: {error.strerror}") from None
 
 
-def unpacked(path: Path, raw: bytes) -> bytes:
+def unpack_gzip(path: Path, raw: bytes) -> bytes:
     """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
     if raw[:2] != b"\x1f\x8b":
         return raw
@@ -95,12 +105,12 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
         for message in reader:
             octets += message.data
             flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
-            flags |= FD * message.is_fd | TRANSMITTED * (not message.is_rx)
+            flags |= FD * message.is_fd
             data = int.from_bytes(message.data[:8], "little")
             rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
         return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
     except ImportError as error:
-        raise InputError(f"{path}: reading this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+        raise needs_extra(path, error) from None
     except Exception as error:
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {error}") from None
 
@@ -134,11 +144,11 @@ def read_log(path: str | Path) -> Recorded:
         InputError: as `read_frames`.
     """
     path = Path(path)
-    ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    ending = log_ending(path)
     if ending != ".log" and ending not in _PYTHON_CAN:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
     raw = read_file(path)
-    content = unpacked(path, raw)
+    content = unpack_gzip(path, raw)
     frames, octets = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     if not len(frames):
         raise InputError(f"{path}: holds no frames")

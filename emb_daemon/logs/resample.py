@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right
+from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -98,7 +98,7 @@ class Series:
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
         # Straight on either side of the one corner in the period.
-        corner = np.clip(self.time_ns[self.nearest(at_ns)], at_ns - half, at_ns + half)
+        corner = np.clip(self.time_ns[nearest(self.time_ns, at_ns)], at_ns - half, at_ns + half)
         share = (corner - at_ns + half) / (2.0 * half)
         before, at, after = self._between(at_ns - half), self._between(corner), self._between(at_ns + half)
         mean = 0.5 * (share * (before + at) + (1.0 - share) * (at + after))
@@ -127,8 +127,8 @@ class Series:
             mean = (np.interp(end, edges, area) - np.interp(start, edges, area)) / np.maximum(end - start, 1.0)
         if self.is_ours:
             # A mean over our own cycle is one, whatever the jitter of its stamp.
-            nearest = self.nearest(middle)
-            mean = np.where(np.abs(self.time_ns[nearest] - middle) < CYCLE_NS // 4, self.values[nearest], mean)
+            row = nearest(self.time_ns, middle)
+            mean = np.where(np.abs(self.time_ns[row] - middle) < CYCLE_NS // 4, self.values[row], mean)
         return np.where(self._near(middle), mean, np.nan)
 
     def derivative(self) -> "Series":
@@ -153,14 +153,8 @@ class Series:
     def _near(self, at_ns: np.ndarray) -> np.ndarray:
         if not len(self.time_ns):
             return np.zeros(len(at_ns), bool)
-        apart = np.abs(self.time_ns[self.nearest(at_ns)] - at_ns)
+        apart = np.abs(self.time_ns[nearest(self.time_ns, at_ns)] - at_ns)
         return apart <= max(CYCLE_NS, _CARRIED_PERIODS * self.period_ns)
-
-    def nearest(self, at_ns: np.ndarray) -> np.ndarray:
-        """Row of the value nearest to each time."""
-        after = np.clip(np.searchsorted(self.time_ns, at_ns), 0, len(self.time_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        return np.where(np.abs(self.time_ns[after] - at_ns) < np.abs(at_ns - self.time_ns[before]), after, before)
 
 
 #: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig has not.
@@ -181,7 +175,7 @@ SUBSTITUTES = {
 }
 
 
-def completed(name: str, signals: Signals) -> Signals:
+def fill_missing(name: str, signals: Signals) -> Signals:
     """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")

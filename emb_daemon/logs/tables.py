@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs.read import read_file, unpacked
+from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
@@ -24,8 +24,8 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
         InputError: unreadable, or without one of the columns, or one that holds no numbers.
     """
     raw = read_file(path)
-    ending = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
-    content, digest = unpacked(path, raw), hashlib.sha256(raw).hexdigest()
+    ending = log_ending(path)
+    content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
     if ending in _MEASUREMENTS:
         return _channels(path, content, names), digest
     if ending not in (".csv", ".parquet"):
@@ -76,7 +76,7 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
     try:
         from asammdf import MDF
     except ImportError as error:
-        raise InputError(f"{path}: reading this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+        raise needs_extra(path, error) from None
     try:
         with MDF(io.BytesIO(content)) as file:
             start_ns = round(1e9 * file.header.start_time.timestamp())

@@ -10,7 +10,8 @@ import numpy as np
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.logs.columns import References
+from emb_daemon.logs.columns import References, latest
+from emb_daemon.logs.read import needs_extra
 from emb_daemon.wire.contract import MODES, SOURCES, reason_words
 from emb_daemon.wire.layout import CORNERS
 
@@ -69,10 +70,7 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
             columns[f"{name}_{depth}mm_C"] = e["depth"][:, side, index]
     columns["disc_C"] = e["disc"]
     columns["mode"] = np.array(MODES)[e["mode"]]
-    names = np.full(16, "", dtype=object)
-    for code, name in SOURCES.items():
-        names[code] = name
-    columns["source"] = names[e["source"]].astype(str)
+    columns["source"] = np.array([SOURCES.get(code, "") for code in range(16)])[e["source"]]
     raised, codes = np.unique(e["reasons"], return_inverse=True)
     columns["reasons"] = np.array(["; ".join(reason_words(value)) for value in raised])[codes]
     return columns
@@ -87,10 +85,8 @@ def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.nd
         "disc_ref_C": reference.latest(time_ns, reference.disc_C),
     }
     for side, (stamps, depths) in reference.pads.items():
-        row = np.searchsorted(stamps, time_ns, side="right") - 1
         for depth, values in zip((2, 4, 6, 8), depths, strict=True):
-            known = values[np.maximum(row, 0)] if len(values) else np.nan
-            columns[f"{side}_{depth}mm_ref_C"] = np.where(row >= 0, known, np.nan)
+            columns[f"{side}_{depth}mm_ref_C"] = latest(stamps, values, time_ns)
     return {name: values for name, values in columns.items() if np.isfinite(values).any()}
 
 
@@ -128,7 +124,7 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
     try:
         from asammdf import MDF, Signal
     except ImportError as error:
-        raise InputError(f"{path}: writing this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+        raise needs_extra(path, error) from None
     # A measurement's times count from its start: viewers add the two.
     start_s = np.floor(columns["time_s"][0]) if len(columns["time_s"]) else 0.0
     signals = []
@@ -175,7 +171,7 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
                         )
                     )
         except ImportError as error:
-            raise InputError(f"{path}: writing this format needs an extra: pip install emb_daemon[mf4] ({error})") from None
+            raise needs_extra(path, error) from None
         os.replace(part, path)
 
 

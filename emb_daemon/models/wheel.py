@@ -5,9 +5,8 @@ from math import floor, pi
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
-PULSES_PER_TURN = 96
-PULSE_MODULO = 4096
 #: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
 _CORRECTION = 0.2
 

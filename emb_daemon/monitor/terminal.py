@@ -11,6 +11,8 @@ from emb_daemon.errors import Unavailable
 from emb_daemon.monitor.listener import SECOND_NS, Listener
 
 _DRAIN_S, _DRAW_NS = 0.05, 250_000_000
+#: Patience until the first frame of a daemon that runs: it sends every 4 ms, but its bus may be coming up.
+_WAIT_S = 3.0
 
 
 @contextlib.contextmanager
@@ -37,9 +39,11 @@ def _keys():
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
-def _discard(bus) -> None:
-    """Frames that came while this program was still loading: the socket's buffer held some, and the gap after them is ours."""
+def _listener(bus) -> Listener:
+    """One that has heard nothing: of what came while this program was loading, the socket's buffer held a part only."""
+    listener = Listener()
     bus.drain()
+    return listener
 
 
 def watch(bus, title: str) -> None:
@@ -49,9 +53,8 @@ def watch(bus, title: str) -> None:
 
     from emb_daemon.monitor.view import render
 
-    listener, console = Listener(), Console()
+    listener, console = _listener(bus), Console()
     drawn_ns, paused = 0, False
-    _discard(bus)
     with _keys() as read, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
             key = read(_DRAIN_S)
@@ -69,22 +72,21 @@ def watch(bus, title: str) -> None:
                 live.update(render(listener, now, title, width, height, paused), refresh=True)
 
 
-def listen(bus, wait_s: float = 3.0, whole_seconds: int = 1) -> tuple[Listener, int]:
-    """Listen until ``whole_seconds`` of the clock's seconds were heard from beginning to end; returns listener and time.
+def listen(bus) -> tuple[Listener, int]:
+    """Listen until one of the clock's seconds was heard from beginning to end; returns listener and time.
 
     Raises:
-        Unavailable: nothing is heard within ``wait_s``.
+        Unavailable: nothing is heard for some seconds.
     """
-    listener, start = Listener(), time.monotonic_ns()
+    listener, start = _listener(bus), time.monotonic_ns()
     heard_ns = 0
-    _discard(bus)
     while True:
         bus.wait(_DRAIN_S)
         listener.hear(bus.drain())
         now = time.monotonic_ns()
         if not heard_ns and listener.heard:
             heard_ns = now
-        if heard_ns and now // SECOND_NS > heard_ns // SECOND_NS + whole_seconds:
+        if heard_ns and now // SECOND_NS > heard_ns // SECOND_NS + 1:
             return listener, now
-        if not heard_ns and now - start > wait_s * SECOND_NS:
-            raise Unavailable(f"bus: no broadcast of a daemon (0x200 to 0x233) within {wait_s:g} s; is one running on it?")
+        if not heard_ns and now - start > _WAIT_S * SECOND_NS:
+            raise Unavailable(f"bus: no broadcast of a daemon (0x200 to 0x233) within {_WAIT_S:g} s; is one running on it?")

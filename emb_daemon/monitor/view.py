@@ -14,7 +14,7 @@ _SILENT_S = 0.5
 _LINES_PER_CORNER = 5
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MODE_COLOURS = dict(zip(MODES, ("dim", "green", "cyan", "yellow", "bold red"), strict=True))
-_STATUS_COLOURS = {"ok": "green", "degraded": "yellow", "fault": "bold red", "not available": "dim"}
+STATUS_COLOURS = {"ok": "green", "degraded": "yellow", "fault": "bold red", "not available": "dim"}
 _MISSING = "–"
 
 
@@ -91,7 +91,7 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     if silent > _SILENT_S:
         third.append(f"SILENT for {silent:.0f} s; last values shown", style="bold red")
     else:
-        third.append(state["status"], style=_STATUS_COLOURS.get(state["status"], "red"))
+        third.append(state["status"], style=STATUS_COLOURS.get(state["status"], "red"))
         if state["input_age_ms"]:
             third.append(f"  {state['input_age_ms']} ms old", style="yellow")
     third.append(f"  {state['forces_per_s']:.0f}/s  ")

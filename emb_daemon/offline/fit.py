@@ -153,11 +153,11 @@ class _Problem:
         self.columns = [np.array([row[key] for key in block.keys], int) for block in blocks]
         self.logarithmic = np.array([f.logarithmic for f in free.values()])
         self.steps = np.array([f.step for f in free.values()])
-        self.start = self._searched([f.start for f in free.values()])
-        self.mean = self._searched([f.prior[0] if f.prior else f.start for f in free.values()])
+        self.start = self._to_vector([f.start for f in free.values()])
+        self.mean = self._to_vector([f.prior[0] if f.prior else f.start for f in free.values()])
         self.weight = np.array([1.0 / f.prior[1] if f.prior else 0.0 for f in free.values()])
 
-    def _searched(self, values):
+    def _to_vector(self, values):
         values = np.array(values, float)
         with np.errstate(divide="ignore"):
             return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
@@ -165,7 +165,7 @@ class _Problem:
     def bounds(self):
         limits = ([getattr(f, name) for f in self.free.values()] for name in ("low", "high"))
         low, high = (np.array(side, float) for side in limits)
-        return self._searched(np.where(self.logarithmic, np.maximum(low, 0.0), low)), self._searched(high)
+        return self._to_vector(np.where(self.logarithmic, np.maximum(low, 0.0), low)), self._to_vector(high)
 
     def values(self, x):
         values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)

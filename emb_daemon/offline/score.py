@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_daemon.logs.columns import References, latest
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
@@ -70,55 +71,48 @@ def is_turning(samples: np.ndarray) -> np.ndarray:
 
 
 def first_known(estimates: np.ndarray) -> int:
-    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing."""
+    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing. The first
+    of all if none does: then there is nothing else to judge."""
     return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
 
 
 def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
     """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference.
 
-    The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before."""
+    The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before, or all if the contact angle
+    is never known."""
     if not np.isfinite(reference_N).any():
         return {}
-    masks = conditions(samples, estimates, reference_N)
+    masks, first = conditions(samples, estimates, reference_N), first_known(estimates)
     result: dict = {}
     for path, column in PATHS.items():
         error = estimates[column] - reference_N
         if path == "fused":
-            error[: first_known(estimates)] = np.nan
+            error[:first] = np.nan
         result[path] = figures(error) | {
             "conditions": {name: figures(error[mask]) for name, mask in masks.items() if mask.any()}
         }
     result["inside_two_sigma"] = share_inside(estimates["force"] - reference_N, estimates["sigma"])
-    result["unknown_samples"] = first_known(estimates)
+    never = bool(np.all(estimates["reasons"] & CONTACT_UNCERTAIN))
+    result["unknown_samples"] = len(estimates) if never else first
     return result
 
 
-def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference) -> dict:
-    """Figures in K for each pad and depth and for the disc, at the reference's own times; empty without a reference.
-
-    ``reference`` is a `logs.columns.References`.
-    """
+def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: References) -> dict:
+    """Figures in K for each pad and depth and for the disc, at the reference's own times; empty without a reference."""
     result: dict = {}
     errors = []
     for side, name in enumerate(("inner", "outer")):
         at, values = reference.pads[name]
-        row = _latest(time_ns, at)
         for index, depth in enumerate((2, 4, 6, 8)):
-            error = np.where(row >= 0, estimates["depth"][row, side, index], np.nan) - values[index]
+            error = latest(time_ns, estimates["depth"][:, side, index], at) - values[index]
             errors.append(error)
             if np.isfinite(error).any():
                 result[f"{name}_{depth}mm"] = figures(error)
-    if errors and np.isfinite(np.concatenate(errors)).any():
+    if result:
         result["pads"] = figures(np.concatenate(errors))
-        row = _latest(time_ns, reference.time_ns)
-        result["disc"] = figures(np.where(row >= 0, estimates["disc"][row], np.nan) - reference.disc_C)
+        result["disc"] = figures(latest(time_ns, estimates["disc"], reference.time_ns) - reference.disc_C)
     return result
-
-
-def _latest(time_ns: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Row of the last sample at or before each time; -1 before the first."""
-    return np.searchsorted(time_ns, at, side="right") - 1
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,6 @@ ACCENT = "#0b5cad"
 INK = "#1d2430"
 MUTED = "#6b7480"
 GRID = "#e6e9ee"
-_WARM = "#c2662d"
-_PALE = "#9aa4b1"
 
 #: Points that a trace may have on the page; more cannot be told apart on a screen.
 SCREEN_POINTS = 3000
@@ -30,8 +28,7 @@ class Style:
 
 REFERENCE = Style(INK, 1.6)
 MODEL = Style(ACCENT, 1.4)
-THESIS = Style(_WARM, 1.2, "dot")
-PALE = Style(_PALE, 1.0)
+PALE = Style("#9aa4b1", 1.0)
 MARKS = Style(ACCENT, mode="markers")
 #: Between a trace and the one before it lies a pale band; give lower and upper edge in this style, lower first.
 BAND = Style("rgba(11,92,173,0.18)", 0.0)
@@ -56,7 +53,6 @@ class Panel:
     unit: str
     traces: list[Trace]
     height: int = 260
-    logarithmic: bool = False
 
 
 def decimate(x: np.ndarray, y: np.ndarray, points: int = SCREEN_POINTS) -> tuple[np.ndarray, np.ndarray]:
@@ -86,8 +82,8 @@ def shades(count: int) -> list[str]:
     return [f"rgb({','.join(str(round(v)) for v in light + s * (dark - light))})" for s in shares]
 
 
-def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, shared: bool):
-    from plotly.graph_objects import Figure, Scatter
+def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
+    from plotly.graph_objects import Scatter
     from plotly.subplots import make_subplots
 
     heights = [panel.height for panel in panels]
@@ -96,7 +92,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
     figure = make_subplots(
         rows=len(panels), cols=1, shared_xaxes=shared, vertical_spacing=gap / total if len(panels) > 1 else 0.0,
         row_heights=heights, subplot_titles=[panel.title for panel in panels],
-    ) if panels else Figure()  # fmt: skip
+    )  # fmt: skip
     shown: set[str] = set()
     for row, panel in enumerate(panels, start=1):
         band_open = False
@@ -128,9 +124,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
             if not (is_band and not band_open):
                 shown.add(trace.name)
             band_open = is_band and not band_open
-        figure.update_yaxes(title_text=panel.unit, type="log" if panel.logarithmic else "linear", row=row, col=1)
-        if x_log:
-            figure.update_xaxes(type="log", row=row, col=1)
+        figure.update_yaxes(title_text=panel.unit, row=row, col=1)
     figure.update_xaxes(title_text=x_title, row=len(panels), col=1)
     axis = {"gridcolor": GRID, "zeroline": False, "linecolor": "#b8c0ca", "ticks": "outside", "tickcolor": "#b8c0ca"}
     figure.update_xaxes(**axis)
@@ -150,11 +144,11 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, x_log: bool, sha
     return figure
 
 
-def time_figure(panels: list[Panel], x_title: str = "time / s"):
+def time_figure(panels: list[Panel]):
     """Panels over one time axis; zooming one zooms all. Data are decimated keeping peaks."""
-    return _figure(panels, x_title, reduce=True, x_log=False, shared=True)
+    return _figure(panels, "time / s", reduce=True, shared=True)
 
 
-def xy_figure(panels: list[Panel], x_title: str, *, x_log: bool = False, reduce: bool = False):
-    """Panels over a quantity other than time. ``reduce`` decimates lines whose x ascends."""
-    return _figure(panels, x_title, reduce=reduce, x_log=x_log, shared=len(panels) > 1)
+def xy_figure(panels: list[Panel], x_title: str):
+    """Panels over a quantity other than time."""
+    return _figure(panels, x_title, reduce=False, shared=len(panels) > 1)

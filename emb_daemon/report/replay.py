@@ -8,7 +8,7 @@ from emb_daemon import __version__
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.offline.score import PATHS, figures, share_inside
-from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, THESIS, Panel, Style, Trace, time_figure, xy_figure
+from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
@@ -18,6 +18,7 @@ _BINS = 120
 #: More than the travel of any brake past contact.
 _TRAVEL_RAD = 100.0
 _LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
+_STIFFNESS, _TORQUE = Style("#7fa7d1", 1.0), Style("#c2662d", 1.2, "dot")
 _INNER, _OUTER, _DISC = Style("#c2662d", 1.4), Style("#1b7f4b", 1.4), Style(INK, 1.2, "dot")
 _INNER_MEAN, _OUTER_MEAN = Style("#e3a982", 1.2), Style("#86bfa0", 1.2)
 _STRETCH = Style(MODEL.colour, 7.0)
@@ -38,24 +39,19 @@ def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.nd
     return begin, np.maximum(end, begin + least)
 
 
-def _row(name: str, time_s: np.ndarray, active: np.ndarray, height: float, style: Style) -> Trace:
+def _row(time_s: np.ndarray, active: np.ndarray, height: float, style: Style) -> Trace:
     begin, end = stretches(time_s, active)
     x = np.column_stack([begin, end, end]).ravel()
-    y = np.column_stack([np.full(len(begin), height), np.full(len(begin), height), np.full(len(begin), np.nan)]).ravel()
-    return Trace("", x, y, style)
+    return Trace("", x, np.tile([height, height, np.nan], len(begin)), style)
 
 
 def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]]:
     """A row for each mode, source and reason that occurs; lowest row first."""
-    rows: list[tuple[str, np.ndarray, Style]] = []
-    for bit in reversed(range(len(REASONS))):
-        rows.append((REASONS[bit], (estimates["reasons"] >> bit & 1).astype(bool), _REASON))
-    for code, name in reversed(SOURCES.items()):
-        rows.append((f"source: {name}", estimates["source"] == code, Style(PALE.colour, 7.0)))
-    for code, name in reversed(list(enumerate(MODES))):
-        rows.append((f"mode: {name}", estimates["mode"] == code, _STRETCH))
-    rows = [row for row in rows if row[1].any()]
-    traces = [_row(name, time_s, active, float(height), style) for height, (name, active, style) in enumerate(rows)]
+    rows = [(f"mode: {name}", estimates["mode"] == code, _STRETCH) for code, name in enumerate(MODES)]
+    rows += [(f"source: {name}", estimates["source"] == code, Style(PALE.colour, 7.0)) for code, name in SOURCES.items()]
+    rows += [(word, (estimates["reasons"] >> bit & 1).astype(bool), _REASON) for bit, word in enumerate(REASONS)]
+    rows = [row for row in reversed(rows) if row[1].any()]
+    traces = [_row(time_s, active, float(height), style) for height, (_, active, style) in enumerate(rows)]
     return Panel("Mode, source and reasons", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
 
 
@@ -64,8 +60,8 @@ def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> l
     traces = [
         Trace("", time_s, force - 2.0 * sigma_kN, BAND),
         Trace("± 2 sigma", time_s, force + 2.0 * sigma_kN, BAND),
-        Trace("stiffness path", time_s, 1e-3 * estimates["stiffness_force"], Style("#7fa7d1", 1.0)),
-        Trace("torque path", time_s, 1e-3 * estimates["torque_force"], THESIS),
+        Trace("stiffness path", time_s, 1e-3 * estimates["stiffness_force"], _STIFFNESS),
+        Trace("torque path", time_s, 1e-3 * estimates["torque_force"], _TORQUE),
         Trace("estimate", time_s, force, MODEL),
     ]
     panels = [Panel("Clamp force", "kN", traces, height=320)]
@@ -127,7 +123,7 @@ def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, by_log: list
     reach = max(1.0, float(np.percentile(np.abs(errors["estimate"]), 99.5)) * 1.5)
     edges = np.linspace(-reach, reach, _BINS + 1)
     centre = 0.5 * (edges[1:] + edges[:-1])
-    styles = {"estimate": MODEL, "stiffness path": Style("#7fa7d1", 1.2), "torque path": THESIS}
+    styles = {"estimate": MODEL, "stiffness path": _STIFFNESS, "torque path": _TORQUE}
     traces = [Trace(label, centre, _histogram(error, edges), styles[label]) for label, error in errors.items() if len(error)]
     section.figure(
         xy_figure([Panel("Distribution of the error", "% of samples", traces)], "error / N"),

@@ -7,4 +7,3 @@ import numpy as np
 FRAME = np.dtype([("time_ns", "i8"), ("data", "u8"), ("can_id", "u4"), ("length", "u1"), ("flags", "u1")], align=True)
 
 EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
-TRANSMITTED = 16

@@ -1,7 +1,7 @@
 """Promises of reception and pipeline, held to millions of frames at the speed of compiled code.
 
 Run as ``python tests/fuzz/promises.py [FRAMES] [SEED]``: ten million by default. A simulated drive is taken again and again,
-each time with other strangers and losses on the bus, drawn from the seed:
+each time with other foreign frames and losses on the bus, drawn from the seed:
 
 - *noise*: frames on any id, none of them with the right protection. Every genuine frame is taken, no other is, and the
   estimates are the same to the bit.
@@ -78,7 +78,7 @@ def _wrongly_protected(frames):
     return count
 
 
-def _strangers(rng: np.random.Generator, count: int, end_ns: int) -> np.ndarray:
+def _foreign(rng: np.random.Generator, count: int, end_ns: int) -> np.ndarray:
     frames = np.zeros(count, FRAME)
     frames["time_ns"] = np.sort(rng.integers(_START_NS, end_ns, count))
     frames["can_id"] = np.where(rng.random(count) < 0.9, rng.choice(_OURS, count), rng.integers(0, 2048, count))
@@ -94,31 +94,31 @@ def _merged(*parts: np.ndarray) -> np.ndarray:
 def noise(rng: np.random.Generator, seconds: float, rate: int) -> int:
     """One drive in unprotected noise; returns how many frames it had."""
     genuine = _drive(seconds)
-    strangers = _strangers(rng, round(rate * seconds), int(genuine["time_ns"][-1]))
-    strangers["length"] = rng.choice([0, 4, 7, 8, 8, 8, 8], len(strangers))
-    strangers["flags"] = np.where(rng.random(len(strangers)) < 0.8, 0, rng.integers(0, 16, len(strangers)))
-    _damage_all(strangers)
+    foreign = _foreign(rng, round(rate * seconds), int(genuine["time_ns"][-1]))
+    foreign["length"] = rng.choice([0, 4, 7, 8, 8, 8, 8], len(foreign))
+    foreign["flags"] = np.where(rng.random(len(foreign)) < 0.8, 0, rng.integers(0, 16, len(foreign)))
+    _damage_all(foreign)
     quiet, expected, _ = _run(genuine)
-    disturbed, estimates, _ = _run(_merged(genuine, strangers))
+    disturbed, estimates, _ = _run(_merged(genuine, foreign))
     assert len(estimates) == len(expected), "an estimate was lost or came besides"
     for name in _KEPT:
         assert estimates[name].tobytes() == expected[name].tobytes(), name
     taken = [pipeline.receptions["count"][:, ACCEPTED].tolist() for pipeline in (quiet, disturbed)]
     assert taken[0] == taken[1] and sum(taken[0]) > 0.9 * len(genuine), "a foreign frame was taken, or a genuine one was not"
-    return len(genuine) + len(strangers)
+    return len(genuine) + len(foreign)
 
 
 def hostile(rng: np.random.Generator, seconds: float, rate: int) -> int:
-    """One drive among protected strangers on a bad bus; returns how many frames it had."""
+    """One drive among protected foreign frames on a bad bus; returns how many frames it had."""
     genuine = _drive(seconds)
     kept = genuine[rng.random(len(genuine)) > rng.choice([0.0, 0.01, 0.3])].copy()
     doubled = kept[rng.random(len(kept)) < 0.02].copy()
     kept["time_ns"] += np.where(rng.random(len(kept)) < 0.01, rng.integers(0, 40_000_000, len(kept)), 0)
     kept["data"] ^= np.where(rng.random(len(kept)) < 0.01, rng.integers(0, 2**63, len(kept)), 0).astype(np.uint64)
-    strangers = _strangers(rng, round(rate * seconds * rng.choice([0.01, 0.1, 1.0])), int(genuine["time_ns"][-1]))
-    statuses = rng.choice([0, 0, 0, 1, 2, 15], len(strangers))
-    _protect_all(strangers, rng.integers(0, COUNTER_MODULO + 1, len(strangers)), statuses)
-    frames = _merged(kept, doubled, strangers)
+    foreign = _foreign(rng, round(rate * seconds * rng.choice([0.01, 0.1, 1.0])), int(genuine["time_ns"][-1]))
+    statuses = rng.choice([0, 0, 0, 1, 2, 15], len(foreign))
+    _protect_all(foreign, rng.integers(0, COUNTER_MODULO + 1, len(foreign)), statuses)
+    frames = _merged(kept, doubled, foreign)
     pipeline, estimates, sent = _run(frames)
     layout = default_layout()[0]
     for slot in range(SLOTS):

@@ -1,12 +1,12 @@
-"""`identify` on what a stranger has: a calibration of whatever there is, as good as it says, and a word on what is missing."""
+"""`identify` on what another rig has: a calibration as good as it says, and a word on what is missing."""
 
 import re
 import shlex
 from pathlib import Path
 
+import foreignkit
 import numpy as np
 import pytest
-import strangerkit
 
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
@@ -17,35 +17,35 @@ _PAGE = Path(__file__).parent.parent / "docs" / "own_actuator.md"
 
 
 def _clamp_only() -> np.ndarray:
-    motion = strangerkit.slow()
+    motion = foreignkit.slow()
     return motion[: int(np.argmax(motion))]
 
 
 def _in_contact() -> np.ndarray:
     """From a clamped brake to a clamped one."""
-    motion = strangerkit.slow()
-    return motion[round(4.0 / strangerkit.FINE_S) : round(20.0 / strangerkit.FINE_S)]
+    motion = foreignkit.slow()
+    return motion[round(4.0 / foreignkit.FINE_S) : round(20.0 / foreignkit.FINE_S)]
 
 
 @pytest.mark.parametrize(
     ("motions", "said", "most_N"),
     [
-        ({"curve": strangerkit.slow, "random": strangerkit.random}, "thermal: no log heats the pads", 30.0),
-        ({"random": strangerkit.random}, "thermal: no log heats the pads", 30.0),
-        ({"curve": strangerkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0),
+        ({"curve": foreignkit.slow, "random": foreignkit.random}, "thermal: no log heats the pads", 30.0),
+        ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0),
+        ({"curve": foreignkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0),
         ({"curve": _clamp_only}, "random: no usable log", 500.0),
         ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0),
     ],
     ids=["both", "random alone", "one slow curve", "apply alone", "no clearance"],
 )
 def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N):
-    campaign = strangerkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})
+    campaign = foreignkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})
     mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
     assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 0
     assert said in capsys.readouterr().err
     found = load_calibration(output)
-    for name, angle in (("stops", None), ("random_2", strangerkit.random(seed=2))):
-        table = strangerkit.write_table(tmp_path / f"{name}.parquet", strangerkit.sampled(strangerkit.truth(angle), 500.0))
+    for name, angle in (("stops", None), ("random_2", foreignkit.random(seed=2))):
+        table = foreignkit.write_table(tmp_path / f"{name}.parquet", foreignkit.sampled(foreignkit.truth(angle), 500.0))
         log = emb_daemon.load_log(table, read=Mapping(mapping).read)
         estimates = emb_daemon.run(log, found)
         error = (estimates["force"] - log.force_N)[1:]
@@ -54,7 +54,7 @@ def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said,
 
 
 def test_a_misspelt_log_is_an_error(tmp_path, capsys):
-    campaign = strangerkit.write_campaign(tmp_path)
+    campaign = foreignkit.write_campaign(tmp_path)
     campaign.write_text(campaign.read_text().replace("curves: []", "curves: [{log: slwo.parquet}]"))
     assert main(["identify", str(campaign), "--output", str(tmp_path / "found.yaml")]) == 2
     assert "curves[0].log: " in capsys.readouterr().err

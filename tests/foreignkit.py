@@ -6,6 +6,7 @@ kelvin.
 """
 
 import datetime
+import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from scipy.signal import lfilter
 import emb_daemon
 from emb_daemon.calibration.files import save_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.identify.example import DATASHEET, MAPPING
 
 #: Step of the truth, s; every sampling rate is a whole part of it.
 FINE_S = 0.0005
@@ -46,21 +48,6 @@ BA_ "VFrameFormat" BO_ 2566844161 5;
 BA_ "VFrameFormat" BO_ 2566844162 5;
 """
 
-MAPPING = """format: 1
-dbc: their.dbc
-signals:
-  EMB_FL_Resolver.MotorAngle: {signal: Drive.Position}
-  EMB_FL_Resolver.MotorSpeed: {signal: Drive.Speed}
-  EMB_FL_Current.CurrentQ: {signal: Drive.Iq, scale: -1.0}
-  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: Bench.Plate}
-  VEH_WheelSpeed.WheelSpeedFL: {value: 0}
-  VEH_WheelPulse.WheelPulseFL: {value: 0}
-  VEH_Status.ParkBrake: {value: 0}
-  VEH_Status.BrakeRequest: {value: 0}
-  VEH_Status.VehicleSpeed: {value: 0}
-  VEH_Status.AmbientTemp: {value: 22}
-  RIG_FL_Force.ClampForceRef: {signal: Bench.Load}
-"""
 #: The same of a table of the rig's columns, see `sampled`.
 COLUMNS = re.sub(r"dbc: .*", "time: {signal: time_s}", MAPPING)
 for _signal, _column in (
@@ -71,29 +58,6 @@ for _signal, _column in (
     ("Bench.Load", "force_N, unit: N"),
 ):
     COLUMNS = COLUMNS.replace(_signal, _column)
-
-DATASHEET = """actuator:
-  gear_gain_m_per_rad: {:g}
-  motor_torque_constant_Nm_per_A: {:g}
-  lumped_inertia_kg_m2: {:g}
-  max_motor_speed_rad_per_s: 300.0
-  rated_clamp_force_N: 20000.0
-  pad_clearance_rad: {:g}
-resolver: {{counts_per_revolution: 4096}}
-pad:
-  thickness_mm: 10.0
-  frontal_area_m2: 0.0046
-  density_kg_per_m3: 2450.0
-  specific_heat_J_per_kgK: 1200.0
-  conductivity_W_per_mK: 1.2
-disc:
-  mass_kg: 5.6
-  specific_heat_J_per_kgK: 480.0
-  effective_radius_m: 0.131
-  cooling_area_m2: 0.19
-  conductivity_W_per_mK: 50.0
-friction_coefficient: 0.39
-"""
 
 
 @dataclass(frozen=True)
@@ -111,7 +75,7 @@ class Truth:
 
 
 def calibration() -> Calibration:
-    """The shipped calibration without effects: the stranger's brake has none."""
+    """The shipped calibration without effects: this brake has none."""
     return msgspec.structs.replace(emb_daemon.shipped_calibration(), effects={})
 
 
@@ -163,7 +127,7 @@ def sampled(of: Truth, rate_Hz: float, means: bool = True, seed: int = 1) -> dic
 
 def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
     """DBC, mapping and calibration of the rig in ``folder``; returns the mapping's path."""
-    (folder / "their.dbc").write_text(DBC)
+    (folder / "rig.dbc").write_text(DBC)
     (folder / "mapping.yaml").write_text(mapping)
     save_calibration(calibration(), folder / "calibration.yaml")
     return folder / "mapping.yaml"
@@ -175,12 +139,20 @@ def write_campaign(folder: Path, **motions: np.ndarray) -> Path:
     write_rig(folder, COLUMNS)
     for name, angle in motions.items():
         write_table(folder / f"{name}.parquet", sampled(truth(angle), 500.0))
-    (folder / "datasheet.yaml").write_text(
-        DATASHEET.format(p["gear_gain"], 1.05 * p["torque_constant"], 0.95 * p["inertia"], 1.1 * p["clearance"])
-    )
+    stated = {
+        "gear_gain_m_per_rad": p["gear_gain"],
+        "motor_torque_constant_Nm_per_A": 1.05 * p["torque_constant"],
+        "motor_torque_constant_tolerance": 0.15,
+        "lumped_inertia_kg_m2": 0.95 * p["inertia"],
+        "max_motor_speed_rad_per_s": 300.0,
+        "rated_clamp_force_N": 20000.0,
+        "pad_clearance_rad": 1.1 * p["clearance"],
+    }
+    sheet = functools.reduce(lambda text, key: re.sub(rf"{key}: \S+", f"{key}: {stated[key]:g}", text), stated, DATASHEET)
+    (folder / "datasheet.yaml").write_text(sheet)
     parts = {"curves": [n for n in motions if n.startswith("curve")], "random": [n for n in motions if n.startswith("random")]}
     lines = [f"{part}: [{', '.join(f'{{log: {name}.parquet}}' for name in names)}]" for part, names in parts.items()]
-    (folder / "campaign.yaml").write_text("rig: stranger\ndatasheet: datasheet.yaml\n" + "\n".join(lines))
+    (folder / "campaign.yaml").write_text("rig: foreign\ndatasheet: datasheet.yaml\n" + "\n".join(lines))
     return folder / "campaign.yaml"
 
 

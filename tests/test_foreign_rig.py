@@ -1,11 +1,11 @@
-"""A rig that nobody here built, through every command that reads its logs: see `strangerkit`."""
+"""A rig that nobody here built, through every command that reads its logs: see `foreignkit`."""
 
 import json
 
+import foreignkit
 import numpy as np
 import pyarrow.parquet
 import pytest
-import strangerkit
 
 import emb_daemon
 from emb_daemon.cli.main import main
@@ -20,7 +20,7 @@ from emb_daemon.wire.contract import E2E_ERROR
 
 @pytest.fixture(scope="module")
 def truth():
-    return strangerkit.truth()
+    return foreignkit.truth()
 
 
 def _replay(folder, log, capsys, *options):
@@ -33,14 +33,14 @@ def _replay(folder, log, capsys, *options):
 @pytest.fixture(scope="module")
 def bus(truth, tmp_path_factory):
     """The rig's CAN FD log at 500 Hz."""
-    folder = tmp_path_factory.mktemp("stranger")
-    strangerkit.write_rig(folder)
-    return strangerkit.write_log(folder / "stops.blf", strangerkit.sampled(truth, 500.0))
+    folder = tmp_path_factory.mktemp("foreign")
+    foreignkit.write_rig(folder)
+    return foreignkit.write_log(folder / "stops.blf", foreignkit.sampled(truth, 500.0))
 
 
 def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
     log = load_log(bus, read=Mapping(bus.parent / "mapping.yaml").read)
-    at = log.time_ns * 1e-9 - strangerkit.START_S
+    at = log.time_ns * 1e-9 - foreignkit.START_S
     inside = at > 0.01
     for name, true in (("angle", truth.angle), ("speed", truth.speed), ("current_q", truth.current)):
         error = log.samples[name] - np.interp(at, truth.time_s, true)
@@ -51,10 +51,10 @@ def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
 
 @pytest.mark.parametrize("name", ["cut.log", "cut.asc"])
 def test_every_format_keeps_payloads_beyond_eight_octets(bus, truth, name):
-    columns = {key: values[:40] for key, values in strangerkit.sampled(truth, 500.0).items()}
+    columns = {key: values[:40] for key, values in foreignkit.sampled(truth, 500.0).items()}
     mapping = Mapping(bus.parent / "mapping.yaml")
-    log = load_log(strangerkit.write_log(bus.parent / name, columns), read=mapping.read)
-    expected = load_log(strangerkit.write_log(bus.parent / "cut.blf", columns), read=mapping.read)
+    log = load_log(foreignkit.write_log(bus.parent / name, columns), read=mapping.read)
+    expected = load_log(foreignkit.write_log(bus.parent / "cut.blf", columns), read=mapping.read)
     for key in ("angle", "speed", "current_q"):
         assert (
             np.abs(log.samples[key] - expected.samples[key]).max() < 0.03 < np.ptp(log.samples[key]) + 1.0 * (key == "angle")
@@ -77,11 +77,11 @@ def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):
 def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, means):
     """The rig's clock shows in neither path: acceleration, current and angle are of the same instants at every rate, in random
     motion as in stops. What a current of the moment does between two samples is unknown, so that it has stops alone."""
-    figures, motion = [], strangerkit.truth(strangerkit.random()) if means else truth
+    figures, motion = [], foreignkit.truth(foreignkit.random()) if means else truth
     for rate, as_means in ((250, True), (rate_Hz, means)):
-        text = strangerkit.COLUMNS if as_means else strangerkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
-        strangerkit.write_rig(tmp_path, text)
-        table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(motion, rate, as_means))
+        text = foreignkit.COLUMNS if as_means else foreignkit.COLUMNS.replace("unit: A", "unit: A, mean_ms: 0")
+        foreignkit.write_rig(tmp_path, text)
+        table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(motion, rate, as_means))
         figures.append(_replay(tmp_path, table, capsys)[0]["force_N"])
     ours, theirs = figures
     assert theirs["torque"]["rmse"] < 1.4 * ours["torque"]["rmse"] < 700.0
@@ -91,12 +91,12 @@ def test_any_sampling_rate_is_as_good_as_ours(truth, tmp_path, capsys, rate_Hz, 
 
 @pytest.mark.parametrize("rate_Hz", [100, 500, 1000])
 def test_our_own_layout_may_be_logged_at_any_rate(truth, tmp_path, capsys, rate_Hz):
-    columns = {key: values[: 4 * rate_Hz] for key, values in strangerkit.sampled(truth, rate_Hz).items()}
-    frames = strangerkit.our_frames(columns)
+    columns = {key: values[: 4 * rate_Hz] for key, values in foreignkit.sampled(truth, rate_Hz).items()}
+    frames = foreignkit.our_frames(columns)
     write_frames(tmp_path / "ours.log", frames)
     samples = load_log(tmp_path / "ours.log").samples
     assert "sampled at another rate than every 4 ms" in capsys.readouterr().err
-    at = samples["time_ns"] * 1e-9 - strangerkit.START_S
+    at = samples["time_ns"] * 1e-9 - foreignkit.START_S
     assert np.all(samples["dt"][1:] == 0.004) and not (samples["reasons"] & E2E_ERROR).any()
     assert np.abs(samples["angle"] - np.interp(at, truth.time_s, truth.angle)).max() < 0.05
     assert np.abs((samples["current_q"] - np.interp(at - 0.002, truth.time_s, truth.current))[2:].mean()) < 0.05
@@ -110,17 +110,17 @@ def test_our_own_layout_may_be_logged_at_any_rate(truth, tmp_path, capsys, rate_
 def test_columns_and_channels_are_logs(truth, tmp_path, name):
     if name.endswith("mf4"):
         pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
-    text = strangerkit.COLUMNS if not name.endswith("mf4") else strangerkit.COLUMNS.replace("time: {signal: time_s}\n", "")
-    strangerkit.write_rig(tmp_path, text)
-    columns = {key: values[:500] for key, values in strangerkit.sampled(truth, 250.0).items()}
-    samples = load_log(strangerkit.write_table(tmp_path / name, columns), read=Mapping(tmp_path / "mapping.yaml").read).samples
+    text = foreignkit.COLUMNS if not name.endswith("mf4") else foreignkit.COLUMNS.replace("time: {signal: time_s}\n", "")
+    foreignkit.write_rig(tmp_path, text)
+    columns = {key: values[:500] for key, values in foreignkit.sampled(truth, 250.0).items()}
+    samples = load_log(foreignkit.write_table(tmp_path / name, columns), read=Mapping(tmp_path / "mapping.yaml").read).samples
     assert len(samples) == 500 and np.abs(samples["angle"] - columns["angle_rad"]).max() < 1.1e-4
-    start_s = strangerkit.START_S if name.endswith("mf4") else 0.0
+    start_s = foreignkit.START_S if name.endswith("mf4") else 0.0
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
 
 
 def test_a_table_may_have_decimal_commas(tmp_path):
-    strangerkit.write_rig(tmp_path, strangerkit.COLUMNS)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = "".join(f"{0.004 * n:.3f};{0.1 * n:.1f};25.0;1.5;22;0\n".replace(".", ",") for n in range(100))
     (tmp_path / "a.csv").write_text("time_s;angle_rad;speed_rad_per_s;current_A;plate_C;force_N\n" + rows)
     samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
@@ -141,7 +141,7 @@ def test_a_table_may_have_decimal_commas(tmp_path):
 def test_a_faulty_table_is_refused_in_one_line(tmp_path, capsys, name, content, expected):
     if name.endswith("mf4"):
         pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
-    strangerkit.write_rig(tmp_path, strangerkit.COLUMNS)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     (tmp_path / name).write_text(content)
     assert main(["replay", str(tmp_path / name), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
     *_notes, line = capsys.readouterr().err.splitlines()
@@ -164,8 +164,8 @@ def _without(text: str, *words: str) -> str:
 )
 def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, left_out, said, reasons, most_N):
     """As far as the physics allows, and with a sigma that holds."""
-    strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, left_out))
-    table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, 250.0))
+    foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, left_out))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
     figures, notes = _replay(tmp_path, table, capsys)
     assert said in notes
     assert {word for word, share in figures["reasons"].items() if share > 0.9} == reasons
@@ -174,8 +174,8 @@ def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, l
 
 
 def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
-    strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, "RIG_"))
-    table = strangerkit.write_table(tmp_path / "stops.parquet", strangerkit.sampled(truth, 250.0))
+    foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "RIG_"))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
     out = tmp_path / "out.parquet"
     figures, _ = _replay(tmp_path, table, capsys, "--output", out)
     assert figures["force_N"] == {} and figures["temperature_K"] == {}
@@ -191,34 +191,34 @@ def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
 )
 def test_what_nothing_can_stand_in_for_is_a_fault(tmp_path, left_out, expected):
     with pytest.raises(InputErrors, match=expected):
-        Mapping(strangerkit.write_rig(tmp_path, _without(strangerkit.COLUMNS, *left_out)))
+        Mapping(foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, *left_out)))
 
 
 def test_an_angle_that_starts_anew_each_turn_is_put_together(truth, tmp_path):
-    columns = {key: values[:3000] for key, values in strangerkit.sampled(truth, 500.0).items()}
+    columns = {key: values[:3000] for key, values in foreignkit.sampled(truth, 500.0).items()}
     samples = []
     for name, period in (("whole", None), ("turn", 360.0)):
         degrees = np.degrees(columns["angle_rad"]) - 90.0
         mapped = "angle_rad, unit: deg" + (f", period: {period:g}" if period else "")
-        strangerkit.write_rig(tmp_path, strangerkit.COLUMNS.replace("angle_rad, unit: rad", mapped))
+        foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("angle_rad, unit: rad", mapped))
         table = columns | {"angle_rad": degrees % period if period else degrees}
-        path = strangerkit.write_table(tmp_path / f"{name}.parquet", table)
+        path = foreignkit.write_table(tmp_path / f"{name}.parquet", table)
         samples.append(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples["angle"])
     assert np.ptp(samples[0]) > 4.0 * np.pi and np.allclose(np.diff(samples[0]), np.diff(samples[1]), atol=4e-4)
 
 
 def test_a_caliper_is_no_pad(tmp_path):
-    text = strangerkit.COLUMNS.replace("InnerBackplateTemp", "CaliperTemp")
+    text = foreignkit.COLUMNS.replace("InnerBackplateTemp", "CaliperTemp")
     with pytest.raises(InputErrors, match="EMB_FL_Thermocouple: expected InnerBackplateTemp or OuterBackplateTemp"):
-        Mapping(strangerkit.write_rig(tmp_path, text))
+        Mapping(foreignkit.write_rig(tmp_path, text))
 
 
 def test_arrays_are_a_log(truth):
-    columns = strangerkit.sampled(truth, 100.0)
+    columns = foreignkit.sampled(truth, 100.0)
     time_s, force_N = columns["time_s"], columns["force_N"]
     motion = (columns["angle_rad"], columns["speed_rad_per_s"], columns["current_A"])
     log = emb_daemon.log_of_arrays(time_s, *motion, inner_backplate_C=22.0, wheel_speed_rad_per_s=0.0, force_N=force_N)
-    estimates = emb_daemon.run(log, strangerkit.calibration())
+    estimates = emb_daemon.run(log, foreignkit.calibration())
     error = (estimates["force"] - log.force_N)[1:]
     assert np.sqrt(np.nanmean(error**2)) < 40.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.93
     without = emb_daemon.log_of_arrays(time_s, columns["angle_rad"])
