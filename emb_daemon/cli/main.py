@@ -20,6 +20,7 @@ COMMANDS = {
     "diagnose": "find what the model lacks, add it, and show the error before and after",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
+    "compile": "the kernels as one library, for a daemon without a compiler",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }

@@ -1,0 +1,231 @@
+"""Kernels compiled ahead, as the daemon finds, checks and calls them: without numba, and without a compiler.
+
+A library is an ELF shared object followed by one line of JSON, the `Manifest`. It is used if it is whole, made from the very
+sources that are installed (those that mention `emb_daemon.jit` or make records), for this processor, and nobody else could
+have written it.
+"""
+
+import ctypes
+import hashlib
+import importlib.util
+import itertools
+import operator
+import os
+import platform
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.ahead.signature import Array, is_group
+from emb_daemon.bounded import read_bounded
+from emb_daemon.errors import InputError
+
+#: A source that mentions one of these takes part in compiled code.
+_MARKS = (b"emb_daemon.jit", b"emb_daemon.ahead.signature", b"np.dtype(")
+_FORMAT = 1
+#: A hundred times what a library of ours has.
+_MOST_BYTES = 20_000_000
+#: The library to use; empty: none.
+VARIABLE = "EMB_DAEMON_KERNELS"
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a library says of itself."""
+
+    format: int = _FORMAT
+    #: Of the ELF object before this line.
+    sha256: str
+    #: `source_digest` of what it was made from.
+    sources: str
+    #: As uname says it; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
+    machine: str
+    cpu: str
+    flags: tuple[str, ...]
+    #: Versions of emb_daemon, numba and llvmlite that made it.
+    made_by: str
+
+
+class Refused(Exception):
+    """A library that must not be used, and why."""
+
+
+def source_digest(package: Path) -> str:
+    """Of all sources in ``package`` that compiled code can depend on."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        if any(mark in content for mark in _MARKS):
+            digest.update(content)
+    return digest.hexdigest()[:16]
+
+
+def installed_digest() -> str:
+    """`source_digest` of this very package."""
+    return source_digest(Path(__file__).parent.parent)
+
+
+def who_else_writes(path: Path) -> str:
+    """Who else could have put something into a file or folder, or into its parent, whose content is executed; in words, empty
+    if nobody. What is root's is as good as one's own, and root may use what it likes."""
+    for place in (path, path.parent):
+        status = place.stat()
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            return f"{place} is writable by anybody"
+        if place == path and os.geteuid() != 0 and status.st_uid not in (0, os.geteuid()):
+            return f"{place} belongs to somebody else"
+    return ""
+
+
+def default_path() -> Path:
+    """Where ``emb-daemon compile`` puts the library and ``emb-daemon run`` looks for it."""
+    return Path(sys.prefix, "lib", "emb_daemon", "kernels.so")
+
+
+def seal(elf: bytes, **manifest) -> bytes:
+    """A library's bytes."""
+    return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Raises Refused for what is no library of ours or not whole; OSError."""
+    elf, _, line = read_bounded(path, _MOST_BYTES).rpartition(b"\n")
+    try:
+        manifest = msgspec.json.decode(line, type=Manifest)
+    except msgspec.DecodeError:
+        raise Refused("it is not whole, or no library that emb-daemon compile has made") from None
+    if manifest.format != _FORMAT or hashlib.sha256(elf).hexdigest() != manifest.sha256:
+        raise Refused("its content is damaged")
+    return manifest
+
+
+def _cpu_flags() -> set[str]:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        name, _, value = line.partition(":")
+        if name.strip().lower() in ("flags", "features"):
+            return set(value.split())
+    return set()
+
+
+def check(path: Path) -> Manifest:
+    """Raises Refused, with the reason, for a library that must not be used here; OSError."""
+    if why := who_else_writes(path):
+        raise Refused(why)
+    manifest = read_manifest(path)
+    if manifest.sources != (installed := installed_digest()):
+        raise Refused(f"it was made from other sources ({manifest.sources}) than are installed ({installed})")
+    if manifest.machine != platform.machine():
+        raise Refused(f"it is for {manifest.machine}, this is {platform.machine()}")
+    if lacking := set(manifest.flags) - _cpu_flags():
+        raise Refused(f"it is for {manifest.cpu}, this processor has no {', '.join(sorted(lacking))}")
+    return manifest
+
+
+_loaded: ctypes.CDLL | None = None
+_says = "kernels are compiled by numba"
+
+
+def load() -> str:
+    """Use the kernels of a library in this process: of the one that `VARIABLE` names, else that at `default_path`.
+
+    Before anything that has kernels is imported. Returns why a library that is there is not used, numba being used instead;
+    empty if one is used, or there is none.
+
+    Raises:
+        InputError: numba is not installed either.
+    """
+    global _loaded, _says
+    named = os.environ.get(VARIABLE)
+    path = Path(named) if named else default_path()
+    wanted = named != "" and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
+    why = ""
+    if wanted and (named or path.exists()):
+        try:
+            if "emb_daemon.jit" in sys.modules:
+                raise Refused("this process has others already")
+            manifest = check(path)
+            # What was left open by a linker that knew no libm is looked for among what is loaded.
+            ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
+            _loaded = ctypes.CDLL(str(path), mode=os.RTLD_NOW)
+            _says = f"kernels of {path}, compiled ahead for {manifest.cpu} by {manifest.made_by}"
+        except (Refused, OSError) as refusal:
+            why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
+    if _loaded is None and importlib.util.find_spec("numba") is None:
+        raise InputError(why or f"{path}: no such file, expected kernels that emb-daemon compile has made: numba is not installed")
+    return why
+
+
+def description() -> str:
+    """Which code runs, in words."""
+    return _says
+
+
+def in_use() -> bool:
+    """Whether this process runs the kernels of a library."""
+    return _loaded is not None
+
+
+def bind(name: str, takes: tuple, returns: int) -> Callable:
+    """The library's function ``name``, called like the Python function that it was made from.
+
+    An argument that is the same object as in the call before costs nothing: it is still where it was."""
+    function = getattr(_loaded, name)
+    # Words are passed as they are: conversion by declared types would cost more than the rest of the call.
+    function.restype, function.argtypes = ctypes.c_int, [ctypes.c_void_p, *itertools.chain.from_iterable(map(_words, takes))]
+    converters = [_converter(kind) for kind in takes]
+    known = [(object(), ())] * len(takes)
+    results = ctypes.c_int64 * max(returns, 1)
+
+    def call(*arguments):
+        words = []
+        for index, argument in enumerate(arguments):
+            pair = known[index]
+            if pair[0] is not argument:
+                known[index] = pair = argument, converters[index](argument)
+            words += pair[1]
+        result = results()
+        if function(result, *words):
+            raise ArithmeticError(f"{name} failed")
+        return tuple(result) if returns > 1 else result[0] if returns else None
+
+    return call
+
+
+def _words(kind) -> list:
+    """C types of an element of a signature."""
+    if is_group(kind):
+        return [word for part in kind for word in _words(part)]
+    if isinstance(kind, Array):
+        return [ctypes.c_void_p, *[ctypes.c_int64] * kind.dimensions]
+    return [{int: ctypes.c_int64, float: ctypes.c_double, bool: ctypes.c_int64}.get(kind, ctypes.c_void_p)]
+
+
+def _converter(kind) -> Callable:
+    """What makes C arguments of a Python one. Raises TypeError for another kind of argument."""
+    if is_group(kind):
+        parts = [_converter(part) for part in kind]
+        return lambda group: [word for convert, part in zip(parts, group, strict=True) for word in convert(part)]
+    if kind is float:
+        return lambda value: (float(value),)
+    if kind in (int, bool):
+        return lambda value: (operator.index(value),)
+    if isinstance(kind, Array):
+        dtype, dimensions = np.dtype(kind.dtype), kind.dimensions
+
+        def convert_array(array):
+            if array.dtype != dtype or array.ndim != dimensions or not array.flags.c_contiguous:
+                raise TypeError(f"expected a contiguous array of {dimensions} dimensions of {dtype.names or dtype}")
+            return (array.ctypes.data, *array.shape)
+
+        return convert_array
+
+    def convert_record(record):
+        # A record that is no view of an array has no address that stays.
+        if not isinstance(record, np.void) or record.dtype != kind or record.flags.owndata:
+            raise TypeError(f"expected a record within an array, of {kind.names}")
+        return (record.__array_interface__["data"][0],)
+
+    return convert_record

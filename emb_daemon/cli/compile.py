@@ -1,0 +1,39 @@
+"""emb-daemon compile."""
+
+import argparse
+import os
+import platform
+import tempfile
+from pathlib import Path
+
+from emb_daemon.ahead.library import default_path
+from emb_daemon.errors import InputError
+
+EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--output", type=Path, default=default_path(), metavar="FILE", help="library to write (%(default)s, where run looks)"
+    )
+    parser.add_argument(
+        "--target", default=platform.machine(), metavar="MACHINE", help="x86_64 or aarch64, or its triple (this machine)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    # What numba has optimised is for this processor, and what it finds in its cache has no text any more.
+    os.environ["NUMBA_OPT"] = "0"
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["NUMBA_CACHE_DIR"] = empty
+        from emb_daemon.ahead.build import TARGETS, build
+        from emb_daemon.jit import ENTRIES
+        from emb_daemon.runtime import bus, daemon
+
+        assert bus and daemon, "imported for their entry points"
+        target = TARGETS.get(arguments.target.partition("-")[0])
+        if target is None:
+            raise InputError(f"--target {arguments.target}: expected {' or '.join(TARGETS)}")
+        build(list(ENTRIES.values()), target, arguments.output)
+    print(f"{arguments.output}: kernels for {target.machine} ({target.cpu})")
+    return 0
