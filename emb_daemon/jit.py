@@ -60,9 +60,7 @@ if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
 
     def depend_on(source) -> None:
         if library.in_use():
-            raise RuntimeError(
-                f"{source}: kernels compiled ahead know nothing of it; {library.VARIABLE}= has numba used"
-            )
+            raise RuntimeError(f"{source}: kernels compiled ahead know nothing of it; {library.VARIABLE}= has numba used")
 
 else:
     from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit

@@ -45,8 +45,8 @@ TARGETS = {
     )
 }  # fmt: skip
 
-#: Arrays of numba's own memory free themselves by this; kernels have none, so that nothing is there to be freed.
-_NEVER = "define void @NRT_MemInfo_call_dtor(ptr %0) { call void @llvm.trap() ret void }\ndeclare void @llvm.trap()\n"
+#: What counts the owners of numba's arrays. Kernels make none, and nobody owns what they are given.
+_NO_OWNERS = "define void @NRT_incref(ptr %0) { ret void }\ndefine void @NRT_decref(ptr %0) { ret void }\n"
 #: What Python and numba have within a process, and a library has not.
 _HERE_ALONE = re.compile("_?Py|NRT_|_?numba")
 
@@ -88,24 +88,33 @@ def _wrapper(entry: Entry):
 
 
 def _lowered(entry: Entry) -> str:
-    """LLVM's text of an entry point with all that it calls, under its name in C."""
+    """LLVM's text of an entry point with all that it calls, and of what calls it with words in memory, under its name in C."""
     wrapper, kinds = _wrapper(entry)
     compiled = numba.njit(types.void(*kinds), nogil=True, error_model="numpy", no_cfunc_wrapper=True)(wrapper)
     [overload] = compiled.overloads.values()
-    words = {types.int64: "i64", types.float64: "double"}
-    arguments = [f"{words.get(kind, 'ptr')} %{index}" for index, kind in enumerate(kinds)]
+    kind_in_c = {types.int64: "i64", types.float64: "double"}
+    loads, arguments = [], ["ptr %words"]
+    for index, kind in enumerate(kinds[1:], entry.returns):
+        word = kind_in_c.get(kind, "ptr")
+        loads += [f"  %p{index} = getelementptr i64, ptr %words, i64 {index}", f"  %a{index} = load {word}, ptr %p{index}"]
+        arguments.append(f"{word} %a{index}")
     # numba's own functions return a status and take where to leave a result and an exception, of which there are none.
-    return f"""{overload.library._final_module}
-define i32 @{entry.name}({", ".join(arguments)}) {{
-  %nothing = alloca ptr
-  %status = call i32 @{overload.fndesc.llvm_func_name}(ptr %nothing, ptr %nothing, {", ".join(arguments)})
-  ret i32 %status
-}}"""
+    return "\n".join(
+        [
+            str(overload.library._final_module),
+            f"define i32 @{entry.name}(ptr %words) {{",
+            "  %nothing = alloca ptr",
+            *loads,
+            f"  %status = call i32 @{overload.fndesc.llvm_func_name}(ptr %nothing, ptr %nothing, {', '.join(arguments)})",
+            "  ret i32 %status",
+            "}",
+        ]
+    )
 
 
 def _merged(entries: list[Entry], triple: str):
     """One module of all entry points, in which nothing else can be seen from outside."""
-    whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NEVER}')
+    whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NO_OWNERS}')
     for entry in entries:
         # numba compiles for this machine; what it writes before it optimises is the same for all.
         text = re.sub(r'(?m)^target (datalayout|triple) = ".*"$', "", _lowered(entry))

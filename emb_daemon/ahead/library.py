@@ -8,12 +8,13 @@ have written it.
 import ctypes
 import hashlib
 import importlib.util
-import itertools
 import operator
 import os
 import platform
 import stat
+import struct
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -154,7 +155,9 @@ def load() -> str:
         except (Refused, OSError) as refusal:
             why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
     if _loaded is None and importlib.util.find_spec("numba") is None:
-        raise InputError(why or f"{path}: no such file, expected kernels that emb-daemon compile has made: numba is not installed")
+        raise InputError(
+            why or f"{path}: no such file, expected kernels that emb-daemon compile has made: numba is not installed"
+        )
     return why
 
 
@@ -168,48 +171,55 @@ def in_use() -> bool:
     return _loaded is not None
 
 
+class _Words(threading.local):
+    """What a function was called with last, and the same as C has it; each thread's own, since a function runs without the
+    interpreter's lock."""
+
+    def __init__(self, arguments: int, words: int):
+        self.known = [object()] * arguments
+        self.words = (ctypes.c_int64 * words)()
+        self.address = ctypes.c_void_p(ctypes.addressof(self.words))
+
+
 def bind(name: str, takes: tuple, returns: int) -> Callable:
     """The library's function ``name``, called like the Python function that it was made from.
 
     An argument that is the same object as in the call before costs nothing: it is still where it was."""
     function = getattr(_loaded, name)
-    # Words are passed as they are: conversion by declared types would cost more than the rest of the call.
-    function.restype, function.argtypes = ctypes.c_int, [ctypes.c_void_p, *itertools.chain.from_iterable(map(_words, takes))]
-    converters = [_converter(kind) for kind in takes]
-    known = [(object(), ())] * len(takes)
-    results = ctypes.c_int64 * max(returns, 1)
+    places, end = [], returns
+    for kind in takes:
+        begin, end = end, end + _size(kind)
+        places.append((slice(begin, end), _converter(kind)))
+    mine = _Words(len(takes), end)
 
     def call(*arguments):
-        words = []
+        known, words = mine.known, mine.words
         for index, argument in enumerate(arguments):
-            pair = known[index]
-            if pair[0] is not argument:
-                known[index] = pair = argument, converters[index](argument)
-            words += pair[1]
-        result = results()
-        if function(result, *words):
+            if known[index] is not argument:
+                place, convert = places[index]
+                words[place] = convert(argument)
+                known[index] = argument
+        if function(mine.address):
             raise ArithmeticError(f"{name} failed")
-        return tuple(result) if returns > 1 else result[0] if returns else None
+        return words[0] if returns == 1 else tuple(words[:returns])
 
     return call
 
 
-def _words(kind) -> list:
-    """C types of an element of a signature."""
+def _size(kind) -> int:
+    """Words of an element of a signature."""
     if is_group(kind):
-        return [word for part in kind for word in _words(part)]
-    if isinstance(kind, Array):
-        return [ctypes.c_void_p, *[ctypes.c_int64] * kind.dimensions]
-    return [{int: ctypes.c_int64, float: ctypes.c_double, bool: ctypes.c_int64}.get(kind, ctypes.c_void_p)]
+        return sum(map(_size, kind))
+    return 1 + kind.dimensions if isinstance(kind, Array) else 1
 
 
 def _converter(kind) -> Callable:
-    """What makes C arguments of a Python one. Raises TypeError for another kind of argument."""
+    """What makes words of an argument. Raises TypeError for another kind of argument."""
     if is_group(kind):
         parts = [_converter(part) for part in kind]
         return lambda group: [word for convert, part in zip(parts, group, strict=True) for word in convert(part)]
     if kind is float:
-        return lambda value: (float(value),)
+        return lambda value: struct.unpack("q", struct.pack("d", value))
     if kind in (int, bool):
         return lambda value: (operator.index(value),)
     if isinstance(kind, Array):
@@ -218,6 +228,7 @@ def _converter(kind) -> Callable:
         def convert_array(array):
             if array.dtype != dtype or array.ndim != dimensions or not array.flags.c_contiguous:
                 raise TypeError(f"expected a contiguous array of {dimensions} dimensions of {dtype.names or dtype}")
+            # Not __array_interface__, which describes every field in words.
             return (array.ctypes.data, *array.shape)
 
         return convert_array
@@ -226,6 +237,6 @@ def _converter(kind) -> Callable:
         # A record that is no view of an array has no address that stays.
         if not isinstance(record, np.void) or record.dtype != kind or record.flags.owndata:
             raise TypeError(f"expected a record within an array, of {kind.names}")
-        return (record.__array_interface__["data"][0],)
+        return (np.asarray(record).ctypes.data,)
 
     return convert_record

@@ -1,7 +1,8 @@
 """What an entry point takes, so that it can be compiled before it is called, and called without a compiler.
 
 A signature has one element for each argument: `Array`, a numpy dtype for one record of it, a named tuple of these, or ``int``,
-``float``, ``bool``. In C an array is a pointer followed by its dimensions, a record a pointer, a number itself.
+``float``, ``bool``. In C a function takes a pointer to words of eight bytes: first what it returns, then for an array its
+address and dimensions, for a record its address, for a number itself.
 """
 
 from typing import NamedTuple
