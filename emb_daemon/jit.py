@@ -3,10 +3,12 @@
 Everything that compiled code consists of is declared here: `njit` for what kernels call, `entry` for what Python calls in a
 tick. With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same records, which is how tests compare them.
 With a library (`emb_daemon.ahead.library.load`, before anything here is imported) the entry points are its functions, numba is
-not imported, and what else is called runs as plain Python.
+not imported, and what else is called runs as plain Python: so does everything where numba is not installed, fast enough to
+read and check files.
 """
 
 import functools
+import importlib.util
 import os
 from collections.abc import Callable
 
@@ -49,7 +51,7 @@ def _plain(function):
     return call
 
 
-if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or importlib.util.find_spec("numba") is None:
     njit = _plain
 
     def compiled_for_the_next_start() -> bool:

@@ -49,6 +49,7 @@ _FIGURES = {
         }
         for corners in (4, 16)
     ],
+    "kernels": None,
     "logs": {
         "seconds": 120.0,
         "frames": 100_000,

@@ -12,7 +12,6 @@ import subprocess
 import tempfile
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -20,30 +19,10 @@ import numba
 from numba import types
 
 from emb_daemon import __version__
-from emb_daemon.ahead.library import installed_digest, seal
+from emb_daemon.ahead.library import Target, seal
 from emb_daemon.ahead.signature import Array, Entry, is_group
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import Unavailable
-
-
-class Target(NamedTuple):
-    """``machine`` as uname says it; the ``cpu`` that LLVM compiles for, and the ``flags`` of /proc/cpuinfo that it takes."""
-
-    machine: str
-    triple: str
-    cpu: str
-    flags: tuple[str, ...]
-
-
-#: The oldest processors of each kind that a brake's computer has: x86-64-v2 is of 2009.
-TARGETS = {
-    target.machine: target
-    for target in (
-        Target("x86_64", "x86_64-unknown-linux-gnu", "x86-64-v2",
-               ("cx16", "lahf_lm", "popcnt", "pni", "sse4_1", "sse4_2", "ssse3")),
-        Target("aarch64", "aarch64-unknown-linux-gnu", "cortex-a53", ("fp", "asimd", "crc32")),
-    )
-}  # fmt: skip
 
 #: What counts the owners of numba's arrays. Kernels make none, and nobody owns what they are given.
 _NO_OWNERS = "define void @NRT_incref(ptr %0) { ret void }\ndefine void @NRT_decref(ptr %0) { ret void }\n"
@@ -151,47 +130,54 @@ def emit_object(entries: list[Entry], target: Target) -> bytes:
     return machine.emit_object(module)
 
 
-def _linkers(machine: str) -> list[list[str]]:
-    """Commands that link for ``machine``, the best first, as far as they are installed.
+def linker_for(machine: str) -> list[str]:
+    """A command that links for ``machine``, the best that is installed.
 
-    A compiler knows where libm is; what a bare linker leaves open is found when the library is loaded."""
-    own = machine == platform.machine()
-    prefix = "" if own else f"{machine}-linux-gnu-"
-    known = [[f"{prefix}{'cc' if own else 'gcc'}", "-shared", "-nostartfiles", "-Wl,-z,noexecstack,-z,now", "-lm"],
-             [f"{prefix}ld", "-shared", "-z", "noexecstack"], ["ld.lld", "-shared", "-z", "noexecstack"]]  # fmt: skip
-    return [command for command in known if shutil.which(command[0])]
-
-
-def link(elf: bytes, target: Target) -> bytes:
-    """The shared object of a relocatable one.
+    A compiler knows where libm is; what a bare linker leaves open is found when the library is loaded.
 
     Raises:
-        Unavailable: no linker is installed, or it fails; says which are known.
+        Unavailable: none is; says what has one.
     """
-    linkers = _linkers(target.machine)
-    if not linkers:
-        install = "gcc or binutils" if target.machine == platform.machine() else f"gcc-{target.machine}-linux-gnu or lld"
-        raise Unavailable(f"no linker for {target.machine} is installed: {install} has one")
+    own = machine == platform.machine()
+    prefix = "" if own else f"{machine}-linux-gnu-"
+    for command in (
+        [f"{prefix}{'cc' if own else 'gcc'}", "-shared", "-nostartfiles", "-Wl,-z,noexecstack,-z,now", "-lm"],
+        [f"{prefix}ld", "-shared", "-z", "noexecstack"],
+        ["ld.lld", "-shared", "-z", "noexecstack"],
+    ):
+        if shutil.which(command[0]):
+            return command
+    packages = "gcc or binutils" if own else f"gcc-{machine.replace('_', '-')}-linux-gnu or lld"
+    raise Unavailable(f"no linker for {machine} is installed: {packages} has one")
+
+
+def _linked(elf: bytes, command: list[str]) -> bytes:
+    """The shared object of a relocatable one. Raises Unavailable with what the linker says if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder, "kernels.o"), Path(folder, "kernels.so")
         source.write_bytes(elf)
         # The object before the libraries that it needs.
-        command = [linkers[0][0], str(source), *linkers[0][1:], "-o", str(library)]
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = subprocess.run([command[0], source, *command[1:], "-o", library], capture_output=True, text=True)
         if done.returncode:
-            raise Unavailable(f"{linkers[0][0]} cannot link the kernels: {done.stderr.strip()}")
+            raise Unavailable(f"{command[0]} cannot link the kernels: {done.stderr.strip()}")
         return library.read_bytes()
 
 
-def build(entries: list[Entry], target: Target, path: Path) -> None:
-    """Write the library of ``entries``. Raises Unavailable where nothing links for the target; OSError."""
+def build(entries: list[Entry], sources: str, target: Target, path: Path) -> None:
+    """Write the library of ``entries`` that were imported from ``sources`` (`library.source_digest`).
+
+    Raises:
+        Unavailable: nothing that is installed links for the target.
+        OSError: the file cannot be written.
+    """
+    linker = linker_for(target.machine)
+    path.parent.mkdir(parents=True, exist_ok=True)
     content = seal(
-        link(emit_object(entries, target), target),
-        sources=installed_digest(),
+        _linked(emit_object(entries, target), linker),
+        sources=sources,
         machine=target.machine,
         cpu=target.cpu,
         flags=target.flags,
         made_by=f"emb_daemon {__version__}, numba {numba.__version__}, llvmlite {llvmlite.__version__}",
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, content)

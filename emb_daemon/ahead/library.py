@@ -17,6 +17,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -32,6 +33,26 @@ _FORMAT = 1
 _MOST_BYTES = 20_000_000
 #: The library to use; empty: none.
 VARIABLE = "EMB_DAEMON_KERNELS"
+
+
+class Target(NamedTuple):
+    """``machine`` as uname says it; the ``cpu`` that LLVM compiles for, and the ``flags`` of /proc/cpuinfo that it takes."""
+
+    machine: str
+    triple: str
+    cpu: str
+    flags: tuple[str, ...]
+
+
+#: The oldest processors of each kind that a brake's computer has: x86-64-v2 is of 2009.
+TARGETS = {
+    target.machine: target
+    for target in (
+        Target("x86_64", "x86_64-unknown-linux-gnu", "x86-64-v2",
+               ("cx16", "lahf_lm", "popcnt", "pni", "sse4_1", "sse4_2", "ssse3")),
+        Target("aarch64", "aarch64-unknown-linux-gnu", "cortex-a53", ("fp", "asimd", "crc32")),
+    )
+}  # fmt: skip
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -86,6 +107,15 @@ def default_path() -> Path:
     return Path(sys.prefix, "lib", "emb_daemon", "kernels.so")
 
 
+def found() -> Path | None:
+    """The library to look at: what `VARIABLE` names, else that at `default_path`; None if there is none, or none is wanted."""
+    named = os.environ.get(VARIABLE)
+    if named == "" or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+        return None
+    path = Path(named) if named else default_path()
+    return path if named or path.exists() else None
+
+
 def seal(elf: bytes, **manifest) -> bytes:
     """A library's bytes."""
     return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
@@ -130,7 +160,7 @@ _says = "kernels are compiled by numba"
 
 
 def load() -> str:
-    """Use the kernels of a library in this process: of the one that `VARIABLE` names, else that at `default_path`.
+    """Use the kernels of the library that is `found` in this process.
 
     Before anything that has kernels is imported. Returns why a library that is there is not used, numba being used instead;
     empty if one is used, or there is none.
@@ -139,11 +169,8 @@ def load() -> str:
         InputError: numba is not installed either.
     """
     global _loaded, _says
-    named = os.environ.get(VARIABLE)
-    path = Path(named) if named else default_path()
-    wanted = named != "" and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
-    why = ""
-    if wanted and (named or path.exists()):
+    path, why = found(), ""
+    if path:
         try:
             if "emb_daemon.jit" in sys.modules:
                 raise Refused("this process has others already")
@@ -155,9 +182,8 @@ def load() -> str:
         except (Refused, OSError) as refusal:
             why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
     if _loaded is None and importlib.util.find_spec("numba") is None:
-        raise InputError(
-            why or f"{path}: no such file, expected kernels that emb-daemon compile has made: numba is not installed"
-        )
+        missing = f"{default_path()}: no such file; expected what emb-daemon compile has made"
+        raise InputError(f"{why or missing}; and numba is not installed")
     return why
 
 
