@@ -12,6 +12,7 @@ import adaptkit
 import aheadkit
 import numpy as np
 import pytest
+from numba.core import config
 
 from emb_daemon.ahead import library
 from emb_daemon.ahead.library import Manifest, Refused, check, installed_digest, read_manifest, seal
@@ -42,12 +43,16 @@ def _environment(**variables) -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory):
-    """The library for this machine and the object for aarch64: half a minute, once."""
-    folder = tmp_path_factory.mktemp("kernels")
-    command = [sys.executable, "-c", _COMPILE, folder / "kernels.so", folder / "aarch64.o"]
-    done = subprocess.run(command, capture_output=True, text=True, env=_environment())
-    assert done.returncode == 0, done.stderr
+def compiled():
+    """The library for this machine and the object for aarch64: a minute, once for each state of the sources, which numba's
+    folder is named after."""
+    folder = Path(config.CACHE_DIR) / "ahead"
+    library, other = folder / "kernels.so", folder / "aarch64.o"
+    if not other.exists():
+        folder.mkdir(exist_ok=True)
+        command = [sys.executable, "-c", _COMPILE, library, other]
+        done = subprocess.run(command, capture_output=True, text=True, env=_environment())
+        assert done.returncode == 0, done.stderr
     return folder
 
 
