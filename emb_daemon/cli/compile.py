@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     if machine not in TARGETS:
         raise InputError(f"--target {arguments.target}: expected {' or '.join(TARGETS)}")
     # What numba has optimised is for this processor, and what it finds in its cache has no text any more.
-    os.environ["NUMBA_OPT"] = "0"
+    os.environ |= {"NUMBA_OPT": "0", "NUMBA_DISABLE_JIT": "0"}
     with tempfile.TemporaryDirectory() as empty:
         os.environ["NUMBA_CACHE_DIR"] = empty
         # Before they are imported: what changes meanwhile is not in the library.
