@@ -1,77 +1,26 @@
-"""The one numba entry point of the package.
+"""How kernels come to run: from a library that was compiled ahead, through numba, or as plain Python.
 
-numba's disk cache is keyed on the file of the compiled function alone, so a change in a kernel that it calls, or in a
-record layout, would go unnoticed. The cache folder is therefore named after all sources that compiled code can depend on.
-
-With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same records, which is how tests compare them.
+Everything that compiled code consists of is declared here: `njit` for what kernels call, `entry` for what Python calls in a
+tick. With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same records, which is how tests compare them.
+With a library (`emb_daemon.ahead.library.load`, before anything here is imported) the entry points are its functions, numba is
+not imported, and what else is called runs as plain Python: so does everything where numba is not installed, fast enough to
+read and check files.
 """
 
 import functools
-import hashlib
+import importlib.util
 import os
-import stat
-import sys
-import tempfile
-import threading
 from collections.abc import Callable
-from pathlib import Path
 
-import numba
 import numpy as np
-from numba.core import config, event
 
-#: A source that mentions one of these takes part in compiled code.
-_MARKS = (b"emb_daemon.jit", b"np.dtype(")
+from emb_daemon.ahead import library
+from emb_daemon.ahead.signature import Array, Entry, name_in_c
 
+__all__ = ["ENTRIES", "Array", "compile_beside", "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit"]
 
-def _source_digest(package: Path) -> str:
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        content = path.read_bytes()
-        if any(mark in content for mark in _MARKS):
-            digest.update(content)
-    return digest.hexdigest()[:16]
-
-
-def _cache_root() -> Path:
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(chosen)
-    base = os.environ.get("CACHE_DIRECTORY") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base.split(":")[0]) / "emb_daemon"
-
-
-def _cache_folder() -> Path:
-    """A writable folder for compiled code: the chosen one or, where that cannot be written or anybody could write to it, one
-    for this process alone."""
-    folder = _cache_root() / _source_digest(Path(__file__).parent)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            trouble = _foreign(folder)
-    except OSError as error:
-        trouble = error.strerror
-    if not trouble:
-        return folder
-    global _private
-    _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
-    print(
-        f"emb_daemon: cannot keep compiled code in {folder} ({trouble}), compiling anew at every start; "
-        "set NUMBA_CACHE_DIR to a writable folder of your own",
-        file=sys.stderr,
-    )
-    return Path(_private.name)
-
-
-def _foreign(folder: Path) -> str:
-    """Who else could have put something into the folder, or its parent: what is found there is executed. Root may use what it
-    likes, nobody else what is not his own."""
-    for path in (folder, folder.parent):
-        status = path.stat()
-        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
-            return f"{path} is writable by anybody"
-        if os.geteuid() not in (0, status.st_uid) and path == folder:
-            return f"{path} belongs to somebody else"
-    return ""
+#: Entry points by name in C, for `emb_daemon.ahead.build`.
+ENTRIES: dict[str, Entry] = {}
 
 
 class _Record(np.void):
@@ -102,62 +51,36 @@ def _plain(function):
     return call
 
 
-class _Compilations(event.Listener):
-    """Counts what is compiled in this process, not what comes from the cache."""
-
-    count = 0
-
-    def on_start(self, _event):
-        self.count += 1
-
-    def on_end(self, _event):
-        pass
-
-
-def compiled_for_the_next_start() -> bool:
-    """Whether this process has compiled what another start would find in the cache."""
-    return _compilations.count > 0 and _private is None
-
-
-def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
-    """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
-
-    Only where ``function`` is not in the cache, a second CPU is there, and no other thread that may hold a lock. Returns
-    what waits for the end of it.
-    """
-    possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
-    if config.DISABLE_JIT or _private is not None or not possible:
-        return lambda: None
-    if any(Path(config.CACHE_DIR).rglob(f"*.{function.__name__}-*.nbi")):
-        return lambda: None
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-        finally:
-            os._exit(0)
-    return lambda: os.waitpid(child, 0)
-
-
-_compilations = _Compilations()
-event.register("numba:compile", _compilations)
-_private: tempfile.TemporaryDirectory | None = None
-
-#: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
-if config.DISABLE_JIT:
+if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or importlib.util.find_spec("numba") is None:
     njit = _plain
+
+    def compiled_for_the_next_start() -> bool:
+        return False
+
+    def compile_beside(_function, _work: Callable[[], object]) -> Callable[[], object]:
+        return lambda: None
+
+    def depend_on(source) -> None:
+        if library.in_use():
+            raise RuntimeError(f"{source}: kernels compiled ahead know nothing of it; {library.VARIABLE}= has numba used")
+
 else:
-    config.CACHE_DIR = str(_cache_folder())
-    njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+    from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit
 
 
-def depend_on(source: Path) -> None:
-    """Keep what is compiled from here on apart from what was compiled without this file, or with another version of it."""
-    if config.DISABLE_JIT:
-        return
-    folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
-    folder.mkdir(parents=True, exist_ok=True)
-    config.CACHE_DIR = str(folder)
+def entry(*takes, returns: int = 0):
+    """A function that Python calls in a tick, or in its stead with arguments that ``takes`` describes (see
+    `emb_daemon.ahead.signature`); ``returns`` whole numbers. Unlike `njit`'s it is in a library that is compiled ahead."""
+
+    def declare(function):
+        name = name_in_c(function)
+        if library.in_use():
+            return functools.wraps(function)(library.bind(name, takes, returns))
+        compiled = njit(function)
+        ENTRIES[name] = Entry(name, compiled, takes, returns)
+        return compiled
+
+    return declare
 
 
 def fields(kind: str, names: str) -> list[tuple[str, str]]:

@@ -12,14 +12,14 @@ import numpy as np
 from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.jit import njit
+from emb_daemon.jit import Array, entry, njit
 from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import pack
-from emb_daemon.wire.receive import ACCEPTED, SECOND_SENDER, new_reception, receive
+from emb_daemon.wire.layout import LAYOUT, pack
+from emb_daemon.wire.receive import ACCEPTED, RECEPTION, SECOND_SENDER, new_reception, receive
 
 #: A resolver sample waits this long for its current before it is answered without: senders put both on the bus together, and
 #: half a cycle leaves as much for the answer.
@@ -64,8 +64,8 @@ CORNER = np.dtype(
     align=True,
 )
 
-#: E2E counters of what is sent, by message and corner.
-TRANSMISSION = np.dtype([("counter", "i8", (4, 4))], align=True)
+#: E2E counters of what is sent, by message and corner; ``values`` of the message that is being encoded.
+TRANSMISSION = np.dtype([("counter", "i8", (4, 4)), ("values", "f8", (wire.SENT_SIGNALS,))], align=True)
 
 #: Which predictions `_overdue` makes.
 _NONE, _ALL, _NEWEST = range(3)
@@ -82,6 +82,9 @@ class Buffers(NamedTuple):
     corners: np.ndarray
     disturbed: np.ndarray
     samples: np.ndarray
+
+
+_BUFFERS = Buffers(Array(LAYOUT), Array(RECEPTION), Array(CORNER), Array(np.int64), Array(SAMPLE))
 
 
 class Pipeline:
@@ -161,7 +164,7 @@ class Pipeline:
         return self.frames[: _broadcast(self.estimates, count, self.transmission, self.layout, self._limits, self.frames)]
 
 
-@njit
+@entry(_BUFFERS, Array(FRAME), int, int, int, returns=2)
 def _collect(b, frames, start, predictions, count):
     while start < len(frames) and count + _ROWS_A_FRAME < len(b.samples):
         frame = frames[start]
@@ -206,7 +209,7 @@ def _record_second_sender(b, frame):
                 b.corners[index].second_sender_ns = frame.time_ns
 
 
-@njit
+@entry(_BUFFERS, int, int, int, returns=1)
 def _overdue(b, time_ns, predictions, count):
     for index in range(4):
         corner = b.corners[index]
@@ -354,11 +357,10 @@ def _head(b, row, index, age):
     row.reasons = reasons
 
 
-@njit
+@entry(Array(ESTIMATE), int, Array(TRANSMISSION), Array(LAYOUT), Array(LIMITS), Array(FRAME), returns=1)
 def _broadcast(estimates, count, transmission, layout, limits, frames):
     """Encode estimates; cycles that pass a message's period make it due. Returns the number of frames."""
-    wires, counters = layout[0], transmission[0].counter
-    values = np.zeros(wire.SENT_SIGNALS)
+    wires, counters, values = layout[0], transmission[0].counter, transmission[0].values
     sent = 0
     for number in range(count):
         e = estimates[number]

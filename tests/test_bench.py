@@ -49,6 +49,7 @@ _FIGURES = {
         }
         for corners in (4, 16)
     ],
+    "kernels": None,
     "logs": {
         "seconds": 120.0,
         "frames": 100_000,
@@ -116,6 +117,14 @@ def test_what_is_missing_is_said(figures):
     shown = text(figures)
     assert "above an empty loop's wake-up" in shown and "rt-tests" in shown
     assert not _missed(figures)
+
+
+def test_kernels_from_numba_and_compiled_ahead_stand_side_by_side(figures):
+    ahead = copy.deepcopy(figures["loops"][0]) | {"ready": {"wall_s": 0.45, "cpu_s": 0.4}, "resident_KiB": [58_000, 58_400]}
+    figures["kernels"] = {"numba": figures["loops"][0], "ahead": ahead}
+    figures["verdict"] = verdict(figures)
+    shown = [line.split() for line in text(figures).splitlines()]
+    assert ["start", "to", "ready,", "s", "1.00", "0.45"] in shown and ["resident,", "MiB", "186", "57"] in shown
 
 
 def test_the_daemon_is_measured_in_a_process_of_its_own():

@@ -9,25 +9,25 @@ from pathlib import Path
 import pytest
 
 import emb_daemon
-from emb_daemon.jit import _source_digest
+from emb_daemon.ahead.library import installed_digest, source_digest
 
 _PACKAGE = Path(emb_daemon.__file__).parent
 _CALL = """
 import sys
 from emb_daemon.models.torque import torque_balance
 assert torque_balance(2.0, 4.0) == 0.5
-import emb_daemon.jit
-print(emb_daemon.jit.config.CACHE_DIR)
+from numba.core import config
+print(config.CACHE_DIR)
 """
 
 
 def test_digest_follows_kernels_and_records_and_nothing_else(tmp_path):
     package = tmp_path / "emb_daemon"
     shutil.copytree(_PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "_resources"))
-    before = _source_digest(package)
-    assert before == _source_digest(_PACKAGE)
+    before = source_digest(package)
+    assert before == installed_digest()
     (package / "cli" / "main.py").write_text("# nothing compiled here\n")
-    assert _source_digest(package) == before
+    assert source_digest(package) == before
     for name in (
         "models/stiffness.py",
         "estimator/records.py",
@@ -38,7 +38,7 @@ def test_digest_follows_kernels_and_records_and_nothing_else(tmp_path):
         file = package / name
         text = file.read_text()
         file.write_text(text.replace("0", "1", 1) if "0" in text else text + "\n# more\n")
-        changed = _source_digest(package)
+        changed = source_digest(package)
         assert changed != before, name
         before = changed
 

@@ -33,6 +33,7 @@ def test_the_wheel_is_complete(built):
     with zipfile.ZipFile(built[0]) as wheel:
         names = set(wheel.namelist())
         for name in ("dbc/emb.dbc", "dbc/rig.dbc", "config/emb.yaml", "config/calibration.yaml", "systemd/emb-daemon.service",
+                     "systemd/emb-daemon.service.d/ahead.conf",
                      "completion/emb-daemon.bash"):  # fmt: skip
             assert wheel.read(f"emb_daemon/_resources/{name}") == (_ROOT / name).read_bytes()
         assert "emb_daemon/py.typed" in names
@@ -59,8 +60,9 @@ def test_the_box_has_a_lock_of_its_own():
     command = [sys.executable, str(_ROOT / "tools" / "lock_box.py"), "--check"]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    lock = (_ROOT / "requirements-box.lock").read_text()
+    lock, ahead = ((_ROOT / f"requirements-{name}.lock").read_text() for name in ("box", "ahead"))
     assert "numba==" in lock and "scipy==" not in lock and lock.count("==") <= lock.count("--hash=sha256:")
+    assert "numpy==" in ahead and "numba==" not in ahead and "llvmlite==" not in ahead
 
 
 def test_the_sdist_can_be_tested_and_documented(built):

@@ -13,8 +13,8 @@ import emb_daemon
 _PACKAGE = Path(emb_daemon.__file__).parent
 #: The box, from the ground up: each may know those before it.
 _BOX = (
-    "errors", "resources", "atomic", "bounded", "jit", "wire", "models", "effects", "estimator", "calibration", "adapt",
-    "pipeline", "runtime", "monitor",
+    "errors", "resources", "atomic", "bounded", "ahead", "numba_cache", "jit", "wire", "models", "effects", "estimator",
+    "calibration", "adapt", "pipeline", "runtime", "monitor",
 )  # fmt: skip
 #: What stands above both wings.
 _ABOVE = ("cli", "api", "__init__")

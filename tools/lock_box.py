@@ -1,4 +1,5 @@
-"""Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`.
+"""Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`;
+and requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead.
 
     python tools/lock_box.py [--check]
 
@@ -14,6 +15,8 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+#: Files, and what of the daemon's dependencies each leaves out.
+LOCKS = {"requirements-box.lock": (), "requirements-ahead.lock": ("numba", "llvmlite")}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -21,8 +24,8 @@ def _name(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", _NAME.match(requirement)[0]).lower()
 
 
-def box_lock() -> str:
-    """The file's content."""
+def box_lock(without: tuple[str, ...]) -> str:
+    """The content of a lock file ``without`` some packages, and what only they need."""
     blocks = re.split(r"(?m)^(?=\S)", (ROOT / "requirements.lock").read_text())
     pinned: dict[str, str] = {}
     for block in blocks:
@@ -33,7 +36,7 @@ def box_lock() -> str:
     needed: set[str] = set()
     while waiting:
         name = waiting.pop()
-        if name not in needed and name in pinned:
+        if name not in needed and name in pinned and name not in without:
             needed.add(name)
             with contextlib.suppress(PackageNotFoundError):
                 waiting += [_name(line) for line in requires(name) or () if "extra ==" not in line]
@@ -41,7 +44,9 @@ def box_lock() -> str:
 
 
 if __name__ == "__main__":
-    path = ROOT / "requirements-box.lock"
-    if sys.argv[1:] == ["--check"]:
-        sys.exit(0 if path.read_text() == box_lock() else f"{path}: out of date, run python tools/lock_box.py")
-    path.write_text(box_lock())
+    for file, without in LOCKS.items():
+        path = ROOT / file
+        if sys.argv[1:] != ["--check"]:
+            path.write_text(box_lock(without))
+        elif path.read_text() != box_lock(without):
+            sys.exit(f"{path}: out of date, run python tools/lock_box.py")

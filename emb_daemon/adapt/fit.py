@@ -41,9 +41,9 @@ from emb_daemon.calibration.parameters import (
 )
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
-from emb_daemon.estimator.records import STATE
+from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
-from emb_daemon.jit import njit
+from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -92,7 +92,7 @@ def unexplained_step(s, p, row):
     return torque - leverage * force - s.error[SLOW] * slow - s.error[VISCOUS] * 0.5 * (row.speed + speed)
 
 
-@njit
+@entry(Array(STATE), Array(PARAMETERS), Array(r.TRAINING), Array(np.float64), Array(np.float64))
 def _run(states, parameters, rows, residual, force):
     """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
     s, p = states[0], parameters[0]

@@ -7,7 +7,9 @@ does not share the model of the fit that follows.
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.adapt.records import TRAINING
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.jit import Array, entry
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.torque import friction_state, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
@@ -27,7 +29,7 @@ _CANDIDATES = 60
 ANGLE, FORCE, FRICTION, WEIGHT = range(4)
 
 
-@njit
+@entry(Array(TRAINING), PARAMETERS, Array(np.float64), Array(np.float64))
 def _sliding(rows, p, direction, torque):
     """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque without it and inertia (N m)."""
     state, variance = 0.0, 1.0

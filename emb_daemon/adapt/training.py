@@ -13,8 +13,9 @@ from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import settle_paths
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
-from emb_daemon.jit import njit
+from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
@@ -308,7 +309,10 @@ def _advance(a, s, parameters, learned, limits, scratch, rows, m):
         end_training(a, r.TOO_LONG, e.RESULT_ABORTED)
 
 
-@njit
+@entry(
+    Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(ESTIMATE), Array(r.ADAPTER),
+    Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
+)  # fmt: skip
 def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
     """Estimate samples from row ``first``, with adaptation.
 

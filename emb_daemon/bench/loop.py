@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.ahead import library
 from emb_daemon.bench import empty
 from emb_daemon.resources import resource
 from emb_daemon.wire.layout import CORNERS
@@ -80,11 +81,12 @@ def _configured(corners: int) -> Iterator[list]:
         yield [config, Path(folder) / "state"]
 
 
-def measure_loop(corners: int, seconds: float) -> dict:
+def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> dict:
     """Run the real daemon for the brakes of a simulated car, each in a process of its own, and beside them an empty loop and,
     where it is installed, cyclictest.
 
-    More than four ``corners`` are several daemons of four in one process, each on its own bus.
+    More than four ``corners`` are several daemons of four in one process, each on its own bus. ``kernels`` is the library that
+    the daemon uses; empty: it uses numba; None: what it would use by itself.
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
@@ -99,7 +101,13 @@ def measure_loop(corners: int, seconds: float) -> dict:
     served = None
     try:
         with _configured(each) as arguments:
-            served = _Child("served", *arguments, *(ours.fileno() for ours, _ in pairs), inherited=[a for a, _ in pairs])
+            served = _Child(
+                "served",
+                *arguments,
+                *(ours.fileno() for ours, _ in pairs),
+                inherited=[a for a, _ in pairs],
+                environment=None if kernels is None else {library.VARIABLE: kernels},
+            )
             command = [sys.executable, empty.__file__, str(seconds), str(_PRIORITY)]
             with subprocess.Popen(command, stdout=subprocess.PIPE) as nothing:
                 latency = cyclictest(seconds)
@@ -124,10 +132,10 @@ def measure_loop(corners: int, seconds: float) -> dict:
 
 
 def measure_start(corners: int = len(CORNERS), cold: bool = False) -> dict:
-    """``wall_s`` and ``cpu_s`` from start to ready, with the kernels that are in the cache or ``cold`` with none."""
+    """``wall_s`` and ``cpu_s`` from start to ready by numba, with the kernels that are in the cache or ``cold`` with none."""
     [(ours, theirs)] = _buses(1)
     with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as empty_cache:
-        environment = {"NUMBA_CACHE_DIR": empty_cache} if cold else None
+        environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
         served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
         try:
             served.stop()

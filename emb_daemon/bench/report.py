@@ -54,6 +54,8 @@ def text(result: dict) -> str:
     lines = [result["machine"]]
     for loop in result["loops"]:
         lines += ["", *_loop(loop)]
+    if result["kernels"]:
+        lines += ["", *_kernels(result["kernels"])]
     lines += ["", *_logs(result["logs"]), f"start with nothing compiled: ready after {_start(result['cold_start'])}"]
     lines += ["", *_verdict(result["verdict"])]
     return "\n".join(lines)
@@ -82,6 +84,24 @@ def _loop(loop: dict) -> list[str]:
     if not loop["cyclictest"]:
         lines.append("  cyclictest is not installed (package rt-tests), or real-time priority was refused")
     return lines
+
+
+def _kernels(measured: dict) -> list[str]:
+    """The daemon with kernels from numba's cache beside the same with a library."""
+    rows = [
+        ("start to ready, s", lambda loop: f"{loop['ready']['wall_s']:.2f}"),
+        ("of them on a CPU, s", lambda loop: f"{loop['ready']['cpu_s']:.2f}"),
+        ("resident, MiB", lambda loop: f"{loop['resident_KiB'][1] / 1024.0:.0f}"),
+        ("tick, us, p50 / p99", lambda loop: _both(loop["tick"])),
+        *((f"  {part}", lambda loop, part=part: _both(loop["parts"][part])) for part in measured["numba"]["parts"]),
+        ("ticks missed", lambda loop: f"{loop['missed']} of {loop['ticks']}"),
+    ]
+    lines = [f"{'4 corners, kernels':<38}{'from numba':>18}{'compiled ahead':>18}"]
+    return lines + [f"  {name:<36}{figure(measured['numba']):>18}{figure(measured['ahead']):>18}" for name, figure in rows]
+
+
+def _both(figures: dict) -> str:
+    return f"{figures['p50_us']:.0f} / {figures['p99_us']:.0f}"
 
 
 def _logs(logs: dict) -> list[str]:

@@ -5,6 +5,12 @@ and, after SIGTERM, a JSON line with what its ticks cost. Several descriptors ma
 tick of one loop: that is no service of this package, whose process has four corners at most, and says what more corners cost.
 """
 
+# Before anything is imported that has kernels.
+from emb_daemon.ahead import library
+
+if refusal := library.load():
+    raise SystemExit(refusal)
+
 import gc
 import json
 import math

@@ -26,9 +26,12 @@ class Bus(Struct, kw_only=True):
     bitrate: Annotated[int, Meta(gt=0)] | None = None
 
     def __post_init__(self):
+        # python-can is imported only for what it alone knows: it brings much along.
+        if self.interface in (None, "socketcan"):
+            return
         from can.interfaces import VALID_INTERFACES
 
-        if self.interface is not None and self.interface not in VALID_INTERFACES:
+        if self.interface not in VALID_INTERFACES:
             near = difflib.get_close_matches(self.interface, VALID_INTERFACES, 3, 0.4) or sorted(VALID_INTERFACES)
             raise InvalidValue(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
 

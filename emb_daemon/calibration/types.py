@@ -87,7 +87,7 @@ class Stiffness(Struct, kw_only=True):
         if thicknesses != sorted(set(thicknesses)):
             raise InvalidValue("curves: expected ascending, distinct pad thicknesses")
         between = np.linspace(*thickness_range(self.curves), 8 * len(thicknesses)) if len(thicknesses) > 1 else ()
-        for thickness in np.union1d(thicknesses, between):
+        for thickness in sorted({*thicknesses, *between}):
             reached = rising_force(curve_at(self.curves, thickness))
             if reached < self.maximum_force_N:
                 raise InvalidValue(

@@ -27,6 +27,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not arguments.seconds >= _LEAST_S:
         raise InputError(f"--seconds {arguments.seconds:g}: expected at least {_LEAST_S:g}: the first second does not count")
+    from emb_daemon.ahead import library
+
+    kernels = library.found()
+    try:
+        if kernels:
+            library.check(kernels)
+    except library.Refused as refusal:
+        raise InputError(f"{kernels}: {refusal}") from None
     from emb_daemon.bench.logs import measure_logs
     from emb_daemon.bench.loop import machine, measure_loop, measure_start
     from emb_daemon.bench.report import text, verdict
@@ -36,6 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
     result = {
         "machine": machine(),
         "loops": [measure_loop(corners, arguments.seconds) for corners in arguments.corners],
+        # The daemon with both, one after the other: what a library changes.
+        "kernels": {code: measure_loop(4, arguments.seconds, path) for code, path in (("numba", ""), ("ahead", str(kernels)))}
+        if kernels
+        else None,
         "logs": measure_logs(),
         "cold_start": measure_start(cold=True),
     }

@@ -20,6 +20,7 @@ COMMANDS = {
     "diagnose": "find what the model lacks, add it, and show the error before and after",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
+    "compile": "the kernels as one library, for a daemon without a compiler",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
@@ -28,6 +29,8 @@ COMMANDS = {
 _OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
+#: Commands of a box without a compiler; all others need numba.
+_WITHOUT_NUMBA = ("run", "check", "monitor", "adaptation")
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
@@ -60,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
     module.add_arguments(parser)
     arguments = parser.parse_args(argv[1:])
     try:
-        for library in _NEED.get(chosen.command, ()):
+        for library in (*_NEED.get(chosen.command, ()), *(() if chosen.command in _WITHOUT_NUMBA else ("numba",))):
             if importlib.util.find_spec(library) is None:
                 raise ModuleNotFoundError(name=library)
         return module.run(arguments)
@@ -68,9 +71,11 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in _OFFLINE:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in (*_OFFLINE, "numba"):
             raise
-        print(f"emb-daemon {chosen.command} needs {error.name}: pip install 'emb_daemon[offline]'", file=sys.stderr)
+        package = "numba" if missing == "numba" else "'emb_daemon[offline]'"
+        print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:
         print(error, file=sys.stderr)

@@ -20,6 +20,11 @@ def run(arguments: argparse.Namespace) -> int:
     # python-can imports asammdf, and with it pandas, wherever it is installed: a third of the daemon's memory and start-up
     # time for a file format that it never reads.
     sys.modules.setdefault("asammdf", None)
+    from emb_daemon.ahead import library
+
+    # Before anything is imported that has kernels. Said at once: where the library is needed, numba's import may fail.
+    if refusal := library.load():
+        print(refusal, file=sys.stderr)
     from emb_daemon.adapt.memory import hold, state_directory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.cli.busoptions import bus_options
@@ -33,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     setup = Setup(arguments.config)
     configuration = setup.configuration
     set_up_logging(configuration.log_level)
+    log.info("%s", library.description())
     ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
     state = state_directory(configuration.state_directory, arguments.config.parent)
     if state:

@@ -1,11 +1,12 @@
 """A sample in, an estimate out: the one place from which the estimator is run."""
 
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.step import predict, step
-from emb_daemon.jit import njit
+from emb_daemon.jit import Array, entry, njit
 from emb_daemon.wire.contract import CONTESTED, CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
 
 
-@njit
+@entry(Array(SAMPLE), int, Array(STATE), Array(PARAMETERS), Array(ESTIMATE))
 def answer(samples, count, states, parameters, estimates):
     """Estimate ``samples[:count]``.
 

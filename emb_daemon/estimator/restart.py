@@ -8,6 +8,7 @@ from math import exp
 
 import numpy as np
 
+from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
     LEAST_SCALE,
@@ -19,7 +20,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     set_priors,
 )
-from emb_daemon.jit import njit
+from emb_daemon.jit import entry, njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
 
@@ -56,6 +57,14 @@ SNAPSHOT = np.dtype(
 
 
 @njit
+def _copy_pads(to, pads):
+    # Not ``to[:, :] = pads``: that allocates.
+    for side in range(2):
+        for node in range(NODES):
+            to[side, node] = pads[side, node]
+
+
+@entry(STATE, PARAMETERS, SNAPSHOT, returns=1)
 def take_snapshot(s, p, snapshot):
     """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or doubted."""
     if not s.started or s.unknown or s.contact.lost:
@@ -66,7 +75,7 @@ def take_snapshot(s, p, snapshot):
     copy_errors(snapshot.error, snapshot.covariance, s.error, s.covariance)
     snapshot.winding, snapshot.housing = s.winding, s.housing
     snapshot.temperature_known = s.temperature_known
-    snapshot.pads[:, :] = s.pads
+    _copy_pads(snapshot.pads, s.pads)
     snapshot.disc, snapshot.history = s.disc, s.history
     snapshot.temperature_sigma, snapshot.history_sigma = s.temperature_sigma, s.history_sigma
     return True
@@ -100,7 +109,7 @@ def why_implausible(snapshot, p) -> str:
     return ", ".join(name for name, is_possible in possible.items() if not is_possible)
 
 
-@njit
+@entry(STATE, PARAMETERS, SNAPSHOT, float)
 def resume(s, p, snapshot, elapsed_s):
     """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
 
@@ -119,7 +128,7 @@ def resume(s, p, snapshot, elapsed_s):
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
     if snapshot.temperature_known:
-        s.pads[:, :] = snapshot.pads
+        _copy_pads(s.pads, snapshot.pads)
         s.disc, s.history = snapshot.disc, snapshot.history
         s.temperature_sigma = snapshot.temperature_sigma + min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
         s.history_sigma = snapshot.history_sigma

@@ -19,8 +19,9 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import ESTIMATE, STATE
 from emb_daemon.estimator.step import step
-from emb_daemon.jit import compile_beside, njit
+from emb_daemon.jit import Array, compile_beside, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.systemd import ServiceManager
@@ -28,6 +29,7 @@ from emb_daemon.wire import contract
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, FRAME
 from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
+from emb_daemon.wire.receive import RECEPTION
 
 #: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
 _MARGIN_NS = 200_000
@@ -76,7 +78,7 @@ class Pacer:
         return min(together, free + _MARGIN_NS)
 
 
-@njit
+@entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), returns=3)
 def _scan(estimates, count, states, receptions, arrivals, reported):
     """What the loop must know of new estimates: ``arrivals`` gets the time at which each corner's sample was complete, 0 for
     none; ``reported`` mode and reasons. Returns bit masks of corners: estimated, lost to what is no number, changed."""

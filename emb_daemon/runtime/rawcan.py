@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from emb_daemon.errors import Unavailable
-from emb_daemon.jit import njit
+from emb_daemon.jit import Array, entry
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 
@@ -70,7 +70,9 @@ class _Batch:
         self.address = ctypes.c_void_p(self.headers.ctypes.data)
 
 
-@njit
+@entry(
+    Array(_CAN_FRAME), Array(_MMSGHDR), Array(np.uint8, 2), int, bool, int, int, int, Array(FRAME), returns=2
+)  # fmt: skip
 def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, now_ns, frames):
     """Frames with times on the monotonic clock; returns how many there are, and the socket's drop counter or -1.
 
@@ -117,7 +119,7 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
     return count, drops
 
 
-@njit
+@entry(Array(FRAME), int, Array(_CAN_FRAME))
 def _to_kernel(frames, now_ns, raw):
     for index in range(len(frames)):
         raw[index].can_id = frames[index].can_id

@@ -1,0 +1,268 @@
+"""Kernels compiled ahead, as the daemon finds, checks and calls them: without numba, and without a compiler.
+
+A library is an ELF shared object followed by one line of JSON, the `Manifest`. It is used if it is whole, made from the very
+sources that are installed (those that mention `emb_daemon.jit` or make records), for this processor, and nobody else could
+have written it.
+"""
+
+import ctypes
+import hashlib
+import importlib.util
+import operator
+import os
+import platform
+import stat
+import struct
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from emb_daemon.ahead.signature import Array, is_group
+from emb_daemon.bounded import read_bounded
+from emb_daemon.errors import InputError
+
+#: A source that mentions one of these takes part in compiled code.
+_MARKS = (b"emb_daemon.jit", b"emb_daemon.ahead.signature", b"np.dtype(")
+_FORMAT = 1
+#: A hundred times what a library of ours has.
+_MOST_BYTES = 20_000_000
+#: The library to use; empty: none.
+VARIABLE = "EMB_DAEMON_KERNELS"
+
+
+class Target(NamedTuple):
+    """``machine`` as uname says it; the ``cpu`` that LLVM compiles for, and the ``flags`` of /proc/cpuinfo that it takes."""
+
+    machine: str
+    triple: str
+    cpu: str
+    flags: tuple[str, ...]
+
+
+#: The oldest processors of each kind that a brake's computer has: x86-64-v2 is of 2009.
+TARGETS = {
+    target.machine: target
+    for target in (
+        Target("x86_64", "x86_64-unknown-linux-gnu", "x86-64-v2",
+               ("cx16", "lahf_lm", "popcnt", "pni", "sse4_1", "sse4_2", "ssse3")),
+        Target("aarch64", "aarch64-unknown-linux-gnu", "cortex-a53", ("fp", "asimd", "crc32")),
+    )
+}  # fmt: skip
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a library says of itself."""
+
+    format: int = _FORMAT
+    #: Of the ELF object before this line.
+    sha256: str
+    #: `source_digest` of what it was made from.
+    sources: str
+    #: As uname says it; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
+    machine: str
+    cpu: str
+    flags: tuple[str, ...]
+    #: Versions of emb_daemon, numba and llvmlite that made it.
+    made_by: str
+
+
+class Refused(Exception):
+    """A library that must not be used, and why."""
+
+
+def source_digest(package: Path) -> str:
+    """Of all sources in ``package`` that compiled code can depend on."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        if any(mark in content for mark in _MARKS):
+            digest.update(content)
+    return digest.hexdigest()[:16]
+
+
+def installed_digest() -> str:
+    """`source_digest` of this very package."""
+    return source_digest(Path(__file__).parent.parent)
+
+
+def who_else_writes(path: Path) -> str:
+    """Who else could have put something into a file or folder, or into its parent, whose content is executed; in words, empty
+    if nobody. What is root's is as good as one's own, and root may use what it likes."""
+    for place in (path, path.parent):
+        status = place.stat()
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            return f"{place} is writable by anybody"
+        if place == path and os.geteuid() != 0 and status.st_uid not in (0, os.geteuid()):
+            return f"{place} belongs to somebody else"
+    return ""
+
+
+def default_path() -> Path:
+    """Where ``emb-daemon compile`` puts the library and ``emb-daemon run`` looks for it."""
+    return Path(sys.prefix, "lib", "emb_daemon", "kernels.so")
+
+
+def found() -> Path | None:
+    """The library to look at: what `VARIABLE` names, else that at `default_path`; None if there is none, or none is wanted."""
+    named = os.environ.get(VARIABLE)
+    if named == "" or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+        return None
+    path = Path(named) if named else default_path()
+    return path if named or path.exists() else None
+
+
+def seal(elf: bytes, **manifest) -> bytes:
+    """A library's bytes."""
+    return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Raises Refused for what is no library of ours or not whole; OSError."""
+    elf, _, line = read_bounded(path, _MOST_BYTES).rpartition(b"\n")
+    try:
+        manifest = msgspec.json.decode(line, type=Manifest)
+    except msgspec.DecodeError:
+        raise Refused("it is not whole, or no library that emb-daemon compile has made") from None
+    if manifest.format != _FORMAT or hashlib.sha256(elf).hexdigest() != manifest.sha256:
+        raise Refused("its content is damaged")
+    return manifest
+
+
+def _cpu_flags() -> set[str]:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        name, _, value = line.partition(":")
+        if name.strip().lower() in ("flags", "features"):
+            return set(value.split())
+    return set()
+
+
+def check(path: Path) -> Manifest:
+    """Raises Refused, with the reason, for a library that must not be used here; OSError."""
+    if why := who_else_writes(path):
+        raise Refused(why)
+    manifest = read_manifest(path)
+    if manifest.sources != (installed := installed_digest()):
+        raise Refused(f"it was made from other sources ({manifest.sources}) than are installed ({installed})")
+    if manifest.machine != platform.machine():
+        raise Refused(f"it is for {manifest.machine}, this is {platform.machine()}")
+    if lacking := set(manifest.flags) - _cpu_flags():
+        raise Refused(f"it is for {manifest.cpu}, this processor has no {', '.join(sorted(lacking))}")
+    return manifest
+
+
+_loaded: ctypes.CDLL | None = None
+_says = "kernels are compiled by numba"
+
+
+def load() -> str:
+    """Use the kernels of the library that is `found` in this process.
+
+    Before anything that has kernels is imported. Returns why a library that is there is not used, numba being used instead;
+    empty if one is used, or there is none.
+
+    Raises:
+        InputError: numba is not installed either.
+    """
+    global _loaded, _says
+    path, why = found(), ""
+    if path:
+        try:
+            if "emb_daemon.jit" in sys.modules:
+                raise Refused("this process has others already")
+            manifest = check(path)
+            # What was left open by a linker that knew no libm is looked for among what is loaded.
+            ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
+            _loaded = ctypes.CDLL(str(path), mode=os.RTLD_NOW)
+            _says = f"kernels of {path}, compiled ahead for {manifest.cpu} by {manifest.made_by}"
+        except (Refused, OSError) as refusal:
+            why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
+    if _loaded is None and importlib.util.find_spec("numba") is None:
+        missing = f"{default_path()}: no such file; expected what emb-daemon compile has made"
+        raise InputError(f"{why or missing}; and numba is not installed")
+    return why
+
+
+def description() -> str:
+    """Which code runs, in words."""
+    return _says
+
+
+def in_use() -> bool:
+    """Whether this process runs the kernels of a library."""
+    return _loaded is not None
+
+
+class _Words(threading.local):
+    """What a function was called with last, and the same as C has it; each thread's own, since a function runs without the
+    interpreter's lock."""
+
+    def __init__(self, arguments: int, words: int):
+        self.known = [object()] * arguments
+        self.words = (ctypes.c_int64 * words)()
+        self.address = ctypes.c_void_p(ctypes.addressof(self.words))
+
+
+def bind(name: str, takes: tuple, returns: int) -> Callable:
+    """The library's function ``name``, called like the Python function that it was made from.
+
+    An argument that is the same object as in the call before costs nothing: it is still where it was."""
+    function = getattr(_loaded, name)
+    places, end = [], returns
+    for kind in takes:
+        begin, end = end, end + _size(kind)
+        places.append((slice(begin, end), _converter(kind)))
+    mine = _Words(len(takes), end)
+
+    def call(*arguments):
+        known, words = mine.known, mine.words
+        for index, argument in enumerate(arguments):
+            if known[index] is not argument:
+                place, convert = places[index]
+                words[place] = convert(argument)
+                known[index] = argument
+        if function(mine.address):
+            raise ArithmeticError(f"{name} failed")
+        return words[0] if returns == 1 else tuple(words[:returns])
+
+    return call
+
+
+def _size(kind) -> int:
+    """Words of an element of a signature."""
+    if is_group(kind):
+        return sum(map(_size, kind))
+    return 1 + kind.dimensions if isinstance(kind, Array) else 1
+
+
+def _converter(kind) -> Callable:
+    """What makes words of an argument. Raises TypeError for another kind of argument."""
+    if is_group(kind):
+        parts = [_converter(part) for part in kind]
+        return lambda group: [word for convert, part in zip(parts, group, strict=True) for word in convert(part)]
+    if kind is float:
+        return lambda value: struct.unpack("q", struct.pack("d", value))
+    if kind in (int, bool):
+        return lambda value: (operator.index(value),)
+    if isinstance(kind, Array):
+        dtype, dimensions = np.dtype(kind.dtype), kind.dimensions
+
+        def convert_array(array):
+            if array.dtype != dtype or array.ndim != dimensions or not array.flags.c_contiguous:
+                raise TypeError(f"expected a contiguous array of {dimensions} dimensions of {dtype.names or dtype}")
+            # Not __array_interface__, which describes every field in words.
+            return (array.ctypes.data, *array.shape)
+
+        return convert_array
+
+    def convert_record(record):
+        # A record that is no view of an array has no address that stays.
+        if not isinstance(record, np.void) or record.dtype != kind or record.flags.owndata:
+            raise TypeError(f"expected a record within an array, of {kind.names}")
+        return (np.asarray(record).ctypes.data,)
+
+    return convert_record

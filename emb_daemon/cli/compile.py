@@ -1,0 +1,41 @@
+"""emb-daemon compile."""
+
+import argparse
+import os
+import platform
+import tempfile
+from pathlib import Path
+
+from emb_daemon.ahead.library import TARGETS, default_path, installed_digest
+from emb_daemon.errors import InputError
+
+EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--output", type=Path, default=default_path(), metavar="FILE", help="library to write (%(default)s, where run looks)"
+    )
+    parser.add_argument(
+        "--target", default=platform.machine(), metavar="MACHINE", help="x86_64 or aarch64, or its triple (this machine)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    machine = arguments.target.partition("-")[0]
+    if machine not in TARGETS:
+        raise InputError(f"--target {arguments.target}: expected {' or '.join(TARGETS)}")
+    # What numba has optimised is for this processor, and what it finds in its cache has no text any more.
+    os.environ |= {"NUMBA_OPT": "0", "NUMBA_DISABLE_JIT": "0"}
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["NUMBA_CACHE_DIR"] = empty
+        # Before they are imported: what changes meanwhile is not in the library.
+        sources = installed_digest()
+        from emb_daemon.ahead.build import build
+        from emb_daemon.jit import ENTRIES
+        from emb_daemon.runtime import bus, daemon
+
+        assert bus and daemon, "imported for their entry points"
+        build(list(ENTRIES.values()), sources, TARGETS[machine], arguments.output)
+    print(f"{arguments.output}: kernels for {machine} ({TARGETS[machine].cpu})")
+    return 0

@@ -1,0 +1,100 @@
+"""numba as `emb_daemon.jit` uses it: compiled code is kept on disk, for the next start.
+
+numba's disk cache is keyed on the file of the compiled function alone, so a change in a kernel that it calls, or in a
+record layout, would go unnoticed. The cache folder is therefore named after all sources that compiled code can depend on.
+"""
+
+import hashlib
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+from numba.core import config, event
+
+from emb_daemon.ahead.library import installed_digest, who_else_writes
+
+
+def _cache_root() -> Path:
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(chosen)
+    base = os.environ.get("CACHE_DIRECTORY") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base.split(":")[0]) / "emb_daemon"
+
+
+def _cache_folder() -> Path:
+    """A writable folder for compiled code: the chosen one or, where that cannot be written or anybody could write to it, one
+    for this process alone."""
+    folder = _cache_root() / installed_digest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            trouble = who_else_writes(folder)
+    except OSError as error:
+        trouble = error.strerror
+    if not trouble:
+        return folder
+    global _private
+    _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
+    print(
+        f"emb_daemon: cannot keep compiled code in {folder} ({trouble}), compiling anew at every start; "
+        "set NUMBA_CACHE_DIR to a writable folder of your own",
+        file=sys.stderr,
+    )
+    return Path(_private.name)
+
+
+class _Compilations(event.Listener):
+    """Counts what is compiled in this process, not what comes from the cache."""
+
+    count = 0
+
+    def on_start(self, _event):
+        self.count += 1
+
+    def on_end(self, _event):
+        pass
+
+
+def compiled_for_the_next_start() -> bool:
+    """Whether this process has compiled what another start would find in the cache."""
+    return _compilations.count > 0 and _private is None
+
+
+def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
+    """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
+
+    Only where ``function`` is not in the cache, a second CPU is there, and no other thread that may hold a lock. Returns
+    what waits for the end of it.
+    """
+    possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
+    if _private is not None or not possible:
+        return lambda: None
+    if any(Path(config.CACHE_DIR).rglob(f"*.{function.__name__}-*.nbi")):
+        return lambda: None
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return lambda: os.waitpid(child, 0)
+
+
+_compilations = _Compilations()
+event.register("numba:compile", _compilations)
+_private: tempfile.TemporaryDirectory | None = None
+
+config.CACHE_DIR = str(_cache_folder())
+#: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
+njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+
+
+def depend_on(source: Path) -> None:
+    """Keep what is compiled from here on apart from what was compiled without this file, or with another version of it."""
+    folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+    folder.mkdir(parents=True, exist_ok=True)
+    config.CACHE_DIR = str(folder)

@@ -1,0 +1,279 @@
+"""Kernels compiled ahead: the same bytes as from numba, without it; and nothing else is ever taken for them."""
+
+import argparse
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import adaptkit
+import aheadkit
+import numpy as np
+import pytest
+from numba.core import config
+
+from emb_daemon.ahead import library
+from emb_daemon.ahead.library import Manifest, Refused, check, installed_digest, read_manifest, seal
+from emb_daemon.ahead.signature import Array
+from emb_daemon.errors import Unavailable
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.jit import ENTRIES
+from emb_daemon.plant.scenarios import city_drive
+from emb_daemon.runtime import bus, daemon
+
+_LIBM = {"cos", "exp", "hypot", "log", "pow", "sin", "sincos"}
+_LIBC = {"memcpy", "memmove", "memset"}
+
+#: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
+_COMPILE = """
+import sys
+from emb_daemon.cli.main import main
+assert main(["compile", "--output", sys.argv[1]]) == 0
+from emb_daemon.ahead.build import emit_object
+from emb_daemon.ahead.library import TARGETS
+from emb_daemon.jit import ENTRIES
+open(sys.argv[2], "wb").write(emit_object(list(ENTRIES.values()), TARGETS["aarch64"]))
+"""
+
+
+def _environment(**variables) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(aheadkit.ROOT), str(aheadkit.ROOT / "tests")])} | variables
+
+
+@pytest.fixture(scope="session")
+def compiled():
+    """The library for this machine and the object for aarch64: a minute, once for each state of the sources, which numba's
+    folder is named after."""
+    folder = Path(config.CACHE_DIR) / "ahead"
+    library, other = folder / "kernels.so", folder / "aarch64.o"
+    if not other.exists():
+        folder.mkdir(exist_ok=True)
+        command = [sys.executable, "-c", _COMPILE, library, other]
+        done = subprocess.run(command, capture_output=True, text=True, env=_environment())
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """A drive, training while parked, and driving on: 130 s of one simulated corner."""
+    heard = []
+
+    def hear(frames):
+        heard.append(frames.copy())
+        return frames
+
+    loop = adaptkit.ClosedLoop(tmp_path_factory.mktemp("learned"))
+    for schedule in (city_drive(), adaptkit.parked(50.0), city_drive(), city_drive().first(20.0)):
+        loop.run(schedule, spoil=hear)
+    return np.concatenate(heard)
+
+
+def test_every_byte_is_as_from_numba(compiled, frames, tmp_path):
+    np.save(tmp_path / "frames.npy", frames)
+    command = [sys.executable, aheadkit.__file__, tmp_path / "frames.npy", tmp_path / "ahead", tmp_path / "ahead.npz"]
+    environment = _environment(EMB_DAEMON_KERNELS=str(compiled / "kernels.so"))
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout)
+    expected, found = aheadkit.answered(frames, tmp_path / "numba"), np.load(tmp_path / "ahead.npz")
+    assert expected["samples"] > 20_000 and "adaptation-FL.json" in expected, "the drive does not show much"
+    assert list(expected) == list(found)
+    for name in expected:
+        assert np.array_equal(expected[name], found[name]), name
+
+
+def _symbols(path: Path) -> tuple[set[str], set[str]]:
+    """Names that an ELF file defines for others, and those that it needs."""
+    listed = subprocess.run(["readelf", "--wide", "--symbols", path], capture_output=True, text=True, check=True).stdout
+    rows = [line.split() for line in listed.splitlines()]
+    seen = [(row[6], row[7].partition("@")[0]) for row in rows if len(row) > 7 and row[4] == "GLOBAL"]
+    return {name for index, name in seen if index != "UND"}, {name for index, name in seen if index == "UND"}
+
+
+def test_nothing_is_needed_beyond_libc_and_libm(compiled):
+    assert bus and daemon, "imported for their entry points"
+    for name in ("kernels.so", "aarch64.o"):
+        defined, needed = _symbols(compiled / name)
+        assert defined == set(ENTRIES), name
+        assert needed <= _LIBM | _LIBC, name
+
+
+def test_the_daemon_says_which_code_it_runs(compiled, tmp_path):
+    """Up to the point at which it finds no such interface."""
+    config = aheadkit.ROOT / "config" / "emb.yaml"
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "run", "--config", config, "-i", "socketcan", "-c", "none0"]
+    path = compiled / "kernels.so"
+    done = subprocess.run(command, capture_output=True, text=True, env=_environment(EMB_DAEMON_KERNELS=str(path)))
+    assert done.returncode == 1 and f"kernels of {path}, compiled ahead" in done.stderr + done.stdout
+
+
+# --- What is refused ----------------------------------------------------------------------------------------------------
+
+
+def _sealed(path: Path, **changes) -> Path:
+    """A library that fits this machine but for ``changes``; no code is in it."""
+    manifest = {"sources": installed_digest(), "machine": platform.machine(), "cpu": "a CPU", "flags": (), "made_by": "a test"}
+    path.write_bytes(seal(b"\x7fELF and more", **(manifest | changes)))
+    path.chmod(0o644)
+    return path
+
+
+def test_one_that_fits_is_accepted(tmp_path):
+    assert check(_sealed(tmp_path / "kernels.so")).made_by == "a test"
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"sources": "0123456789abcdef"}, "made from other sources"),
+        ({"machine": "riscv64"}, "it is for riscv64, this is"),
+        ({"flags": ("avx4096",)}, "this processor has no avx4096"),
+    ],
+)
+def test_one_that_does_not_fit_is_refused(tmp_path, changes, why):
+    with pytest.raises(Refused, match=why):
+        check(_sealed(tmp_path / "kernels.so", **changes))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole[:-1],
+        lambda whole: whole[8:],
+        lambda whole: b"\x7fELF And more" + whole[13:],
+        lambda whole: b"",
+        lambda whole: whole.replace(b'"format":1', b'"format":2'),
+    ],
+)
+def test_one_that_is_damaged_is_refused(tmp_path, damage):
+    path = _sealed(tmp_path / "kernels.so")
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(Refused, match=r"not whole|damaged"):
+        check(path)
+
+
+def test_one_that_anybody_can_write_is_refused(tmp_path):
+    path = _sealed(tmp_path / "kernels.so")
+    path.chmod(0o666)
+    with pytest.raises(Refused, match="is writable by anybody"):
+        check(path)
+    path.chmod(0o644)
+    tmp_path.chmod(0o777)
+    with pytest.raises(Refused, match="is writable by anybody"):
+        check(path)
+
+
+def test_one_of_somebody_else_is_refused(tmp_path, monkeypatch):
+    path = _sealed(tmp_path / "kernels.so")
+    if path.stat().st_uid == 0:
+        os.chown(path, 1234, -1)
+    monkeypatch.setattr(os, "geteuid", lambda: 4321)
+    with pytest.raises(Refused, match="belongs to somebody else"):
+        check(path)
+
+
+def _load(code: str = "", **variables) -> subprocess.CompletedProcess:
+    """`library.load` in a process of its own."""
+    code = f"import sys\n{code}\nfrom emb_daemon.ahead import library\nprint(library.load(), library.in_use())"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=_environment(**variables))
+
+
+def test_what_is_refused_is_told_and_numba_is_used(tmp_path):
+    path = _sealed(tmp_path / "kernels.so", sources="0123456789abcdef")
+    done = _load(EMB_DAEMON_KERNELS=str(path))
+    assert re.fullmatch(f"kernels of {path} are not used: it was made from other sources .* False\n", done.stdout), done.stderr
+    # Sealed well, and yet no ELF file: the loader's own words.
+    done = _load(EMB_DAEMON_KERNELS=str(_sealed(path)))
+    assert done.stdout.startswith(f"kernels of {path} are not used: ") and done.stdout.endswith(" False\n"), done.stderr
+    done = _load(EMB_DAEMON_KERNELS=str(tmp_path / "none.so"))
+    assert done.stdout == f"kernels of {tmp_path / 'none.so'} are not used: No such file or directory False\n"
+
+
+def test_none_is_used_where_numba_has_begun_or_nobody_asks(tmp_path):
+    path = _sealed(tmp_path / "kernels.so")
+    done = _load("import emb_daemon.jit", EMB_DAEMON_KERNELS=str(path))
+    assert done.stdout == f"kernels of {path} are not used: this process has others already False\n", done.stderr
+    assert _load(EMB_DAEMON_KERNELS="").stdout == " False\n"
+    assert _load(EMB_DAEMON_KERNELS=str(path), NUMBA_DISABLE_JIT="1").stdout == " False\n"
+
+
+def test_without_library_and_numba_nothing_starts(tmp_path):
+    done = _load("sys.modules['numba'] = None", EMB_DAEMON_KERNELS=str(tmp_path / "none.so"))
+    assert "InputError" in done.stderr and f"kernels of {tmp_path / 'none.so'} are not used" in done.stderr
+    done = _load("sys.modules['numba'] = None", EMB_DAEMON_KERNELS="")
+    assert "numba is not installed" in done.stderr
+
+
+def _without_numba(*arguments) -> subprocess.CompletedProcess:
+    code = f"import sys; sys.modules['numba'] = None; from emb_daemon.cli.main import main; sys.exit(main({list(arguments)}))"
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=_environment(EMB_DAEMON_KERNELS="")
+    )
+
+
+def test_on_a_box_without_numba_files_are_checked_and_what_needs_it_says_so():
+    config = str(aheadkit.ROOT / "config" / "emb.yaml")
+    done = _without_numba("check", "--config", config)
+    assert done.returncode == 0, done.stderr
+    done = _without_numba("replay", "some.log", "--output", "some.csv")
+    assert (done.returncode, done.stderr) == (2, "emb-daemon replay needs numba: pip install numba\n")
+    done = _without_numba("run", "--config", config, "-i", "virtual", "-c", "none")
+    assert done.returncode == 2 and "numba is not installed" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_the_commands_of_the_documentation_are_understood():
+    from emb_daemon.cli import compile as command
+
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    page = (aheadkit.ROOT / "docs" / "integration.md").read_text()
+    lines = re.findall(r"(?m)^    emb-daemon compile(.*)$", page)
+    assert len(lines) > 2
+    for line in lines:
+        parser.parse_args(line.split())
+
+
+def test_without_a_linker_it_says_what_has_one(monkeypatch):
+    from emb_daemon.ahead.build import linker_for
+
+    assert linker_for(platform.machine())[0] == "cc", "not the compiler that knows where libm is"
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(Unavailable, match="no linker for riscv64 is installed: gcc-riscv64-linux-gnu or lld has one"):
+        linker_for("riscv64")
+
+
+def test_an_unknown_machine_is_wrong_usage():
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "compile", "--target", "riscv64"]
+    done = subprocess.run(command, capture_output=True, text=True, env=_environment())
+    assert (done.returncode, done.stderr) == (2, "--target riscv64: expected x86_64 or aarch64\n")
+
+
+def test_a_manifest_says_what_was_sealed(tmp_path):
+    manifest = read_manifest(_sealed(tmp_path / "kernels.so", flags=("sse4_2",)))
+    assert isinstance(manifest, Manifest) and manifest.flags == ("sse4_2",)
+
+
+@pytest.mark.parametrize(
+    ("kind", "argument"),
+    [
+        (Array(SAMPLE), np.zeros(2)),
+        (Array(SAMPLE), np.zeros((2, 2), SAMPLE)),
+        (Array(np.int64), np.zeros(4, np.int64)[::2]),
+        (SAMPLE, np.zeros(1)[0]),
+        (SAMPLE, np.zeros(1, SAMPLE)),
+        (int, 1.5),
+    ],
+)
+def test_an_argument_of_another_kind_never_reaches_the_library(kind, argument):
+    with pytest.raises(TypeError):
+        library._converter(kind)(argument)
+
+
+def test_records_and_arrays_are_passed_where_they_are():
+    rows = np.zeros(3, SAMPLE)
+    assert library._converter(SAMPLE)(rows[2]) == (rows.ctypes.data + 2 * SAMPLE.itemsize,)
+    assert library._converter(Array(SAMPLE))(rows[1:]) == (rows.ctypes.data + SAMPLE.itemsize, 2)
