@@ -10,14 +10,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from emb_daemon.calibration.types import to_parameters
-from emb_daemon.diagnose.comparison import errors, errors_of, whole
+from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import UNITS, Bench
 from emb_daemon.diagnose.selection import Selection
-from emb_daemon.offline.run import estimate
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
@@ -54,11 +52,8 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     for number in range(_FOLDS):
         values = selection.applied(without)
         for channel in bench.channels:
-            values |= _refitted(selection, channel, without, fold != number)
-        parameters = to_parameters(bench.calibrated(values))
-        parts.append(
-            EpisodeErrors.joined([errors_of(bench, trial, estimate(trial.log.samples, parameters)) for trial in bench.trials])
-        )
+            values |= refitted(selection, channel, fold != number, without)
+        parts.append(errors(bench, bench.calibrated(values)))
     result = parts[0]
     for number in range(1, _FOLDS):
         result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
@@ -66,8 +61,9 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     return result
 
 
-def _refitted(selection: Selection, channel: str, without: str, kept: np.ndarray) -> dict[Coordinate, float]:
-    """A channel's coordinates from some of the episodes; shapes, which are not linear, stand as fitted."""
+def refitted(selection: Selection, channel: str, kept: np.ndarray, without: str = "") -> dict[Coordinate, float]:
+    """A channel's coordinates from the episodes that are ``kept``, shape (episodes,), ``without`` one suspect; shapes, which
+    are not linear, stand as fitted."""
     model = selection.model
     linear = [c for c in model.own(channel) if not is_shape(c)]
     if channel == without or not linear or channel not in selection.touched:

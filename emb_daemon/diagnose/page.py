@@ -26,13 +26,18 @@ def page(diagnosis: Diagnosis) -> str:
     )
     details = [f"{title(f)}: {f.effect.equation}" for f in diagnosis.accepted]
     report.verdict(True if diagnosis.unexplained is None else None, verdict(diagnosis), details)
+    sections(report, diagnosis)
+    return report.render()
+
+
+def sections(report: Page, diagnosis: Diagnosis) -> None:
+    """Error before and after, evidence for what was found, what is left, and everything that was tried."""
     _errors(report, diagnosis)
     for finding in diagnosis.accepted:
         _evidence(report, diagnosis, finding)
     _left(report, diagnosis)
     _candidates(report, diagnosis)
     _recalibration(report, diagnosis)
-    return report.render()
 
 
 def _errors(report: Page, diagnosis: Diagnosis) -> None:
