@@ -10,12 +10,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from emb_daemon.diagnose.comparison import errors, whole
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.comparison import errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import UNITS, Bench
 from emb_daemon.diagnose.selection import Selection
+from emb_daemon.offline.run import estimate
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
@@ -53,7 +55,10 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
         values = selection.applied(without)
         for channel in bench.channels:
             values |= refitted(selection, channel, fold != number, without)
-        parts.append(errors(bench, bench.calibrated(values)))
+        # A log with pads of its own has its own contact, too.
+        own = [bench.calibrated(values, trial.index if trial.mounted else None) for trial in bench.trials]
+        found = [estimate(trial.log.samples, to_parameters(c)) for trial, c in zip(bench.trials, own, strict=True)]
+        parts.append(EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, found, strict=True)]))
     result = parts[0]
     for number in range(1, _FOLDS):
         result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from emb_daemon.calibration.parameters import CLEARANCE, moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.confirmation import refitted
+from emb_daemon.diagnose.coordinates import by_key
 from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnosed, with_terms
 from emb_daemon.diagnose.page import sections
 from emb_daemon.diagnose.residuals import Bench
@@ -41,19 +42,32 @@ class AttributionStep(Step):
     hot: tuple[Errors, ...] = ()
 
     def without(self, fold: Fold) -> Calibration:
-        """What is known of a fold's pads without their random logs: found effects and the torque path by other pads' logs."""
+        """What is known of a fold's pads without their random logs: found effects, and the torque path, by other pads' logs.
+
+        A found effect of the stiffness path goes with the curves and dynamics that were fitted beside it."""
         if self.diagnosis is None:
             return moved(self.calibration, fold.values)
         selection, values = self.diagnosis.selection, dict(fold.values)
         bench, applied = selection.model.bench, selection.applied()
-        own = [trial.mounted.get("pad_thickness_mm") == fold.pads.thickness_mm for trial in bench.trials]
-        kept = np.ones(bench.episodes, bool)
-        kept[np.unique(bench.sample_episode[np.repeat(own, [len(trial.log.samples) for trial in bench.trials])])] = False
+        same = [trial.mounted.get("pad_thickness_mm") == fold.pads.thickness_mm for trial in bench.trials]
         if "torque" in selection.touched:
-            applied |= refitted(selection, "torque", kept)
+            applied |= refitted(selection, "torque", _others(bench, same))
             values = {key: value for key, value in values.items() if key not in KEYS}
+        if "stiffness" in map(selection.channel_of, selection.accepted):
+            judged = [any(trial.log is log for log in fold.judged) for trial in bench.trials]
+            applied |= refitted(selection, "stiffness", _others(bench, judged))
+            slow = [value for c, value in applied.items() if c.name == CLEARANCE and same[c.log] and not judged[c.log]]
+            fitted = set(by_key(applied, bench.middle))
+            values = {key: value for key, value in values.items() if key not in fitted} | {CLEARANCE: float(np.mean(slow))}
         there = with_terms(bench.calibrated(applied), selection)
         return moved(replace(there, noise=self.calibration.noise), values)
+
+
+def _others(bench: Bench, gone: Sequence[bool]) -> np.ndarray:
+    """Which episodes are of other logs than those that are ``gone``, shape (episodes,)."""
+    kept = np.ones(bench.episodes, bool)
+    kept[np.unique(bench.sample_episode[np.repeat(gone, [len(trial.log.samples) for trial in bench.trials])])] = False
+    return kept
 
 
 def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, progress: Progress) -> AttributionStep:
