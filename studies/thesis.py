@@ -198,6 +198,7 @@ class Thesis:
             values=stiffness | here | found.physical(),
             pads=fold.pads,
             judged=fold.judged,
+            torque=found,
             errors=errors,
             unexplained=[unexplained(log, found, self.sheet.actuator.gear_gain_m_per_rad) for log in fold.judged],
         )

@@ -147,7 +147,7 @@ def test_a_hold_is_one_episode_however_long():
 
 
 def _coordinates(calibration):
-    result = base_coordinates(calibration, 1)
+    result = base_coordinates(calibration, [calibration.contact.clearance_rad])
     for effect in REGISTRY:
         result += effect_coordinates(calibration, effect, "stiffness").values()
     return result
@@ -176,7 +176,7 @@ def test_no_step_of_a_fit_leaves_what_a_calibration_may_say(calibration):
     """However far a fold's fit goes: at its bounds every base coordinate still gives a calibration that loads."""
     by_sign = msgspec.structs.replace(calibration.friction, presliding_angle_rad=1e-6, load_m_per_rad=0.0)
     for start in (calibration, msgspec.structs.replace(calibration, friction=by_sign)):
-        for c in base_coordinates(start, 1):
+        for c in base_coordinates(start, [start.contact.clearance_rad]):
             for value in (max(c.low, c.start - 20.0 * c.prior), min(c.high, c.start + 20.0 * c.prior)):
                 if "coefficients" not in c.name:
                     moved(start, by_key({c: value}, 0.0), checked=True)
@@ -184,7 +184,8 @@ def test_no_step_of_a_fit_leaves_what_a_calibration_may_say(calibration):
 
 def test_zero_is_a_start_like_any_other(calibration):
     friction = msgspec.structs.replace(calibration.friction, load_m_per_rad=0.0)
-    [load] = (c for c in base_coordinates(msgspec.structs.replace(calibration, friction=friction), 1) if "load" in c.name)
+    started = msgspec.structs.replace(calibration, friction=friction)
+    [load] = (c for c in base_coordinates(started, [7.5]) if "load" in c.name)
     true = calibration.friction.load_m_per_rad
     found = by_key({load: load.start + true / load.moves[0].weight}, 0.0)
     assert load.start == 0.0 and load.step > 0.0 and found[load.name] == pytest.approx(true)
@@ -279,6 +280,25 @@ def test_nothing_is_invented_and_a_calibration_that_is_off_is_said_to_be_off(cal
     assert "calibration itself was off" in verdict(result)
 
 
+def test_each_log_has_its_own_pads(calibration):
+    """Residuals of a log with other pads are those of a calibration for these pads, beside logs that have none."""
+    plant = plant_from_calibration(calibration)
+    log = log_of(simulate_log(plant, training(plant, 6.0), seed=3)[0])
+    other = {"pad_thickness_mm": 0.8 * calibration.pad_thickness_mm, "contact.clearance_rad": 6.0}
+    together = Bench([log, log], calibration, [{}, other]).residuals({})["stiffness"]
+    alone = [Bench([log], moved(calibration, values)).residuals({})["stiffness"] for values in ({}, other)]
+    assert np.array_equal(together, np.concatenate(alone)) and not np.array_equal(*alone)
+
+
+def test_on_its_own_data_nothing_is_looked_for_where_nothing_is_left(calibration):
+    plant, said = plant_from_calibration(calibration), []
+    log = log_of(simulate_log(plant, campaign(plant, np.random.default_rng(3), 3), seed=3)[0])
+    bench = Bench([log], calibration, own_data=True)
+    found = search.select(bench, lambda text, share: said.append(text))
+    assert not found.accepted and not any("catalogue" in text for text in said)
+    assert set(bench.channels) == {"stiffness", "torque"}
+
+
 def test_without_reference_the_paths_judge_each_other(calibration):
     frames = _logs(calibration, 5, {"viscous_friction": {"viscous_Nms_per_rad": 3e-4}}, reference=False)
     result = diagnose([log_of(frames[0])], calibration)
@@ -369,7 +389,8 @@ def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_
         start = Model.of(Bench([of], calibration))
         model = start.refined(["stiffness"])
         screening = Screening(model.bench, start)
-        reasons.append(screening.judged(model, screening.tested(model, [uneven])[0], {}).reason)
+        tested = screening.tested(model, [uneven])
+        reasons.append(screening.judged(model, tested[0], {}, tested).reason)
     assert not reasons[0] and reasons[1]
 
 

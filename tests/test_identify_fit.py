@@ -9,7 +9,7 @@ from synthetic_rig import datasheet, draw, pads
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
 from emb_daemon.identify.campaign import Campaign, CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
-from emb_daemon.identify.steps import noise
+from emb_daemon.identify.steps import noise, stiffness
 from emb_daemon.identify.steps.thickness import left_out_errors
 from emb_daemon.identify.steps.torque import fit_torque
 
@@ -83,6 +83,20 @@ def test_an_effect_that_is_not_there_is_not_clear_of_zero(effect):
     assert fit.value(share) < 3.0 * fit.sigmas[share] or fit.value(share) < 1e-3
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_one_more_relaxation_is_taken_in_where_it_is_and_only_there(there):
+    rng = np.random.default_rng(7)
+    truth = draw(rng, thicknesses=(6.0,))
+    own = {"effects.third_relaxation.share": 0.06, "effects.third_relaxation.time_constant_s": 5.0}
+    truth.dynamics.update(own if there else {})
+    found = stiffness.identify(pads(truth, rng), truth.nominal())
+    assert ("third_relaxation" in [effect.name for effect in found.chosen.effects]) == there
+    if there:
+        assert found.fit.rms == pytest.approx(truth.reference_noise_N, rel=0.05)
+        for key, value in own.items():
+            assert abs(found.values[key] - value) < 4.0 * found.sigmas[key]
+
+
 def test_the_free_regression_is_exact_on_data_of_its_form():
     """Thesis 3.4's own difference equation, computed here without the estimator's kernels."""
     rng = np.random.default_rng(11)
@@ -115,10 +129,12 @@ def test_integral_time_of_first_order_noise_is_its_time_constant():
     assert noise.integral_time(white) == pytest.approx(0.002, rel=0.1)
 
 
-def test_current_noise_tells_coloured_from_white():
+@pytest.mark.parametrize("difference_A", [0.0, 0.28])
+def test_current_noise_tells_what_is_coloured_from_a_difference_of_noisy_speeds(difference_A):
     rng = np.random.default_rng(19)
-    series = [_coloured(rng, 40_000, 0.3, 0.02) + rng.normal(0.0, 0.2, 40_000)]
-    sigma, time = noise.current_noise(series, 0.2)
+    white = rng.normal(0.0, difference_A / np.sqrt(2.0), 40_001)
+    series = [_coloured(rng, 40_000, 0.3, 0.02) + np.diff(white)]
+    sigma, time = noise.current_noise(series, difference_A)
     assert (sigma, time) == pytest.approx((0.3, 0.02), rel=0.1)
 
 

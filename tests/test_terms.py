@@ -1,5 +1,11 @@
 """Terms that no catalogue holds: what they do at their ports, and what of them a calibration may say."""
 
+import contextlib
+import io
+import os
+import subprocess
+import sys
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,6 +16,7 @@ from emb_daemon.calibration.files import dump_calibration, load_calibration
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.cli.main import main
 from emb_daemon.effects import terms
 from emb_daemon.errors import InputErrors, InvalidValue
 from emb_daemon.estimator.records import SAMPLE
@@ -235,3 +242,61 @@ def test_terms_are_few_and_have_names_of_their_own(calibration):
         fields = {name: getattr(calibration, name) for name in calibration.__struct_fields__} | {"terms": own}
         with pytest.raises(InvalidValue, match=said):
             Calibration(**fields)
+
+
+_REPLAYED = """
+import runpy, sys
+import numpy as np
+effect = runpy.run_path(sys.argv[1])["EFFECT"]
+from emb_daemon.effects.own import extend
+extend(effect)
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.offline.run import held, run_step
+samples = np.load(sys.argv[2])
+for calibration in sys.argv[3:5]:
+    trace = run_step(samples, held(to_parameters(load_calibration(calibration))))
+    np.save(calibration + ".npy", np.stack([trace[name] for name in ("force", "torque", "leverage")]))
+"""
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        Term(name="term:x", port="gear_friction", signal="motor_angle", shape="harmonic", gate="load", coefficient=0.1,
+             sine=0.05, scale=3.0, centre=1.0, low=-5.0, high=30.0),
+        Term(name="term:x", port="stiffness", signal="clamp_force", memory="slip", shape="odd_power", coefficient=0.03,
+             memory_scale=900.0, low=0.0, high=2e4),
+        Term(name="term:x", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
+             scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
+    ],
+    ids=lambda term: term.memory,
+)  # fmt: skip
+def test_an_exported_effect_is_the_term(term, calibration, tmp_path):
+    """By the command, in the form of a file of one's own: the estimator with it gives what it gives with the term."""
+    shipped = tmp_path / "term.yaml"
+    own = tmp_path / "effect.yaml"
+    plain = msgspec.structs.replace(calibration, provenance=None)
+    shipped.write_text(dump_calibration(msgspec.structs.replace(plain, terms=(term,))))
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert main(["effect", "export", str(shipped), "term:x", "--output", str(tmp_path / "found.py")]) == 0
+    own.write_text(dump_calibration(plain).replace("effects: {}\n", "") + out.getvalue().partition("\n")[2])
+    np.save(tmp_path / "samples.npy", drive(1.5))
+    files = [tmp_path / "found.py", tmp_path / "samples.npy", shipped, own]
+    # As plain Python: compiling the estimator anew for one effect more would take longer than everything else here.
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", _REPLAYED, *files], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found, expected = (np.load(f"{file}.npy") for file in (own, shipped))
+    plainly = run_step(drive(1.5), held(to_parameters(plain)))
+    names = ("force", "torque", "leverage")
+    assert any(np.nanmax(np.abs(row - plainly[name])) > 1e-9 for row, name in zip(found, names, strict=True))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_term_that_is_not_there_is_told_by_those_that_are(calibration, tmp_path, capsys):
+    file = tmp_path / "term.yaml"
+    file.write_text(dump_calibration(msgspec.structs.replace(calibration, terms=(constant("torque", 0.01),))))
+    assert main(["effect", "export", str(file), "term:y", "--output", str(tmp_path / "found.py")]) == 2
+    assert "term:x" in capsys.readouterr().err and not (tmp_path / "found.py").exists()

@@ -28,6 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.identify.campaign import load_campaign
     from emb_daemon.identify.report import build
     from emb_daemon.identify.run import identify
+    from emb_daemon.identify.steps.attribution import words
     from emb_daemon.logs.read import read_with_digest
 
     if arguments.example:
@@ -46,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
     _print(result.judged, result.thermal.figures)
+    print(words(result.attribution))
     print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s")
     return 0
 

@@ -18,6 +18,7 @@ COMMANDS = {
     "convert": "another rig's log as ours, by a mapping file",
     "identify": "calibration from a rig campaign, with its evidence",
     "diagnose": "find what the model lacks, add it, and show the error before and after",
+    "effect": "a term that diagnose found, as an effect file",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
     "compile": "the kernels as one library, for a daemon without a compiler",

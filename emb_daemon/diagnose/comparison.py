@@ -25,8 +25,8 @@ def errors_of(bench: Bench, trial: Trial, estimates: np.ndarray) -> EpisodeError
 
 def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
     """Errors of the running estimator over all logs of a bench, each from a fresh start."""
-    parameters = to_parameters(calibration)
-    return EpisodeErrors.joined([errors_of(bench, trial, estimate(trial.log.samples, parameters)) for trial in bench.trials])
+    found = [(trial, estimate(trial.log.samples, to_parameters(bench.on(trial, calibration)))) for trial in bench.trials]
+    return EpisodeErrors.joined([errors_of(bench, trial, estimates) for trial, estimates in found])
 
 
 def whole(bench: Bench) -> str:

@@ -54,11 +54,11 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     for number in range(_FOLDS):
         values = selection.applied(without)
         for channel in bench.channels:
-            values |= _refitted(selection, channel, without, fold != number)
-        parameters = to_parameters(bench.calibrated(values))
-        parts.append(
-            EpisodeErrors.joined([errors_of(bench, trial, estimate(trial.log.samples, parameters)) for trial in bench.trials])
-        )
+            values |= refitted(selection, channel, fold != number, without)
+        # A log with pads of its own has its own contact, too.
+        own = [bench.calibrated(values, trial.index if trial.mounted else None) for trial in bench.trials]
+        found = [estimate(trial.log.samples, to_parameters(c)) for trial, c in zip(bench.trials, own, strict=True)]
+        parts.append(EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, found, strict=True)]))
     result = parts[0]
     for number in range(1, _FOLDS):
         result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
@@ -66,8 +66,9 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     return result
 
 
-def _refitted(selection: Selection, channel: str, without: str, kept: np.ndarray) -> dict[Coordinate, float]:
-    """A channel's coordinates from some of the episodes; shapes, which are not linear, stand as fitted."""
+def refitted(selection: Selection, channel: str, kept: np.ndarray, without: str = "") -> dict[Coordinate, float]:
+    """A channel's coordinates from the episodes that are ``kept``, shape (episodes,), ``without`` one suspect; shapes, which
+    are not linear, stand as fitted."""
     model = selection.model
     linear = [c for c in model.own(channel) if not is_shape(c)]
     if channel == without or not linear or channel not in selection.touched:

@@ -4,7 +4,7 @@ A coordinate of the base calibration is a nuisance: a curve or a friction that i
 nor hide one, so every candidate is tested with all of its channel's base coordinates free.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +83,8 @@ _CURVE, _FRICTION, _SLOPE = 0.1, 0.3, 0.1
 _FRICTION_FORCE_N, _FRICTION_SPEED = 5000.0, 20.0
 #: Each power-on finds its own contact: standard deviation of the clearance, rad.
 _CLEARANCE_RAD = 0.5
+#: A parameter of the stiffness path whose work is done with the heat.
+HISTORY_TIME = "thermal.softening.history_time_s"
 #: Pads soften with heat, never stiffen: what was calibrated holds within a third or this, and never beyond the most, 1/K.
 _SOFTENING, _MOST_SOFTENING = 1e-4, 2e-3
 #: Phase runs away with the angle: an order is only ever touched up. Step and standard deviation, per turn.
@@ -91,13 +93,13 @@ _ORDER_STEP, _ORDER = 1e-4, 0.1
 _SHAPE = 0.5
 
 
-def base_coordinates(calibration: Calibration, logs: int) -> list[Coordinate]:
-    """Coordinates of the base calibration; the contact angle has one for each log."""
+def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float]) -> list[Coordinate]:
+    """Coordinates of the base calibration; the contact angle has one for each log, about its clearance."""
     clearance = parameter(calibration, "contact.clearance_rad")
     moves = (Move(clearance.key, 1.0, 0.0, np.inf),)
     result = [
-        Coordinate(clearance.key, "stiffness", clearance.value, clearance.step, _CLEARANCE_RAD, moves, unit="rad", log=log)
-        for log in range(logs)
+        Coordinate(clearance.key, "stiffness", start, clearance.step, _CLEARANCE_RAD, moves, unit="rad", log=log)
+        for log, start in enumerate(clearances_rad)
     ]
     curves = calibration.stiffness.curves
     mounted = int(np.argmin([abs(curve.pad_thickness_mm - calibration.pad_thickness_mm) for curve in curves]))
@@ -109,10 +111,14 @@ def base_coordinates(calibration: Calibration, logs: int) -> list[Coordinate]:
             result.append(_scale(calibration, keys, "stiffness", _CURVE))
     for name in ("per_K", "history_per_K"):
         known = parameter(calibration, f"thermal.softening.{name}")
-        prior = max(abs(known.value) / 3.0, _SOFTENING)
+        # Of what no log has shown yet only the usual size is known.
+        prior = max(abs(known.value) / 3.0, _SOFTENING) if known.value else _usual(known.step)
         move = (Move(known.key, 1.0, 0.0, _MOST_SOFTENING),)
         low, high = min(0.0, known.value), max(_MOST_SOFTENING, known.value)
         result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
+    if not calibration.thermal.softening.history_per_K:
+        # No log has shown it yet.
+        result.append(_scale(calibration, [HISTORY_TIME], "stiffness", 1.0))
     result += [_scale(calibration, [key], channel, prior) for key, channel, prior in _BASE]
     return result + _friction(calibration)
 

@@ -24,16 +24,16 @@ from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Progress, Selection
-from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, dependences
+from emb_daemon.diagnose.unexplained import Dependence, Left, dependences
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
-from emb_daemon.identify.steps.noise import force_error_levels, integral_time
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
+from emb_daemon.offline.levels import force_error_levels, integral_time
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Least number of episodes that tell effect from chance.
-_EPISODES = 6
+EPISODES = 6
 #: A stated noise this many times what is left is none.
 _OVERSTATED = 3.0
 #: Correlation from which two parameters are known only together.
@@ -60,6 +60,7 @@ class Diagnosis:
 
     Attributes:
         calibration: the augmented one.
+        selection: what the search chose.
         findings: one for each effect of the catalogue, accepted ones first.
         recalibrated: base parameters, by key.
         initial, residual: by channel, on the fit logs, before anything and after everything.
@@ -74,6 +75,7 @@ class Diagnosis:
     bench: Bench
     judges: Bench
     judged_on: str
+    selection: Selection
     findings: tuple[Candidate, ...]
     recalibrated: Mapping[str, Recalibrated]
     signals: Mapping[str, np.ndarray]
@@ -132,16 +134,22 @@ def diagnose(
     _refuse_same(fit_logs, validate)
     progress("cutting the logs into episodes", 0.02)
     bench = Bench(fit_logs, calibration)
-    if bench.episodes < _EPISODES:
-        told = f"only {bench.episodes} episodes, expected at least {_EPISODES} to tell effect from chance"
+    if bench.episodes < EPISODES:
+        told = f"only {bench.episodes} episodes, expected at least {EPISODES} to tell effect from chance"
         raise InputError(f"{fit_logs[0].path}: {told}")
-    judges = Bench(validate, calibration) if validate else None
+    result = diagnosed(bench, Bench(validate, calibration) if validate else None, progress)
+    return replace(result, seconds=time.monotonic() - begin)
+
+
+def diagnosed(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
+    """The same of logs that are cut into episodes already; ``judges``: the validation logs."""
+    begin, calibration = time.monotonic(), bench.calibration
     selection = select(bench, progress)
     progress("confirming with the running estimator", 0.8)
     selection, left_out = confirmed(selection, judges)
     applied = selection.applied()
     augmented = (
-        _with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
+        with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
     )
     progress("judging", 0.9)
     judging = judges or bench
@@ -149,12 +157,14 @@ def diagnose(
     after = errors(judging, augmented) if judges else left_out
     final = judging.under(augmented).residuals({}) if judges else selection.model.residual
     judged_before = judging.residuals({})
+    logs = [trial.log for trial in bench.trials]
     result = Diagnosis(
         original=calibration,
-        calibration=_with_provenance(augmented, selection, after, judges is not None, fit_logs),
+        calibration=_with_provenance(augmented, selection, after, judges is not None, logs),
         bench=bench,
         judges=judging,
         judged_on="validate" if judges else "left_out_episodes",
+        selection=selection,
         findings=findings(selection),
         recalibrated=_recalibrated(selection),
         signals=selection.screening.signals,
@@ -164,7 +174,7 @@ def diagnose(
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
         judged_residual={c: (_rms(judged_before[c]), _rms(final[c])) for c in judging.channels} if judges else {},
-        left=_left(selection, judged_before, final, judging, calibration),
+        left=_left(selection, judged_before, final, judging),
         left_before=selection.at_first,
         seconds=time.monotonic() - begin,
     )
@@ -283,7 +293,6 @@ def _left(
     before: Mapping[str, np.ndarray],
     after: Mapping[str, np.ndarray],
     judging: Bench,
-    calibration: Calibration,
 ) -> dict[str, Left]:
     """What is left in each channel: its size where the error is judged, its dependences where effects were looked for."""
     model, screening, result = selection.model, selection.screening, {}
@@ -300,7 +309,7 @@ def _left(
             found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
         first, last = _rms(before[channel]), _rms(after[channel])
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, achieved(calibration, channel, force, rise), share, tuple(found))
+        result[channel] = Left(channel, last, screening.achieved(model, channel, force, rise), share, tuple(found))
     return result
 
 
@@ -335,7 +344,7 @@ def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
     return msgspec.structs.replace(calibration, noise=levels)
 
 
-def _with_terms(calibration: Calibration, selection: Selection) -> Calibration:
+def with_terms(calibration: Calibration, selection: Selection) -> Calibration:
     """The calibration with the terms that are in use, each with its standard deviation and where it comes from."""
     model, kept = selection.model, []
     for term in calibration.terms:

@@ -20,16 +20,15 @@ from emb_daemon.diagnose.evidence import Evidence, leave_out
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, made_effect, rippling
 from emb_daemon.diagnose.held_heat import follow_signals, record_heat
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.orders import strongest_order
+from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import UNSURE, Selection
-from emb_daemon.diagnose.unexplained import achieved, is_beyond
+from emb_daemon.diagnose.unexplained import is_beyond, sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
 from emb_daemon.offline.run import held
-from emb_daemon.offline.score import rmse
 
 #: A term is made if a smooth function of some signal explains this share of the rest, less what of it differs from sample to
 #: sample; or if that much of the rest does not: what memories do is no function of any signal now. Of the torque path of
@@ -46,8 +45,8 @@ _CHANCES, _SHIFTS, _BOOTSTRAPS = 99, 5, 100
 _STABLE, _AS_GOOD = 0.8, 0.95
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
-#: Orders of ripples that are scanned.
-_ORDERS = (0.05, 100.0)
+#: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
+_ORDERS, _LOBES = (0.05, 100.0), 4
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ def _wanted(selection: Selection, channel: str) -> bool:
     """Whether enough is left, and enough of it looks explicable, for a term to be made up."""
     model, screening = selection.model, selection.screening
     residual, square = model.residual[channel], model.noise(channel)
-    known = achieved(model.bench.calibration, channel, screening.signals["clamp_force"], np.zeros(0))
-    noise = _noise(residual)
+    known = screening.achieved(model, channel, screening.signals["clamp_force"], np.zeros(0))
+    noise = sample_noise(residual) ** 2
     if is_beyond(np.sqrt(square), known) or square - noise > _STRUCTURED * square:
         return True
     ceiling = model.rms(screening.rival(model, channel, {})[0], channel)
@@ -149,11 +148,6 @@ class Prospect:
     def is_of(self, other: "Prospect") -> bool:
         """Whether it says the same of port and signal."""
         return (self.form.port, self.form.signal) == (other.form.port, other.form.signal)
-
-
-def _noise(residual: np.ndarray) -> float:
-    """Mean square of what differs from sample to sample."""
-    return 0.5 * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)]) ** 2
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
@@ -226,7 +220,7 @@ class _Search:
         found = [Prospect(form, own, model.evidence(self.channel, own)) for form, own in zip(best, exact, strict=True)]
         moments = model.moments(self.channel, [model.columns[c] for c in own])
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
-        alone -= model.counted(self.channel) * _noise(model.residual[self.channel])
+        alone -= model.counted(self.channel) * sample_noise(model.residual[self.channel]) ** 2
         kept = [p for p in found if p.evidence.p_value < UNSURE and p.evidence.gain > 0.0 and _stays_in_bounds(p)]
         length = {id(p): _length(p, alone, model.bench.episodes) + np.log(len(self.forms)) for p in kept}
         return sorted((p for p in kept if length[id(p)] < 0.0), key=lambda p: length[id(p)])
@@ -360,7 +354,7 @@ def _shortlisted(forms: Sequence[Form], scores: Scores) -> list[Form]:
 
 
 def _ripples(search: _Search) -> list[Form]:
-    """The strongest ripple over the motor angle at each port that may have one."""
+    """The strongest ripples over the motor angle at each port that may have one."""
     found = []
     for port in rippling(search.ports) if "motor_angle" in search.covered else ():
         effect = Effect(
@@ -368,9 +362,8 @@ def _ripples(search: _Search) -> list[Form]:
             parameters=(Parameter("o", "1", *_ORDERS, 1.0, "", _ORDERS),),
             harmonic=Harmonic("o", "c", "s", grows_with="port"),
         )  # fmt: skip
-        order, _ = strongest_order(search.model, effect, search.channel, {"port": search.sensitivities[port]})
-        if order:
-            found.append(harmonic(port, order, search.model.bench.middle, search.covered))
+        orders, _ = strongest_orders(search.model, effect, search.channel, {"port": search.sensitivities[port]}, _LOBES)
+        found += [harmonic(port, order, search.model.bench.middle, search.covered) for order in orders]
     return found
 
 

@@ -45,7 +45,8 @@ class Model:
     def of(cls, bench: Bench) -> "Model":
         """The calibration as it is: its base parameters and its effects free, nothing moved."""
         coordinates = []
-        for coordinate in base_coordinates(bench.calibration, len(bench.trials)):
+        clearances = [bench.on(trial).contact.clearance_rad for trial in bench.trials]
+        for coordinate in base_coordinates(bench.calibration, clearances):
             if channel := bench.channel_of(coordinate.channel):
                 coordinates.append(replace(coordinate, channel=channel))
         for effect in REGISTRY:

@@ -1,4 +1,4 @@
-"""Over which order per motor turn does a residual vary most?"""
+"""Over which orders per motor turn does a residual vary most?"""
 
 import numpy as np
 
@@ -9,9 +9,11 @@ from emb_daemon.effects.base import Effect
 _BINS = 8
 
 
-def strongest_order(model: Model, effect: Effect, channel: str, signals: dict[str, np.ndarray]) -> tuple[float | None, int]:
-    """Order of ``effect``'s harmonic over which the channel's residual varies most, None if it never does; and how many
-    independent orders were looked at."""
+def strongest_orders(
+    model: Model, effect: Effect, channel: str, signals: dict[str, np.ndarray], most: int = 1
+) -> tuple[list[float], int]:
+    """Orders of ``effect``'s harmonic over which the channel's residual varies most, strongest first; and how many independent
+    orders were looked at. Logs at places far apart have side lobes nearly as strong as what makes them: ``most`` of them."""
     samples = np.concatenate([trial.log.samples for trial in model.bench.trials])
     angle, travel = samples["angle"], np.abs(samples["speed"]) * samples["dt"]
     harmonic, limits = effect.harmonic, effect.parameter(effect.harmonic.order).starts
@@ -22,7 +24,8 @@ def strongest_order(model: Model, effect: Effect, channel: str, signals: dict[st
         orders = np.arange(max(limits[0], 4.0 * np.pi / span), limits[1], 0.5 * np.pi / span)
     residual = _beside_the_model(model, channel)
     weight = signals[harmonic.grows_with] if harmonic.grows_with else np.ones(len(residual))
-    best, found, low = 0.0, None, orders[0]
+    peaks: list[tuple[float, float]] = []
+    low = orders[0]
     while low < orders[-1]:
         # One octave at a time: samples that pass more than a sixth of a period smear it, bins are an eighth of one wide.
         high = 2.0 * low
@@ -35,10 +38,16 @@ def strongest_order(model: Model, effect: Effect, channel: str, signals: dict[st
         if harmonic.whole and len(chosen):
             power, scanned = np.interp(chosen, scanned, power), chosen
         inside = (scanned >= max(low, orders[0])) & (scanned < min(high, orders[-1] + 1e-9))
-        if inside.any() and power[inside].max() > best:
-            best, found = float(power[inside].max()), float(scanned[inside][np.argmax(power[inside])])
+        peaks += _peaks(power[inside], scanned[inside])
         low = high
-    return found, len(orders)
+    return [order for _, order in sorted(peaks, reverse=True)[:most]], len(orders)
+
+
+def _peaks(power: np.ndarray, orders: np.ndarray) -> list[tuple[float, float]]:
+    """(power, order) where the power is above that of both neighbours."""
+    beside = np.concatenate([[-np.inf], power, [-np.inf]])
+    top = np.flatnonzero((power > 0.0) & (power >= beside[:-2]) & (power > beside[2:]))
+    return [(float(power[row]), float(orders[row])) for row in top]
 
 
 def _beside_the_model(model: Model, channel: str) -> np.ndarray:

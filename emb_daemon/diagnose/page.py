@@ -26,13 +26,18 @@ def page(diagnosis: Diagnosis) -> str:
     )
     details = [f"{title(f)}: {f.effect.equation}" for f in diagnosis.accepted]
     report.verdict(True if diagnosis.unexplained is None else None, verdict(diagnosis), details)
+    sections(report, diagnosis)
+    return report.render()
+
+
+def sections(report: Page, diagnosis: Diagnosis) -> None:
+    """Error before and after, evidence for what was found, what is left, and everything that was tried."""
     _errors(report, diagnosis)
     for finding in diagnosis.accepted:
         _evidence(report, diagnosis, finding)
     _left(report, diagnosis)
     _candidates(report, diagnosis)
     _recalibration(report, diagnosis)
-    return report.render()
 
 
 def _errors(report: Page, diagnosis: Diagnosis) -> None:
@@ -127,12 +132,11 @@ def _unit(finding: Candidate, name: str) -> str:
 
 def _left(report: Page, diagnosis: Diagnosis) -> None:
     section = report.section("What is left")
+    least = "what is noise" if diagnosis.bench.own_data else "what the calibration achieved on its own data"
     if diagnosis.unexplained is None:
-        section.text(
-            "Nothing clearly above what the calibration achieved on its own data, and no smooth function of any signal."
-        )
+        section.text(f"Nothing clearly above {least}, and no smooth function of any signal.")
     section.table(
-        ["", "left, RMS", "achieved by the calibration", "unit", "share of before", ""],
+        ["", "left, RMS", least, "unit", "share of before", ""],
         [
             [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}", UNITS[c], f"{p.share:.2f}", "not explained" if p.present else ""]
             for c, p in diagnosis.left.items()

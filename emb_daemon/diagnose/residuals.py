@@ -14,10 +14,11 @@ import numpy as np
 
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.diagnose.coordinates import Coordinate, Values, by_key
+from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.held_heat import record_heat, run_held
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_step
 
@@ -46,19 +47,21 @@ class Trial:
     temperature_rows: np.ndarray
     temperature_C: np.ndarray
     brake_torque_Nm: np.ndarray
+    #: What the calibration says otherwise of this log alone, by key: pads of another thickness, and their clearance.
+    mounted: Mapping[str, float]
 
     @property
     def has_force(self) -> bool:
         return bool(np.isfinite(self.force_N).mean() > _RECORDED)
 
 
-def make_trial(log: Log, index: int, stiffness_N: np.ndarray) -> Trial:
+def make_trial(log: Log, index: int, stiffness_N: np.ndarray, mounted: Mapping[str, float]) -> Trial:
     """Prepare a log. ``stiffness_N``: an estimate of the clamp force, to cut episodes where no reference is."""
     force, torque = _synchronous(log)
     rows, measured = _temperatures(log)
     known = np.isfinite(force).mean() > _RECORDED
     cut = episodes(log.time_s, np.nan_to_num(force if known else stiffness_N), log.samples["angle"])
-    return Trial(log, index, force, cut, rows, measured, torque)
+    return Trial(log, index, force, cut, rows, measured, torque, mounted)
 
 
 def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
@@ -112,15 +115,28 @@ class Bench:
         middle: of the motor angles that occur, rad; harmonics are fitted about it.
     """
 
-    def __init__(self, logs: Sequence[Log], calibration: Calibration, workers: int = 2):
-        self.calibration = calibration
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        calibration: Calibration,
+        mounted: Sequence[Mapping[str, float]] = (),
+        own_data: bool = False,
+        workers: int = 2,
+    ):
+        """``mounted``: for each log what the calibration says otherwise of it alone (`Trial.mounted`). ``own_data``:
+        the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
+        self.calibration, self.own_data = calibration, own_data
         self._pool = ThreadPoolExecutor(workers)
-        parameters = held(to_parameters(calibration))
-        forces = self._pool.map(lambda log: run_step(log.samples, parameters)["force"], logs)
-        self.trials = [make_trial(log, index, force) for index, (log, force) in enumerate(zip(logs, forces, strict=True))]
+        mounted = mounted or [{}] * len(logs)
+
+        def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
+            force = run_step(log.samples, held(to_parameters(moved(calibration, here))))["force"]
+            return make_trial(log, index, force, here)
+
+        self.trials = list(self._pool.map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
         self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
-        self.channels = self._channels()
+        self.channels = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
@@ -169,8 +185,13 @@ class Bench:
         return result
 
     def calibrated(self, values: Values, log: int | None = None) -> Calibration:
-        """The calibration with coordinates at ``values``, as they apply to a log."""
-        return moved(self.calibration, by_key(values, self.middle, log))
+        """The calibration with coordinates at ``values``; with ``log`` as they apply to that one, its own pads mounted."""
+        base = self.calibration if log is None else self.on(self.trials[log])
+        return moved(base, by_key(values, self.middle, log))
+
+    def on(self, trial: Trial, calibration: Calibration | None = None) -> Calibration:
+        """A calibration, the bench's own if none is given, for the pads that a log has."""
+        return moved(calibration or self.calibration, trial.mounted)
 
     def residuals(self, values: Values) -> dict[str, np.ndarray]:
         """Residual by channel over all logs."""
@@ -195,7 +216,8 @@ class Bench:
             mean[0] *= 0.5
         # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
         current = (trace["torque"] - trace["leverage"] * mean) / trace["torque_constant"]
-        torque = np.nan_to_num(current * self.newton_per_ampere, nan=0.0)
+        # The current is a mean over the cycle before its sample: of a longer way it tells the end.
+        torque = np.where(samples["dt"] <= ONE_CYCLE_S, np.nan_to_num(current * self.newton_per_ampere, nan=0.0), 0.0)
         result = {"stiffness": np.nan_to_num(force - trace["force"]), "torque": torque, "innovation": torque}
         if "temperature" in self.channels:
             temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]
@@ -222,7 +244,8 @@ class Bench:
             now = tried.get(coordinate, coordinate.start)
             step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
             tried[coordinate] = now + step
-            return (at[coordinate.channel] - self._probed(tried, coordinate.channel, heat)) / step
+            known = [] if coordinate.name == HISTORY_TIME else heat
+            return (at[coordinate.channel] - self._probed(tried, coordinate.channel, known)) / step
 
         return list(self._pool.map(answer, probes))
 

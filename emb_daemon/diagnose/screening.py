@@ -20,9 +20,10 @@ import numpy as np
 from emb_daemon.diagnose.coordinates import Coordinate, effect_coordinates
 from emb_daemon.diagnose.evidence import NOT_EXCITED, Evidence, false_discovery, leave_out
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.orders import strongest_order
+from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
 from emb_daemon.diagnose.signals import signals, smooth_basis
+from emb_daemon.diagnose.unexplained import achieved, sample_noise
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS, Effect, Placebo
 from emb_daemon.offline.score import rmse
@@ -112,6 +113,13 @@ class Screening:
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         return max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel])
 
+    def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
+        """RMS that a channel's residual need not exceed: what the calibration achieved on its own data, by what it states
+        (`unexplained.achieved`), or where these are its own data by what of the residual is noise or does not matter."""
+        if self.bench.own_data:
+            return max(sample_noise(model.residual[channel]), self.floor(model, channel))
+        return achieved(self.bench.calibration, channel, force_N, rise_K)
+
     # -- tests --------------------------------------------------------------------------------------------------------
 
     def tested(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
@@ -137,8 +145,8 @@ class Screening:
             return [()], 1
         parameter = effect.shapes[0]
         if effect.harmonic:
-            order, tried = strongest_order(model, effect, own[parameter.name].channel, self.signals)
-            return ([((own[parameter.name], order),)] if order else []), tried
+            orders, tried = strongest_orders(model, effect, own[parameter.name].channel, self.signals)
+            return [((own[parameter.name], order),) for order in orders], tried
         return [((own[parameter.name], start),) for start in parameter.starts], len(parameter.starts)
 
     def _best(self, model: Model, effect: Effect, shapes: list, tried: int, columns: dict) -> Candidate:
@@ -173,8 +181,9 @@ class Screening:
 
     # -- objections ---------------------------------------------------------------------------------------------------
 
-    def judged(self, model: Model, candidate: Candidate, rivals: dict) -> Candidate:
-        """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked."""
+    def judged(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate]) -> Candidate:
+        """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked. ``tested``: all
+        that were tested with it."""
         effect, evidence = candidate.effect, candidate.evidence
         if candidate.channel is None:
             return replace(candidate, reason="these logs hold no reference on which it would show")
@@ -183,9 +192,9 @@ class Screening:
         if candidate.q_value > Q_VALUE:
             clusters = f"{evidence.clusters:.0f} effective episodes (q = {candidate.q_value:.2g})"
             return replace(candidate, reason=f"not significant over {clusters}")
-        return self.plausible(model, candidate, rivals)
+        return self.plausible(model, candidate, rivals, tested)
 
-    def plausible(self, model: Model, candidate: Candidate, rivals: dict) -> Candidate:
+    def plausible(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate] = ()) -> Candidate:
         """The same but for chance."""
         channel, evidence, unit = candidate.channel, candidate.evidence, UNITS[candidate.channel]
         floor = self.floor(model, channel)
@@ -198,7 +207,7 @@ class Screening:
             if not c.low - 2.0 * sigma <= value <= c.high + 2.0 * sigma:
                 return replace(candidate, reason=f"{c.parameter} = {value:.3g} {c.unit} is outside what physics allows")
         gain, signal = self.rival(model, channel, rivals)
-        if evidence.gain < _OF_MODEL_FREE * gain:
+        if evidence.gain < _OF_MODEL_FREE * gain and _together(model, candidate, signal, tested) < _OF_MODEL_FREE * gain:
             shadow = (
                 f"explains {candidate.gain:.3g} {unit} RMS where a smooth function of {signal} explains "
                 f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
@@ -273,6 +282,15 @@ class Screening:
     def _columns(self, model: Model, bench: Bench, candidate: Candidate, shape: tuple) -> list[np.ndarray]:
         at = model.residual if bench is self.bench else bench.residuals(model.values)
         return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at)
+
+
+def _together(model: Model, candidate: Candidate, signal: str, tested: Sequence[Candidate]) -> float:
+    """Gain on left-out episodes of all proven candidates that follow the same signal: what a smooth function of it explains
+    may be two effects, viscous and Stribeck friction, neither of which is a shadow."""
+    alike = [c for c in tested if (c.channel, c.effect.signal) == (candidate.channel, signal) and c.q_value <= Q_VALUE]
+    if len(alike) < 2 or candidate not in alike:
+        return 0.0
+    return model.evidence(candidate.channel, [column for c in alike for column in c.columns]).gain
 
 
 def groups(effect: Effect, coordinates: Sequence[Coordinate]) -> list[list[Coordinate]]:

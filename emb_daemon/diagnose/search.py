@@ -8,12 +8,14 @@ each round.
 
 from dataclasses import replace
 
+import numpy as np
+
 from emb_daemon.diagnose.grammar import made
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.selection import Progress, Selection, changes, one_round, recalibrated, revised, settled_heat
-from emb_daemon.diagnose.unexplained import dependences
+from emb_daemon.diagnose.unexplained import dependences, is_beyond
 from emb_daemon.effects import REGISTRY
 
 
@@ -26,12 +28,16 @@ def select(bench: Bench, progress: Progress) -> Selection:
     model = start.refined(bench.channels)
     screening = Screening(bench, start)
     at_first = {
-        channel: dependences(channel, screening.dependence(model, channel), model.counted(channel), 0.0)
+        channel: dependences(
+            channel, screening.dependence(model, channel), model.counted(channel), screening.floor(model, channel)
+        )
         for channel in bench.channels
         if channel in FORCE_CHANNELS
     }
     selection = Selection(model, screening, at_first=at_first)
     selection = replace(selection, recalibrated=recalibrated(selection, start))
+    if bench.own_data and not _anything_left(selection):
+        return changes(settled_heat(selection))
     for number in range(len(REGISTRY)):
         progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
         before = selection.accepted
@@ -41,3 +47,14 @@ def select(bench: Bench, progress: Progress) -> Selection:
     selection = made(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
     return changes(revised(settled_heat(selection)))
+
+
+def _anything_left(selection: Selection) -> bool:
+    """Whether a channel's residual depends on anything that matters, or is clearly more than it need be."""
+    model, screening = selection.model, selection.screening
+    force = screening.signals["clamp_force"]
+    return any(
+        any(d.matters for d in found)
+        or is_beyond(np.sqrt(model.noise(channel)), screening.achieved(model, channel, force, np.zeros(0)))
+        for channel, found in selection.at_first.items()
+    )

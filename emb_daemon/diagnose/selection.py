@@ -148,8 +148,11 @@ def one_round(selection: Selection) -> Selection:
     model, screening = selection.model, selection.screening
     gone = {*selection.accepted, *selection.dropped}
     left = [e for e in REGISTRY if e.name not in gone and not model.of_effect(e.name)]
+    apart = [e for e in left if e.beside and not model.of_effect(e.beside)]
+    left = [e for e in left if e not in apart]
     rivals: dict = {}
-    tested = [screening.judged(model, c, rivals) for c in screening.tested(model, left)]
+    found = screening.tested(model, left)
+    tested = [screening.judged(model, c, rivals, found) for c in found]
     winners, losers = [], []
     for channel in model.bench.channels:
         passed = [c for c in tested if c.channel == channel and not c.reason]
@@ -162,6 +165,8 @@ def one_round(selection: Selection) -> Selection:
         tested = [screening.with_placebos(model, c) for c in tested]
     confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
     selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
+    alone = (Candidate(e, None, reason=f"one more element beside {e.beside}, which is not there") for e in apart)
+    selection = selection.noted(alone)
     return selection._entered(winners) if winners else _tried(selection, tested, rivals)
 
 

@@ -17,10 +17,9 @@ _APPLIED_N = 150.0
 def signals(bench: Bench) -> dict[str, np.ndarray]:
     """Measured and estimated signals at every sample of all logs, under the names of the report."""
     columns: dict[str, list[np.ndarray]] = {}
-    parameters = held(to_parameters(bench.calibration))
     for trial in bench.trials:
         samples = trial.log.samples
-        estimates = estimate(samples, parameters)
+        estimates = estimate(samples, held(to_parameters(bench.on(trial))))
         # The estimate, not the reference: the reference's noise is part of the residual.
         force = estimates["stiffness_force"]
         wheel = np.where(samples["has_wheel_speed"], np.nan_to_num(samples["wheel_speed"]), 0.0)

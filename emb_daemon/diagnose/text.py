@@ -114,10 +114,9 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
         return []
     unit, strongest = UNITS[left.channel], left.strongest
     if left.beyond:
-        text = (
-            f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, "
-            f"where the calibration achieved {left.achieved:.3g} {unit} on its own data"
-        )
+        size = f"{left.achieved:.3g} {unit}"
+        known = f"{size} are noise" if diagnosis.bench.own_data else f"the calibration achieved {size} on its own data"
+        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     return [f"{text}, which depend most on {strongest.signal.replace('_', ' ')}." if strongest else f"{text}."]

@@ -95,6 +95,11 @@ def is_beyond(rms: float, known: float) -> bool:
     return rms > _CLEARLY * known
 
 
+def sample_noise(residual: np.ndarray) -> float:
+    """RMS of what of a residual differs from sample to sample; zero means none."""
+    return float(np.sqrt(0.5)) * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)])
+
+
 def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
     """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
     nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_daemon.effects.terms import PORTS
+
 
 @dataclass(frozen=True)
 class Hook:
@@ -134,7 +136,8 @@ class Effect:
     Attributes:
         hook: where it enters, one of `HOOKS`.
         term: what it adds there, compiled (`emb_daemon.jit.njit`), exactly zero at zero amplitudes. Its arguments are asked
-            for by name: ``p`` its parameters, ``s`` its state, ``value``, and what the hook offers.
+            for by name: ``p`` its parameters, ``s`` its state, ``value``, what the hook offers, and where terms may add, too,
+            the ``signals`` that they see (`effects.terms.SIGNALS`).
         equation: the term as an engineer writes it.
         source: paper, standard or textbook.
         state: numpy dtype of what the running term remembers, or None.
@@ -142,6 +145,7 @@ class Effect:
         manoeuvre: what a driver of the rig does to make it visible and tell it from others.
         placebos: what must destroy the finding.
         harmonic: how its shape is looked for, if it is a harmonic of the motor angle.
+        beside: effect of which it is one more element, and without which it is not looked for.
     """
 
     name: str
@@ -155,11 +159,13 @@ class Effect:
     manoeuvre: str = ""
     placebos: tuple[Placebo, ...] = ()
     harmonic: Harmonic | None = None
+    beside: str = ""
 
     def __post_init__(self):
         if self.hook not in HOOKS:
             raise ValueError(f"effect {self.name}: there is no hook {self.hook}; there are {', '.join(HOOKS)}")
         offered = {"p", "value", *HOOKS[self.hook].arguments} | ({"s"} if self.state is not None else set())
+        offered |= {"signals"} if self.hook in PORTS else set()
         if unknown := set(self.arguments) - offered:
             raise ValueError(f"effect {self.name}: {self.hook} does not offer {', '.join(sorted(unknown))}")
 

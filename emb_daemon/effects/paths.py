@@ -19,7 +19,7 @@ def _source(name: str, hook: Hook) -> str:
         lines.append(f"    value = {hook.start!r}")
     for effect in effects.REGISTRY:
         if effect.hook == name:
-            own = {"p": f"e.{effect.name}", "s": f"s.{effect.name}"}
+            own = {"p": f"e.{effect.name}", "s": f"s.{effect.name}", "signals": "s.terms.signal"}
             lines.append(f"    value += {effect.name}({', '.join(own.get(a, a) for a in effect.arguments)})")
     if name in terms.PORTS:
         lines.append(f"    value += s.terms.added[{terms.PORTS.index(name)}]")
@@ -33,7 +33,17 @@ def _compose(name: str):
     return njit(scope[name])
 
 
-look = terms.look
+#: Whether an effect sees what terms see, which is followed without any term then.
+_WATCHED = any("signals" in effect.arguments for effect in effects.REGISTRY)
+
+
+@njit
+def look(e, s, p, m):
+    """What terms see and add at this sample."""
+    if _WATCHED or e.count > 0:
+        terms.look(e, s, p, m)
+
+
 thickness = _compose("thickness")
 motor_angle = _compose("motor_angle")
 stiffness = _compose("stiffness")

@@ -11,7 +11,7 @@ STATE = np.dtype([("force", "f8"), ("before", "f8")], align=True)
 
 @njit
 def term(p, s, value, dt):
-    """Force in N that is still to come: share of the static force ``value`` that lags with the second time constant."""
+    """Force in N that is still to come: share of the static force ``value`` that lags with the time constant."""
     if p.share == 0.0:
         return 0.0
     s.force = first_order_lag(s.force, s.before, value, dt, p.time_constant_s)

@@ -2,7 +2,7 @@
 
 A term is coefficient × shape(memory(signal)) × gate at one port of the physics. `emb_daemon.diagnose.grammar` makes them;
 `Calibration.terms` holds them, checked when the file is loaded. Nothing executable comes from a file. Without terms the kernel
-returns at once.
+is not called.
 """
 
 from math import cos, exp, hypot, sin, sqrt
@@ -192,8 +192,6 @@ def _doubt(q, x, added, s):
 @njit
 def look(e, s, p, m):
     """All terms at this sample. ``e`` PARAMETERS, ``s`` the estimator's state, ``p`` its parameters, ``m`` the sample."""
-    if e.count == 0:
-        return
     t = s.effects.terms
     _follow(t.signal, s, m)
     for port in range(len(t.added)):

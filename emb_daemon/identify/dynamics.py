@@ -18,10 +18,14 @@ TERMS = 3
 RELAXATION = "stiffness.relaxation_time_s"
 #: By how much the rig's reference is later than its resolver, s: fitted beside the calibration's keys, none of the brake's.
 DELAY = "reference delay"
-#: Effects on the static force, which the dynamics may have or not.
-OPTIONAL = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
-#: Where shapes of such effects begin: times the lag's time constant, and as a share of the travel.
+#: Effects on the static force, which the dynamics may have or not, and further elements of them.
+_STATIC = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
+OPTIONAL = tuple(effect for effect in _STATIC if not effect.beside)
+FURTHER = tuple(effect for effect in _STATIC if effect.beside)
+#: Where shapes of such effects begin: times the lag's time constant, and as a share of the travel; of one more element beside
+#: another, times the other's.
 _TIMES, _SHARE_OF_TRAVEL = 10.0, 0.05
+_MORE = {"s": 10.0, "rad": 0.25}
 #: Further starting points of those that are an angle, times the first, and evaluations that each is given to prove itself.
 _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
@@ -190,7 +194,8 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
     values = {RELAXATION: time}
     for effect in effects:
         for p in effect.parameters:
-            start = usual.get(p.unit, p.prior) if p.starts else p.prior
+            more = _MORE.get(p.unit, 1.0) if effect.beside else 1.0
+            start = more * usual.get(p.unit, p.prior) if p.starts else p.prior
             values[f"effects.{effect.name}.{p.name}"] = float(np.clip(start, p.low, p.high))
     for pads in groups:
         log = pads.logs[-1]

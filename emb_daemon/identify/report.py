@@ -3,7 +3,7 @@
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.identify import judge
 from emb_daemon.identify.run import Identification
-from emb_daemon.identify.steps import noise, stiffness, thermal, thickness, torque
+from emb_daemon.identify.steps import attribution, noise, stiffness, thermal, thickness, torque
 from emb_daemon.report import Page
 
 
@@ -23,6 +23,7 @@ def build(result: Identification) -> Page:
     torque.section(page, result.torque)
     noise.section(page, calibration)
     thermal.section(page, result.thermal, calibration)
+    attribution.section(page, result.attribution)
     _logs(page, result)
     return page
 

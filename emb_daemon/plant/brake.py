@@ -187,17 +187,23 @@ def clamp(p, s):
     # The clearance is what the motor turns until contact when closing.
     x = s.driven_angle + half + grown(p, s) + 1e-6 * _drawn(e.drawn_thickness, s, 1) / p.gear_gain - p.contact_angle
     s.static_force = static_curve(p, x)
-    hysteresis = e.stiffness_hysteresis
+    hysteresis, further = e.stiffness_hysteresis, e.second_hysteresis
+    travel = max(x, 0.0) - max(s.past_contact, 0.0)
     if hysteresis.share != 0.0:
-        travel = max(x, 0.0) - max(s.past_contact, 0.0)
         s.slip = min(max(s.slip + travel / hysteresis.slip_angle_rad, -1.0), 1.0)
+    if further.share != 0.0:
+        s.further_slip = min(max(s.further_slip + travel / further.slip_angle_rad, -1.0), 1.0)
     s.past_contact = x
-    drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip)
+    drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip + further.share * s.further_slip)
     drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + _drawn(e.drawn_stiffness, s, 0)
     excitation = drive
     if e.second_relaxation.share != 0.0:
         s.slow = _settle(s.slow, s.drive, drive, e.second_relaxation.time_constant_s)
         excitation += e.second_relaxation.share * (s.slow - drive)
+    if e.third_relaxation.share != 0.0:
+        before, s.settled = s.settled, excitation
+        s.slower = _settle(s.slower, before, s.settled, e.third_relaxation.time_constant_s)
+        excitation += e.third_relaxation.share * (s.slower - s.settled)
     if e.clamp_creep.share != 0.0:
         s.creep = _settle(s.creep, s.drive, drive, e.clamp_creep.time_constant_s)
         excitation += e.clamp_creep.share * (s.creep - drive)

@@ -66,8 +66,16 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("share", "1", "half width of the loop over the clamp force"),
         Field("slip_angle_rad", "rad", "motor angle over which the slip element stretches"),
     ),
+    "second_hysteresis": (
+        Field("share", "1", "half width of a second element's loop over the clamp force"),
+        Field("slip_angle_rad", "rad", "motor angle over which that stretches"),
+    ),
     "second_relaxation": (
         Field("share", "1", "share of the force that settles slowly"),
+        Field("time_constant_s", "s", "its time constant"),
+    ),
+    "third_relaxation": (
+        Field("share", "1", "share of the force that settles more slowly still"),
         Field("time_constant_s", "s", "its time constant"),
     ),
     "signal_delay": (Field("delay_s", "s", "age of the measured motor angle, up to 15 ms"),),
@@ -187,12 +195,15 @@ PLANT = np.dtype(
 PLANT_STATE = np.dtype(
     [
         *fields("f8", "angle speed current friction"),
-        # Clamp: backlash output, travel past contact, slip element, drive of the relaxations and their states.
+        # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
         ("driven_angle", "f8"),
         ("past_contact", "f8"),
         ("slip", "f8"),
+        ("further_slip", "f8"),
         ("drive", "f8"),
         ("slow", "f8"),
+        ("settled", "f8"),
+        ("slower", "f8"),
         ("creep", "f8"),
         ("motor_heat", "f8"),
         # What drawn effects add, in the order of their table.

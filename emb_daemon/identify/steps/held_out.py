@@ -1,15 +1,16 @@
 """Each pad thickness from the others: what the models are worth on logs that fitted nothing."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import CLEARANCE
+from emb_daemon.calibration.parameters import CLEARANCE, value_of
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import DynamicsFit, Pads, fit_dynamics, is_slow, simulate
+from emb_daemon.identify.dynamics import Pads, fit_dynamics, is_slow, simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import Unexplained, fit_torque, unexplained_current
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import Log
 
 #: (error of the stiffness path, reference force) in N on one log, where there is a reference.
@@ -23,14 +24,26 @@ class Fold(Step):
 
     Attributes:
         judged: its random logs.
+        torque: fit of the torque path to the other thicknesses' logs.
         errors: of the stiffness path on each of them.
         unexplained: of the torque path on each of them.
     """
 
     pads: Pads
     judged: tuple[Log, ...]
+    torque: TorqueFit = field(repr=False)
     errors: list[Errors] = field(repr=False)
     unexplained: list[Unexplained] = field(repr=False)
+
+    def under(self, calibration: Calibration) -> "Fold":
+        """The same with what another calibration, its pads mounted, leaves."""
+        found = replace(self.torque, values={key: value_of(calibration, key) for key in KEYS})
+        clearance = value_of(calibration, CLEARANCE)
+        return replace(
+            self,
+            errors=[_errors(log, calibration, self.pads, clearance) for log in self.judged],
+            unexplained=[unexplained_current(log, found, calibration) for log in self.judged],
+        )
 
 
 def identify(campaign: Campaign, stiffness: StiffnessStep) -> list[Fold]:
@@ -51,25 +64,25 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
         values=own.values() | torque.physical() | {"pad_thickness_mm": pads.thickness_mm, CLEARANCE: max(clearance, 0.0)},
         pads=pads,
         judged=pads.random,
-        errors=[_errors(log, own, pads, clearance) for log in pads.random],
+        torque=torque,
+        errors=[_errors(log, own.calibration, pads, clearance) for log in pads.random],
         unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],
     )
 
 
-def _errors(log: Log, fit: DynamicsFit, pads: Pads, clearance: float, rows: slice = slice(None)) -> Errors:
+def _errors(log: Log, calibration: Calibration, pads: Pads, clearance: float, rows: slice = slice(None)) -> Errors:
     """Of the stiffness path as the daemon has it: the delay of the rig's reference is none of the brake's."""
     force = log.force_N[rows]
-    error = simulate(log, fit.calibration, pads.thickness_mm, clearance)[rows] - force
+    error = simulate(log, calibration, pads.thickness_mm, clearance)[rows] - force
     known = np.isfinite(error)
     return error[known], force[known]
 
 
 def second_halves(stiffness: StiffnessStep) -> list[Errors]:
     """Errors where no thickness can be left out: of the fit on first halves, on the second halves, slow logs whole."""
-    fit = stiffness.chosen.fit
-    errors = []
+    fit, errors = stiffness.chosen.fit, []
     for pads, curve in zip(stiffness.pads, fit.curves, strict=True):
         for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
             rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
-            errors.append(_errors(log, fit, pads, clearance, rows))
+            errors.append(_errors(log, fit.calibration, pads, clearance, rows))
     return errors

@@ -9,7 +9,7 @@ import numpy as np
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.steps.held_out import Fold, second_halves
+from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
 from emb_daemon.identify.steps.torque import (
     INERTIA,
@@ -23,6 +23,7 @@ from emb_daemon.identify.steps.torque import (
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.offline import Log
+from emb_daemon.offline.levels import force_error_levels, integral_time
 from emb_daemon.offline.score import rmse
 from emb_daemon.report import Page
 from emb_daemon.wire.contract import CYCLE_S
@@ -32,12 +33,18 @@ _STANDING = 2.5e-3
 
 
 def identify(
-    campaign: Campaign, stiffness: StiffnessStep, torque: TorqueStep, folds: list[Fold], interpolation: float
+    campaign: Campaign,
+    stiffness: StiffnessStep,
+    torque: TorqueStep,
+    folds: list[Fold],
+    interpolation: float,
+    hot: tuple[Errors, ...] = (),
 ) -> Step:
     """Noise levels from the folds, or from the second halves of the random logs where there are none.
 
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
+        hot: errors that the whole model leaves on logs of hot pads; where they are more than what cold ones show, they count.
     """
     logs = [log for pads in stiffness.pads for log in pads.logs]
     known, notes = stiffness.fit.calibration, []
@@ -56,6 +63,10 @@ def identify(
         )
     gear_gain = known.motor.gear_gain_m_per_rad
     floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
+    more = [(error, force) for error, force in hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
+    if more:
+        errors = [*errors, *more]
+        floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
     levels = {
         "stiffness_N": floor,
         "stiffness_relative": float(np.hypot(relative, interpolation)),
@@ -78,46 +89,6 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign) -> float:
     return USUAL_RELAXATION_S * campaign.datasheet.actuator.max_motor_speed_rad_per_s / travel
 
 
-def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
-    """Covariance at lags 0 to ``lags``, shape (lags + 1,), over gap-free series of zero mean."""
-    total, count = np.zeros(lags + 1), np.zeros(lags + 1)
-    for s in series:
-        # By the spectrum, padded with as many zeros as no lag wraps around.
-        total += np.fft.irfft(np.abs(np.fft.rfft(s, 2 * len(s))) ** 2)[: lags + 1]
-        count += len(s) - np.arange(lags + 1)
-    return total / np.maximum(count, 1)
-
-
-def integral_time(series: list[np.ndarray]) -> float:
-    """Seconds over which an error stays: the integral of its autocorrelation up to the first lag at which it is gone.
-
-    A first-order process with this time constant has the error's own density at the slow end of the spectrum, where the
-    filter works; white parts shorten it as they should.
-    """
-    covariance = autocorrelation(series, min(2500, min(len(s) for s in series) // 4))
-    correlation = covariance / covariance[0]
-    gone = np.flatnonzero(correlation < 0.05)
-    end = gone[0] if len(gone) else len(correlation)
-    return float(max(CYCLE_S * (np.sum(correlation[:end]) - 0.5), 0.5 * CYCLE_S))
-
-
-def force_error_levels(errors: np.ndarray, force: np.ndarray) -> tuple[float, float]:
-    """Maximum-likelihood (floor in N, relative part) of an error with variance floor^2 + (relative F)^2."""
-    from scipy.optimize import minimize
-
-    squared, load = errors**2, np.maximum(force, 0.0) ** 2
-    total = float(np.mean(squared))
-    floor_start = 0.5 * np.log(total)
-    relative_start = 0.5 * np.log(0.1 * total / max(float(np.mean(load)), 1.0))
-
-    def cost(p):
-        variance = np.exp(2.0 * p[0]) + np.exp(2.0 * p[1]) * load
-        return float(np.mean(np.log(variance) + squared / variance))
-
-    found = minimize(cost, [floor_start, relative_start], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-7})
-    return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
-
-
 def speed_noise(logs: list[Log]) -> float | None:
     """Standard deviation in rad/s of the motor speed while the motor stands; None if it never stands for 0.2 s."""
     squares = count = 0.0
@@ -133,25 +104,33 @@ def speed_noise(logs: list[Log]) -> float | None:
 
 
 @njit
-def _innovation_cost(residual, variance, decay, white):
-    """Mean negative log likelihood (without constants) of first-order noise under white noise, by its Kalman filter."""
+def _innovation_cost(residual, variance, decay, difference):
+    """Mean negative log likelihood (without constants) of first-order noise plus the difference of successive values of white
+    noise, by its Kalman filter. ``variance`` of the one, ``difference`` of the other."""
+    white = 0.5 * difference
     state, spread, cost = 0.0, variance, 0.0
+    # White noise at the sample before, which this difference has too, and its covariance with the state.
+    before, before_spread, shared = 0.0, white, 0.0
     for value in residual:
-        total = spread + white
-        innovation = value - state
+        total = spread - 2.0 * shared + before_spread + white
+        innovation = value - state + before
         cost += np.log(total) + innovation * innovation / total
-        gain = spread / total
+        gain, white_gain = (spread - shared) / total, white / total
         state = decay * (state + gain * innovation)
-        spread = decay * decay * (1.0 - gain) * spread + (1.0 - decay * decay) * variance
+        before = white_gain * innovation
+        shared = -decay * gain * white
+        before_spread = white - white_gain * white
+        spread = decay * decay * (spread - gain * gain * total) + (1.0 - decay * decay) * variance
     return cost
 
 
-def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, float]:
+def current_noise(residuals: list[np.ndarray], difference_A: float) -> tuple[float, float]:
     """First-order coloured noise of the current by maximum likelihood: (standard deviation in A, correlation time in s).
 
     Args:
         residuals: unexplained current, gap-free stretches.
-        white: standard deviation in A of the white noise that the filter takes the speed's noise for.
+        difference_A: standard deviation of what the speed's noise makes of it beside, as inertia times a difference of two
+            speeds: each speed's noise comes twice, with opposite signs, and is not white.
     """
     from scipy.optimize import minimize
 
@@ -160,9 +139,9 @@ def current_noise(residuals: list[np.ndarray], white: float) -> tuple[float, flo
 
     def cost(p):
         decay = float(np.exp(-CYCLE_S / np.exp(p[1])))
-        return sum(_innovation_cost(r, float(np.exp(2.0 * p[0])), decay, white**2) for r in residuals) / samples
+        return sum(_innovation_cost(r, float(np.exp(2.0 * p[0])), decay, difference_A**2) for r in residuals) / samples
 
-    start = [0.5 * np.log(max(total - white**2, 0.1 * total)), np.log(2.0 * CYCLE_S)]
+    start = [0.5 * np.log(max(total - difference_A**2, 0.1 * total)), np.log(2.0 * CYCLE_S)]
     bounds = [(start[0] - 5.0, start[0] + 2.0), (np.log(0.25 * CYCLE_S), np.log(1.0))]
     found = minimize(cost, start, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-7})
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
@@ -173,7 +152,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
     series, turning, excess, gains = [], [], [], []
     first = held_out[0].found
     constant = first.values[TORQUE_CONSTANT]
-    white = np.sqrt(2.0) * first.values[INERTIA] * speed_sigma / CYCLE_S / constant
+    difference = np.sqrt(2.0) * first.values[INERTIA] * speed_sigma / CYCLE_S / constant
     for left in held_out:
         values = left.found.values
         rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
@@ -187,7 +166,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
-    sigma, time = current_noise(series, white)
+    sigma, time = current_noise(series, difference)
     return {
         "current_A": sigma,
         "current_correlation_s": time,

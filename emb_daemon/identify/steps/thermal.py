@@ -1,6 +1,6 @@
 """Heat: pads, disc, friction and softening out of a rig's thermal logs, and how well temperatures are known."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -52,20 +52,23 @@ class ThermalStep(Step):
     """Thermal section.
 
     Attributes:
-        fitted: recordings that fitted, by name.
+        fitted, unseen: recordings that fitted, and logs that judge, by name.
+        hot: logs that fitted in which the brake works as in service: force over heat.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-        figures: RMSE on logs that fitted nothing, by name with unit.
+        figures: RMSE on logs that fitted nothing, by name with unit, once `judged`.
         residuals: the same for what was fitted.
     """
 
     fitted: dict[str, Recording]
+    unseen: dict[str, Log] = field(default_factory=dict, repr=False)
+    hot: tuple[Log, ...] = field(default=(), repr=False)
     heat: HeatFit | None = None
     law: CoolingLaw | None = None
     friction: FrictionFit | None = None
     softening: SofteningFit | None = None
-    temperatures: dict[str, Temperatures]
-    figures: dict[str, float]
-    residuals: dict[str, float]
+    temperatures: dict[str, Temperatures] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    residuals: dict[str, float] = field(default_factory=dict)
 
 
 def _attempt(campaign: Campaign, action, *arguments):
@@ -91,7 +94,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
             "thermal: no log heats the pads with their thermocouples recorded; needed: thermal.tune, braking with "
             "thermocouples in the pads; heat keeps the datasheet's nominal values and the force does not follow temperature"
         )
-        return ThermalStep(fitted={}, temperatures={}, figures={}, residuals={})
+        return ThermalStep(fitted={})
     heat = fit_heat(list(recordings.values()), cold)
     values, heated = dict(heat.values), moved(cold, heat.values)
     dense = [r for r in recordings.values() if r.dense]
@@ -106,26 +109,32 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
         values["thermal.sigma_K"] = rounded(max(spread, _LEAST_SIGMA_K), 3)
     law = cooling_law([r for name, r in recordings.items() if name.startswith("disc_cooling")], campaign.datasheet.disc)
-    temperatures, figures, residuals = _judge(campaign, recordings, judged, moved(cold, values))
-    if softened:
-        figures |= softened.figures()
-    if rubbed:
-        residuals["friction coefficient, weighted by force"] = rubbed.rms
-    if law:
-        residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
     return ThermalStep(
         values=values,
         sigmas=_sigmas(heat, rubbed, softened),
         notes=_notes(heat, law, rubbed, softened),
         fitted=recordings,
+        unseen=judged,
+        hot=tuple(logs[name] for name in recordings if name == "tune" or name.startswith("integrated")),
         heat=heat,
         law=law,
         friction=rubbed,
         softening=softened,
-        temperatures=temperatures,
-        figures=figures,
-        residuals=residuals,
     )
+
+
+def judged(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
+    """The step with what a calibration achieves."""
+    if step.heat is None:
+        return step
+    temperatures, figures, residuals = _judge(campaign, step.fitted, step.unseen, calibration)
+    if step.softening:
+        figures |= step.softening.figures()
+    if step.friction:
+        residuals["friction coefficient, weighted by force"] = step.friction.rms
+    if law := step.law:
+        residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
+    return replace(step, temperatures=temperatures, figures=figures, residuals=residuals)
 
 
 def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:

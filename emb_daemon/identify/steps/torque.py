@@ -259,13 +259,12 @@ class Unexplained:
 
 
 def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
-    """Current of a log that a fit does not explain; of the calibration only the gear counts."""
-    part, values = _Regression(log, calibration), found.values
-    regressors, _, use, _ = part.matrices(values[PRESLIDING])
-    gear_gain = calibration.motor.gear_gain_m_per_rad
-    coefficients = np.array([gear_gain, *(values[key] for key in (INERTIA, OFFSET, LOAD))]) / values[TORQUE_CONSTANT]
-    residual = part.current - regressors @ coefficients
-    return Unexplained(found, part.rows[use], residual[use], regressors[use, 2], part.force[use])
+    """Current of a log that the estimator's torque path leaves: a fit's parameters, the calibration's gear and effects."""
+    part, known = _Regression(log, calibration), moved(calibration, found.physical())
+    paths = run_paths(log.samples, to_parameters(known))[part.rows]
+    use = paths["friction_variance"] < _KNOWN
+    residual = (paths["torque"] - paths["leverage"] * part.force) / found.values[TORQUE_CONSTANT]
+    return Unexplained(found, part.rows[use], residual[use], paths["friction_mean"][use], part.force[use])
 
 
 _ROWS = (

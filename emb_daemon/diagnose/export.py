@@ -1,0 +1,157 @@
+"""A found term as an effect file, in the form that a person would have written (docs: adding an effect)."""
+
+from emb_daemon.calibration.terms import Term
+from emb_daemon.effects.terms import SIGNALS
+
+#: What a shape makes of u, by its name.
+_SHAPED = {
+    "constant": "1.0",
+    "odd_power": "abs(u) ** p.exponent * (1.0 if u >= 0.0 else -1.0)",
+    "even_power": "abs(u) ** p.exponent",
+    "saturation": "u / (1.0 + abs(u))",
+    "decay": "exp(-abs(u))",
+    "onset": "max(u, 0.0)",
+    "bump": "exp(-u * u)",
+}
+_GATES = {
+    "always": "",
+    "load": "_FORCE] / _LARGEST_N",
+    "closing": "(1.0 if signals[_SPEED] > 0.0 else 0.0)",
+    "opening": "(1.0 if signals[_SPEED] < 0.0 else 0.0)",
+    "turning": "(1.0 if signals[_WHEEL] > TURNING_RAD_PER_S else 0.0)",
+    "standing": "(1.0 if signals[_WHEEL] <= TURNING_RAD_PER_S else 0.0)",
+}
+#: Signals that gates look at.
+_LOOKED_AT = {"_FORCE": "clamp_force", "_SPEED": "motor_speed", "_WHEEL": "disc_speed"}
+_HELD = "min(max(x, _LOW), _HIGH)"
+_MEMORIES = {
+    "lag": f"""    x = {_HELD}
+    if not s.begun:
+        s.begun, s.memory = True, x
+    s.memory += (1.0 - exp(-dt / p.memory_scale)) * (x - s.memory)
+""",
+    "slip": f"""    x = {_HELD}
+    if not s.begun:
+        s.begun, s.before = True, x
+    s.memory = min(max(s.memory + (x - s.before) / p.memory_scale, -1.0), 1.0)
+    s.before = x
+""",
+}
+_MEMORIES["deficit"] = _MEMORIES["lag"]
+_SIZES = {
+    "scale": "over which it changes",
+    "centre": "where it is centred",
+    "exponent": "of the power",
+    "memory_scale": "that its memory spans",
+}
+
+
+def effect_name(term: Term) -> str:
+    """Name of the effect that a term becomes."""
+    return term.name.removeprefix("term:").replace(":", "_")
+
+
+def values(term: Term) -> dict[str, float]:
+    """Parameters of the effect that is the term, as a calibration states them."""
+    names = ["coefficient", *(["sine"] if term.shape == "harmonic" else []), *_sizes(term)]
+    return {name: getattr(term, name) for name in names}
+
+
+def source(term: Term, maximum_force_N: float, equation: str) -> str:
+    """The effect file of a term.
+
+    Args:
+        maximum_force_N: of the calibration; a gate of load counts in it.
+        equation: the term as an engineer writes it.
+    """
+    signal, words = term.signal, term.signal.replace("_", " ")
+    gate = _GATES[term.gate].replace("_FORCE]", "signals[_FORCE]")
+    looked_at = {"_SIGNAL": signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
+    shaped = "p.coefficient * cos(u) + p.sine * sin(u)" if term.shape == "harmonic" else _SHAPED[term.shape]
+    body = f"({shaped})" + (f" * {gate}" if gate else "")
+    if term.shape != "harmonic":
+        body = f"p.coefficient * {body}"
+    z = {"none": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
+    functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in body + _MEMORIES.get(term.memory, "")]
+    arguments = "p, signals" if term.memory == "none" else "p, s, signals, dt" if term.memory != "slip" else "p, s, signals"
+    off = "p.coefficient == 0.0" + (" and p.sine == 0.0" if term.shape == "harmonic" else "")
+    lines = [
+        f'"""{equation}."""',
+        "",
+        "import sys",
+        *([f"from math import {', '.join(functions)}"] if functions else []),
+        "",
+        "import numpy as np",
+        "",
+        "from emb_daemon.effects.base import Effect, Parameter",
+        f"from emb_daemon.effects.terms import SIGNALS{', TURNING_RAD_PER_S' if 'TURNING' in gate else ''}",
+        "from emb_daemon.jit import njit",
+        "",
+        *(f'{key} = list(SIGNALS).index("{name}")' for key, name in looked_at.items()),
+        f"#: {words.capitalize()} ({SIGNALS[signal]}) between which it was found; outside it stays what it is at the edge.",
+        f"_LOW, _HIGH = {term.low!r}, {term.high!r}",
+    ]
+    if term.gate == "load":
+        lines += ["#: Clamp force at which it acts in full, N.", f"_LARGEST_N = {maximum_force_N!r}"]
+    if term.memory != "none":
+        lines += ['STATE = np.dtype([("begun", "?"), ("memory", "f8"), ("before", "f8")], align=True)']
+    lines += [
+        "",
+        "",
+        "@njit",
+        f"def term({arguments}):",
+        f'    """What it adds, {term.unit}."""',
+        "    x = signals[_SIGNAL]",
+        f"    if {off} or not np.isfinite(x):",
+        "        return 0.0",
+    ]
+    lines += _MEMORIES.get(term.memory, "").splitlines()
+    if term.shape != "constant":
+        lines.append(f"    u = ({z} - p.centre) / p.scale")
+    lines += [f"    return {body}", "", "", "EFFECT = Effect("]
+    lines += [f'    name="{effect_name(term)}",', f'    hook="{term.port}",', "    term=term,", "    parameters=("]
+    lines += [f"        {line}" for line in _parameters(term)]
+    lines += ["    ),", f'    equation="{equation}",', f'    source="found by diagnose, {term.provenance or "no log named"}",']
+    if term.memory != "none":
+        lines.append("    state=STATE,")
+    lines += [
+        f'    signal="{signal}",',
+        ")",
+        "",
+        'if __name__ == "__main__":',
+        "    from emb_daemon.effects.own import extend",
+        "",
+        "    extend(EFFECT)",
+        "    from emb_daemon.cli.main import main",
+        "",
+        "    sys.exit(main())",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _sizes(term: Term) -> list[str]:
+    """Sizes that shape a term."""
+    shape = [] if term.shape == "constant" else ["scale", "centre"]
+    power = ["exponent"] if term.shape in ("odd_power", "even_power") else []
+    return [*shape, *power, *(["memory_scale"] if term.memory != "none" else [])]
+
+
+def _parameters(term: Term) -> list[str]:
+    """Its parameters as constructor calls: amplitudes, then what shapes it, each searched from where it was found."""
+    own = SIGNALS[term.signal]
+    over = "1" if term.memory == "slip" else own
+    units = {"scale": over, "centre": over, "exponent": "1", "memory_scale": own if term.memory == "slip" else "s"}
+    found = values(term)
+    result = []
+    for name, value in found.items():
+        if name in units:
+            reach = max(abs(term.low), abs(term.high))
+            low, high = (-reach, reach) if name == "centre" else (value / 10.0, 4.0 if name == "exponent" else 10.0 * value)
+            result.append(
+                f'Parameter("{name}", "{units[name]}", {low!r}, {high!r}, {value!r}, "{_SIZES[name]}", ({value!r},)),'
+            )
+        else:
+            size = 10.0 * max(abs(found["coefficient"]), abs(term.sine))
+            words = "how much of it" if term.shape != "harmonic" else f"{'sine' if name == 'sine' else 'cosine'} of it"
+            result.append(f'Parameter("{name}", "{term.unit}", {-size!r}, {size!r}, {value!r}, "{words}"),')
+    return result

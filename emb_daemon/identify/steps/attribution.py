@@ -1,0 +1,118 @@
+"""What the other steps' models lack: the campaign's residual goes through the search that ``diagnose`` makes.
+
+Known effects first, then terms of the grammar. What is accepted stands in the calibration; what is left is said, and is in
+sigma.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec.structs import replace
+
+from emb_daemon.calibration.parameters import CLEARANCE, moved
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.diagnose.confirmation import refitted
+from emb_daemon.diagnose.coordinates import by_key
+from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnosed, with_terms
+from emb_daemon.diagnose.page import sections
+from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.selection import Progress
+from emb_daemon.diagnose.text import verdict
+from emb_daemon.identify.steps import Step
+from emb_daemon.identify.steps.held_out import Errors, Fold
+from emb_daemon.identify.steps.stiffness import StiffnessStep
+from emb_daemon.identify.steps.torque import KEYS
+from emb_daemon.offline import Log
+from emb_daemon.report import Page
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributionStep(Step):
+    """What was found.
+
+    Attributes:
+        calibration: with what was accepted.
+        diagnosis: the search; None where the logs are too short for one.
+        hot: errors of the stiffness path on the logs that heat the pads.
+    """
+
+    calibration: Calibration
+    diagnosis: Diagnosis | None = None
+    hot: tuple[Errors, ...] = ()
+
+    def without(self, fold: Fold) -> Calibration:
+        """What is known of a fold's pads without their random logs: found effects, and the torque path, by other pads' logs.
+
+        A found effect of the stiffness path goes with the curves and dynamics that were fitted beside it."""
+        if self.diagnosis is None:
+            return moved(self.calibration, fold.values)
+        selection, values = self.diagnosis.selection, dict(fold.values)
+        bench, applied = selection.model.bench, selection.applied()
+        same = [trial.mounted.get("pad_thickness_mm") == fold.pads.thickness_mm for trial in bench.trials]
+        if "torque" in selection.touched:
+            applied |= refitted(selection, "torque", _others(bench, same))
+            values = {key: value for key, value in values.items() if key not in KEYS}
+        if "stiffness" in map(selection.channel_of, selection.accepted):
+            judged = [any(trial.log is log for log in fold.judged) for trial in bench.trials]
+            applied |= refitted(selection, "stiffness", _others(bench, judged))
+            slow = [value for c, value in applied.items() if c.name == CLEARANCE and same[c.log] and not judged[c.log]]
+            fitted = set(by_key(applied, bench.middle))
+            values = {key: value for key, value in values.items() if key not in fitted} | {CLEARANCE: float(np.mean(slow))}
+        there = with_terms(bench.calibrated(applied), selection)
+        return moved(replace(there, noise=self.calibration.noise), values)
+
+
+def _others(bench: Bench, gone: Sequence[bool]) -> np.ndarray:
+    """Which episodes are of other logs than those that are ``gone``, shape (episodes,)."""
+    kept = np.ones(bench.episodes, bool)
+    kept[np.unique(bench.sample_episode[np.repeat(gone, [len(trial.log.samples) for trial in bench.trials])])] = False
+    return kept
+
+
+def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, progress: Progress) -> AttributionStep:
+    """Effects and terms that curves, random logs and ``hot`` ones, which heat the pads, prove beside ``known``."""
+    logs, mounted = [], []
+    for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
+        logs += pads.logs
+        mounted += [{"pad_thickness_mm": pads.thickness_mm, CLEARANCE: max(float(c), 0.0)} for c in curve.clearances_rad]
+    bench = Bench([*logs, *hot], known, [*mounted, *({} for _ in hot)], own_data=True)
+    if bench.episodes < EPISODES:
+        return AttributionStep(calibration=known)
+    found = diagnosed(bench, None, progress)
+    calibration = replace(found.calibration, contact=known.contact, noise=known.noise, provenance=None)
+    return AttributionStep(
+        sigmas=found.calibration.provenance.sigmas,
+        calibration=calibration,
+        diagnosis=found,
+        hot=tuple(_errors(found, index) for index in range(len(logs), len(bench.trials))),
+    )
+
+
+def words(step: AttributionStep) -> str:
+    """What was found beside the thesis's models and the stiffness step's effects, and what is left."""
+    if step.diagnosis is None:
+        return "The campaign is too short to tell what its models lack."
+    return verdict(step.diagnosis)
+
+
+def section(page: Page, step: AttributionStep) -> None:
+    """The search in the report, its evidence as a diagnosis shows it."""
+    part = page.section(
+        "What the models lacked",
+        "The residual of curves, random logs and what heats the pads went through the search of a diagnosis: effects of "
+        "the catalogue, then terms. Before: the steps above; after: with what was accepted, each quarter of the episodes by "
+        "parameters from the other three.",
+    )
+    part.text(words(step))
+    if step.diagnosis is not None:
+        sections(page, step.diagnosis)
+
+
+def _errors(found: Diagnosis, index: int) -> Errors:
+    """What the search leaves of one log's stiffness path."""
+    trials = found.bench.trials
+    first = sum(len(trial.log.samples) for trial in trials[:index])
+    residual = found.residual["stiffness"][first : first + len(trials[index].log.samples)]
+    known = np.isfinite(trials[index].force_N)
+    return residual[known], trials[index].force_N[known]
