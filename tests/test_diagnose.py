@@ -33,7 +33,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
-from emb_daemon.offline.score import rmse
+from emb_daemon.offline.score import EpisodeErrors, rmse
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import random_angle, simulate_log, training
 from emb_daemon.resources import resource
@@ -648,3 +648,14 @@ def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calib
 def test_the_report_opens_in_a_browser(uneven_disc, tmp_path):
     html = (uneven_disc[0] / "out" / "report.html").read_text()
     assert_is_drawn(html, tmp_path, plots=html.count("data-figure="))
+
+
+def test_a_path_that_is_no_number_any_more_has_got_worse():
+    """What an effect leaves without a value would else not count in the error."""
+    episode = np.repeat(np.arange(4), 100)
+    errors = {"fused": np.full(400, 10.0), "torque": np.full(400, 10.0)}
+    before = EpisodeErrors.of(errors, {}, episode)
+    lost = errors | {"torque": np.where(episode > 1, np.nan, 1.0)}
+    assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused", {"torque"})
+    better = errors | {"torque": np.full(400, 1.0)}
+    assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused", {"torque"})

@@ -96,3 +96,18 @@ def test_a_gain_error_of_the_resolver_is_covered_though_a_torque_constant_would_
     error = np.abs(estimates["force"] - force)[clamped]
     assert np.median(error) > 90.0
     assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][clamped], 25.0)) < 0.1
+
+
+def test_a_resolver_that_is_frozen_while_the_brake_is_latched_leaves_no_small_sigma():
+    """The latch holds 7 kN without a current: the torque alone would say 0."""
+
+    def change(samples):
+        samples["angle"][city.HOLDING :] = samples["angle"][city.HOLDING]
+        samples["speed"][city.HOLDING :] = samples["speed"][city.HOLDING] + 1.0
+        samples["park_brake"][city.HOLDING :] = 1.0
+        samples["current_q"][city.HOLDING + 100 :] = 0.0
+
+    estimates, force = city.changed(change)
+    latched = slice(city.HOLDING + 200, city.BEFORE_RELEASE)
+    assert np.all(force[latched] > 6500.0) and np.all(estimates["reasons"][latched] & r.STUCK)
+    assert np.all(np.abs(estimates["force"] - force)[latched] < 3.0 * estimates["sigma"][latched])

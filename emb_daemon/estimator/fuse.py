@@ -266,9 +266,9 @@ def take_sides(s, p, m, torque_sigma, out):
         facts |= JUMP_SUSPECTED
     if abs(x[OFFSET]) > 2.0 * torque_offset(p):
         facts |= OFFSET_LARGE
+    # A latched brake needs no current: the torque alone then says that nothing is known.
+    latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
     if s.unknown:
-        # A latched brake needs no current: the torque then says that nothing is known.
-        latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
         c.contradiction = 0.0
         if s.seen:
             out.force, out.sigma = force, hypot(sigma, latched)
@@ -285,7 +285,7 @@ def take_sides(s, p, m, torque_sigma, out):
         out.sigma = hypot(out.sigma, min(error, out.force))
         facts |= MODEL_ERROR
     if c.verdict == STIFFNESS_WRONG:
-        out.force, out.sigma = force, sigma
+        out.force, out.sigma = force, hypot(sigma, latched)
         return facts | RESOLVER_IMPLAUSIBLE | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = hypot(out.sigma, out.innovation)

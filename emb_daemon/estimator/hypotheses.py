@@ -9,7 +9,8 @@ deviation. A proven one becomes the first hypothesis.
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
 torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
-proven, and the fused force does not follow it. Its distance counts in the standard deviation by its odds.
+proven, and the fused force does not follow it. By its odds, its distance counts in the standard deviation as far as its own
+does not explain it.
 """
 
 from math import exp, log, sqrt
@@ -80,7 +81,7 @@ STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, DRIFT = range(ALTERNATIVES)
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
-#: One hypothesis beside the first. ``log_odds`` against it, and the ``share`` of all that it has by them; ``slope`` N/rad at
+#: One hypothesis beside the first. ``log_odds`` against it, and the ``share`` that it has by them; ``slope`` N/rad at
 #: its own contact angle; ``shift`` N: its force over the first one's.
 ALTERNATIVE = np.dtype(
     [
@@ -140,14 +141,14 @@ def _strongest(s, but):
 
 @njit
 def _share_out(s):
-    """Probability of each alternative."""
+    """Probability of each change if nothing drifts, and of a drift."""
     total = 1.0
-    for kind in range(ALTERNATIVES):
-        a = s.alternatives[kind]
-        a.share = exp(a.log_odds)
-        total += a.share
-    for kind in range(ALTERNATIVES):
-        s.alternatives[kind].share /= total
+    for kind in range(DRIFT):
+        total += exp(s.alternatives[kind].log_odds)
+    for kind in range(DRIFT):
+        s.alternatives[kind].share = exp(s.alternatives[kind].log_odds) / total
+    drifts = exp(s.alternatives[DRIFT].log_odds)
+    s.alternatives[DRIFT].share = drifts / (total + drifts)
 
 
 @njit
@@ -160,10 +161,10 @@ def least_odds(kind):
 
 @njit
 def drift_odds(s):
-    """Log odds between which those of a drift stay. Whatever is the likeliest, it may be what drifts that makes it so: until
-    that is proven, a share of it stays. And a drift that has ended would have to make up for too high ones."""
+    """Log odds between which those of a drift stay. Whatever is the likeliest, it may be a drift that makes it so: until that
+    is proven a share of it stays, and as it can explain anything a little at a time, never the larger one."""
     likeliest = max(_strongest(s, -1), 0.0)
-    return likeliest + _DRIFT_ODDS, likeliest - PRIOR_ODDS
+    return likeliest + _DRIFT_ODDS, likeliest
 
 
 @njit
@@ -174,11 +175,11 @@ def suspected(s):
 
 @njit
 def unproven(s):
-    """How far unproven changes move the force, N: the largest of probability, if nothing drifts, times difference."""
+    """How far unproven changes move the force, N: the largest of probability times difference."""
     most = 0.0
     for kind in range(DRIFT):
         most = max(most, s.alternatives[kind].share * abs(s.alternatives[kind].shift))
-    return most / (1.0 - s.alternatives[DRIFT].share)
+    return most
 
 
 @njit
@@ -299,26 +300,26 @@ def fold(s, warmth, linear):
 
 @njit
 def mix(s, h, spread, warmth):
-    """Force (N) and standard deviation of all hypotheses together, over their common model of the force. ``h``: scratch."""
+    """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
+    of a drift's distance from it what is beyond its own standard deviation counts too. ``h``: scratch."""
     to_force(h, spread, s.slope, s.force, warmth)
     _share_out(s)
     rest = 1.0
     first = spread * s.error[FAST]
-    told = mean = variance = square = 0.0
-    for kind in range(ALTERNATIVES):
+    mean = variance = square = 0.0
+    for kind in range(DRIFT):
         a = s.alternatives[kind]
         w = a.share
         rest -= w
         apart = a.shift + spread * a.error[FAST] - first
         mean += w * apart
         square += w * apart * apart
-        if kind != DRIFT:
-            told += w * apart
         to_force(h, spread, a.slope, s.force + a.shift, warmth)
         variance += w * force_variance(a.covariance, h)
+    d = s.alternatives[DRIFT]
+    distance = d.shift + spread * d.error[FAST] - first - mean
+    to_force(h, spread, d.slope, s.force + d.shift, warmth)
+    drifted = d.share * max(distance * distance - force_variance(d.covariance, h), 0.0)
     to_force(h, spread, s.slope, s.force, warmth)
     variance += rest * force_variance(s.covariance, h)
-    # About what is told, which is the mean if nothing drifts.
-    told /= 1.0 - s.alternatives[DRIFT].share
-    square += told * (told - 2.0 * mean)
-    return s.force + first + told, sqrt(variance + max(square, 0.0))
+    return s.force + first + mean, sqrt(variance + max(square - mean * mean, 0.0) + drifted)

@@ -23,6 +23,7 @@ from emb_daemon.estimator.unknown import (
 from emb_daemon.jit import entry, njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Kelvin per second by which a disc may have heated while nobody looked, and at most: hard braking from motorway speed.
 _UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
@@ -104,8 +105,9 @@ def why_implausible(snapshot, p) -> str:
     for name in ("pads", "disc", "growth_start"):
         if snapshot["temperature_known"]:
             possible[name] = np.all((snapshot[name] >= _COLDEST_C) & (snapshot[name] <= _HOTTEST_C))
-    for name in ("history", "temperature_sigma", "history_sigma"):
-        possible[name] = abs(snapshot[name]) <= _HOTTEST_C
+    possible["history"] = abs(snapshot["history"]) <= _HOTTEST_C
+    for name in ("temperature_sigma", "history_sigma"):
+        possible[name] = 0.0 <= snapshot[name] <= _HOTTEST_C
     return ", ".join(name for name, is_possible in possible.items() if not is_possible)
 
 
@@ -132,7 +134,7 @@ def resume(s, p, snapshot, elapsed_s):
         s.disc, s.history = snapshot.disc, snapshot.history
         s.temperature_sigma = snapshot.temperature_sigma + min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
         s.history_sigma = snapshot.history_sigma
-        s.rested_s = min(elapsed_s, _FOLLOWED_S)
+        s.rested_s = min(max(elapsed_s, CYCLE_S), _FOLLOWED_S)
 
 
 @njit

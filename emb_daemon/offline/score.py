@@ -154,3 +154,7 @@ class EpisodeErrors:
         weights = np.ones(self.sums.shape[2]) if weights is None else weights
         count = float(self.counts[p, c] @ weights)
         return float(np.sqrt(self.sums[p, c] @ weights / count)) if count else float("nan")
+
+    def samples(self, path: str) -> int:
+        """Samples with a finite error of ``path``."""
+        return int(self.counts[self.paths.index(path), -1].sum())
