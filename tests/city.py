@@ -1,4 +1,4 @@
-"""Fifteen seconds of the simulated city drive, and the estimator over it with something changed."""
+"""The beginning of the simulated city drive, and the estimator over it with something changed."""
 
 import functools
 
@@ -16,10 +16,10 @@ RELEASED, CLAMPING, HOLDING, BEFORE_RELEASE, OPENED, SECOND_CLEARANCE = 400, 130
 
 
 @functools.cache
-def drive(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def drive(seed: int = 0, seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray]:
     """Samples of a simulated unit, and the true clamp force."""
     calibration = load_calibration(resource("config/calibration.yaml"))
-    frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), 15.0, seed=seed)
+    frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), seconds, seed=seed)
     log = log_of(frames)
     return log.samples, log.force_N
 
@@ -29,9 +29,9 @@ def estimated(samples: np.ndarray) -> np.ndarray:
     return estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
 
 
-def changed(change=lambda samples: None, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def changed(change=lambda samples: None, seed: int = 0, seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray]:
     """Estimates and true force of the drive whose samples went through ``change``."""
-    samples, force = drive(seed)
+    samples, force = drive(seed, seconds)
     samples = samples.copy()
     change(samples)
     return estimated(samples), force

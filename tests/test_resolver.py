@@ -85,17 +85,17 @@ def test_an_offset_of_the_current_between_two_strokes_leaves_the_contact_angle(o
 @pytest.mark.parametrize("gain", [0.982, 1.018])
 def test_a_gain_error_of_the_resolver_is_covered_though_a_torque_constant_would_explain_it(gain):
     """2 % of the angle are 4 % of the force and as much of the motor torque: nothing tells them apart, so sigma says it.
-    Without the hypothesis of a drift 99 % lie beyond it."""
+    Without the hypothesis of a drift nine tenths lie beyond it."""
 
     def change(samples):
         samples["angle"] = samples["angle"][0] + gain * (samples["angle"] - samples["angle"][0])
         samples["speed"] *= gain
 
-    estimates, force = city.changed(change)
-    clamped = force > 2000.0
+    estimates, force = city.changed(change, seconds=45.0)
+    clamped = (force > 2000.0) & (np.arange(len(force)) > 5000)
     error = np.abs(estimates["force"] - force)[clamped]
-    assert np.median(error) > 90.0
-    assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][clamped], 25.0)) < 0.1
+    assert np.median(error) > 500.0
+    assert np.mean(error > 4.0 * np.hypot(estimates["sigma"][clamped], 25.0)) < 0.1
 
 
 def test_a_resolver_that_is_frozen_while_the_brake_is_latched_leaves_no_small_sigma():
