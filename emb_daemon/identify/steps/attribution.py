@@ -33,7 +33,7 @@ class AttributionStep(Step):
 
     Attributes:
         calibration: with what was accepted.
-        diagnosis: the search; None where the logs are too short for one.
+        diagnosis: the search; None where nothing moves at random or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
     """
 
@@ -71,7 +71,12 @@ def _others(bench: Bench, gone: Sequence[bool]) -> np.ndarray:
 
 
 def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, progress: Progress) -> AttributionStep:
-    """Effects and terms that curves, random logs and ``hot`` ones, which heat the pads, prove beside ``known``."""
+    """Effects and terms that curves, random logs and ``hot`` ones, which heat the pads, prove beside ``known``.
+
+    Nothing without random logs: slow motion leaves inertia and relaxation to the datasheet, and a search that may move them
+    all would find what they are not."""
+    if not any(pads.random for pads in stiffness.pads):
+        return AttributionStep(calibration=known)
     logs, mounted = [], []
     for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
         logs += pads.logs
@@ -92,7 +97,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
 def words(step: AttributionStep) -> str:
     """What was found beside the thesis's models and the stiffness step's effects, and what is left."""
     if step.diagnosis is None:
-        return "The campaign is too short to tell what its models lack."
+        return "The campaign has no random motion, or is too short, to tell what its models lack."
     return verdict(step.diagnosis)
 
 
