@@ -54,9 +54,9 @@ from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 PRIOR_ODDS = -6.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
-#: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases of `studies.silent grid
-#: --count 4 --pairs 24 --seed 11` 151 fail without this hypothesis and 126 with it; on the rig's random logs 98 to 99 % of
-#: samples instead of 97 then lie within two sigma, so the odds are no higher.
+#: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases that `studies.silent
+#: grid` draws (--count 4 --pairs 24 --seed 11) 151 fail without this hypothesis and 126 with it; on the rig's random logs 98
+#: to 99 % of samples instead of 97 then lie within two sigma, so the odds are no higher.
 _DRIFT_ODDS = -2.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
