@@ -8,7 +8,6 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
-    CERTAIN_ODDS,
     DRIFT,
     drift_odds,
     fold,
@@ -19,6 +18,7 @@ from emb_daemon.estimator.hypotheses import (
     open_all,
     place,
     settle,
+    stay_finite,
     to_force,
     to_torque,
     unproven,
@@ -187,10 +187,11 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
-            least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), CERTAIN_ODDS)
+            least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), np.inf)
             weigh(a, least, most, first, variance, second, variance_a)
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
+    stay_finite(s)
     return sqrt(moving + slow)
 
 
@@ -242,19 +243,42 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 
 
 @njit
+def _motor_torque(s, p, m, x):
+    """Motor torque (N m) by what a hypothesis with the errors ``x`` makes of the current."""
+    gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
+    return p.torque_constant * m.current_q * max(gain, _LEAST_GAIN) - x[OFFSET]
+
+
+@njit
+def _friction(p, x):
+    """Load friction (m/rad) and offset friction (N m) of a hypothesis with the errors ``x``."""
+    return max(p.load_friction + x[LOAD], 0.0), max(p.offset_friction + x[COULOMB], 0.0)
+
+
+@njit
+def _beyond_friction(s, p, m, x, force, spread):
+    """`beyond_friction` of a hypothesis with the errors ``x`` and the clamp force ``force`` N."""
+    torque = _motor_torque(s, p, m, x) - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
+    load, coulomb = _friction(p, x)
+    return beyond_friction(torque, force, spread, p.gear_gain, load, coulomb)
+
+
+@njit
 def take_sides(s, p, m, torque_sigma, out):
     """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``torque_sigma`` N m, as
     `fuse` returns it."""
     c, x, facts = s.plausibility, s.error, 0
-    gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
-    motor_torque = p.torque_constant * m.current_q * max(gain, _LEAST_GAIN) - x[OFFSET]
-    load, coulomb = max(p.load_friction + x[LOAD], 0.0), max(p.offset_friction + x[COULOMB], 0.0)
+    motor_torque = _motor_torque(s, p, m, x)
+    load, coulomb = _friction(p, x)
     force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, load, coulomb)
     sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / p.gear_gain)
     if np.isfinite(out.innovation):
-        torque = motor_torque - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
         spread = hypot(p.gear_gain * out.stiffness_sigma, torque_sigma)
-        beyond = beyond_friction(torque, s.force, spread, p.gear_gain, load, coulomb)
+        beyond = _beyond_friction(s, p, m, x, s.force, spread)
+        for kind in range(DRIFT):
+            a = s.alternatives[kind]
+            if a.log_odds > 0.0:
+                beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     swings = hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb) if m.has_current else 0
     if swings > 1:

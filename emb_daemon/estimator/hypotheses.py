@@ -256,6 +256,16 @@ def weigh(a, least, most, first, first_variance, second, second_variance):
 
 
 @njit
+def stay_finite(s):
+    """Log odds count from the first hypothesis; beyond certainty against it, what tells the alternatives apart stays."""
+    beyond = _strongest(s, -1) - CERTAIN_ODDS
+    if beyond > 0.0:
+        for kind in range(ALTERNATIVES):
+            a = s.alternatives[kind]
+            a.log_odds = max(a.log_odds - beyond, least_odds(kind))
+
+
+@njit
 def settle(s, p, released, dt):
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
