@@ -5,7 +5,7 @@ from math import hypot, sqrt
 import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
-from emb_daemon.estimator.hypotheses import learned_torque, open_again, to_torque
+from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
@@ -178,6 +178,10 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
     unsure = hypot(offset_sigma, learned_sigma)
     found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, unsure)
+    # A change that explains the torque is not found a second time as a contact angle that is somewhere else.
+    explained = likely_shift(s) != 0.0
+    if explained:
+        found = NOTHING
     offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
     seen = predicted + c.excess
     if found != NOTHING:
@@ -191,7 +195,7 @@ def watch_contact(s, p, m, force_before, torque, leverage):
         _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD, leverage)
     elif found != NOTHING:
         _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage, leverage)
-    elif not c.confirmed and c.excess > max(predicted, noticeable):
+    elif not c.confirmed and not explained and c.excess > max(predicted, noticeable):
         # Power came while the brake was clamped: no angle from which to count the clearance. Or the torque has an offset.
         s.covariance[OFFSET, OFFSET] += seen * seen
         force = seen / leverage

@@ -167,6 +167,17 @@ def drift_odds(s):
 
 
 @njit
+def likely_shift(s):
+    """How far the change that is likelier than none moves the force, N; 0 if there is none."""
+    best, shift = 0.0, 0.0
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        if a.log_odds > best:
+            best, shift = a.log_odds, a.shift
+    return shift
+
+
+@njit
 def suspected(s):
     """Whether an alternative is likely enough to be waited for."""
     return _strongest(s, -1) > _SUSPECTED
