@@ -213,7 +213,7 @@ class Adaptation:
             return
         self._evaluations[corner], self.learned[corner] = evaluation, learned
         adapter["evaluation"], adapter["evaluation_ready"] = evaluation.outcome, True
-        for name in ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma"):
+        for name in ("contact_angle", "contact_sigma", "torque_gain", "torque_gain_sigma"):
             adapter[name] = getattr(evaluation, name)
 
     def close(self, states: np.ndarray, parameters: np.ndarray) -> None:

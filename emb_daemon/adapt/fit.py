@@ -6,7 +6,8 @@ calibration.
 
 An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
 sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
-which steel keeps for life, can.
+which steel keeps for life, can. Torque constant, inertia and stiffness start from what driving has found of them: they only
+fit each other together.
 
 Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
@@ -15,7 +16,7 @@ Only the paths are compiled. The fit is done once in a park brake's life of minu
 computes itself would take far longer to compile than to run.
 """
 
-from math import exp, expm1, hypot, log, sqrt
+from math import exp, hypot, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,8 @@ from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
 from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.contact import torque_sigma
-from emb_daemon.models.fusion import SLOW, VISCOUS
+from emb_daemon.models.fusion import FADE, GAIN, HOUSING, SLOW, VISCOUS
+from emb_daemon.models.fusion import INERTIA as INERTIA_ERROR
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -81,7 +83,7 @@ _RANGES = 5
 def unexplained_step(s, p, row):
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
     before, speed = s.force, s.speed
-    stiffness_path(s, p, row, row.factor)
+    stiffness_path(s, p, row, row.factor * s.scale)
     torque, leverage, _ = torque_path(s, p, row)
     s.angle, s.speed = row.angle, row.speed
     force = 0.5 * (before + s.force)
@@ -96,7 +98,7 @@ def unexplained_step(s, p, row):
 def _run(states, parameters, rows, residual, force):
     """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
     s, p = states[0], parameters[0]
-    settle_paths(s, p, rows[0], rows[0].factor)
+    settle_paths(s, p, rows[0], rows[0].factor * s.scale)
     residual[0], force[0] = np.nan, s.force
     for i in range(1, len(rows)):
         residual[i] = unexplained_step(s, p, rows[i])
@@ -105,12 +107,13 @@ def _run(states, parameters, rows, residual, force):
 
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
-    angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
+    torque constant over what driving made of it, load friction over gear gain, offset friction (N m), logarithms of the
+    presliding angle and of the inertia, again over driving's, and the curve's coefficients in units of ``scale``
+    (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
-        calibration: in use until now.
+        calibration: in use until now, with driving's torque constant and inertia.
         state: STATE record of the estimator at its end.
     """
 
@@ -138,7 +141,7 @@ class _Training:
         inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
         trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
         self._states[0] = self._state
-        self._states["contact_angle"] = x[_CONTACT]
+        self._states["contact_angle"], self._states["scale"] = x[_CONTACT], 1.0
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
         _run(self._states, np.atleast_1d(to_parameters(trial)), self._rows, residual, force)
         residual -= x[_TORQUE_OFFSET]
@@ -358,7 +361,15 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     Returns:
         `Evaluation`; its ``outcome`` says whether it may be used.
     """
-    now, limits = to_parameters(calibration), calibration.adaptation
+    limits, errors = calibration.adaptation, state["error"]
+    driven_gain = 1.0 + errors[GAIN] + errors[FADE] * state["winding"] + errors[HOUSING] * state["housing"]
+    motor = calibration.motor
+    driven = {
+        TORQUE_CONSTANT: motor.torque_constant_Nm_per_A * driven_gain,
+        INERTIA: motor.inertia_kg_m2 * (1.0 + errors[INERTIA_ERROR]),
+    }
+    calibration = moved(calibration, driven)
+    now = to_parameters(calibration)
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
     terms = curve_terms(calibration)
@@ -367,12 +378,14 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     training = _Training(rows, calibration, state, scale)
-    fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
+    mounted = state["scale"] * now["curve"][:terms]
+    fit, unchanged = _fit_with_and_without_curve(training, x, mounted / scale, now["offset_friction"])
     x, covariance = fit.x, fit.covariance
     values = training.values(x)
     if unchanged:
         values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
-    curve = to_parameters(moved(calibration, values))["curve"]
+    # Pads that are as they were keep what driving has found of their stiffness.
+    curve = to_parameters(moved(calibration, values))["curve"] * (state["scale"] if unchanged else 1.0)
     expected, _ = torque_sigma(*_noises(calibration))
     sigma = _deviation(fit.residual)
     sigmas = np.sqrt(np.diag(covariance))
@@ -380,8 +393,11 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     # The torque constant's error scales the whole curve, whose shape is known better than its size.
     along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
     constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
-    # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
-    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
+    # What the fit cannot see: the dynamics' own error, and those of gear gain, inertia and pad temperature, which the curve
+    # inherits.
+    inertia_sigma = sqrt(state["covariance"][INERTIA_ERROR, INERTIA_ERROR])
+    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, inertia_sigma, factor_sigma)
+    torque_gain = driven_gain * exp(x[_GAIN])
     if unchanged:
         values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
     else:
@@ -398,8 +414,8 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         },
         contact_angle=float(x[_CONTACT]),
         contact_sigma=fit.contact_sigma,
-        torque_error=expm1(-x[_GAIN]),
-        torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
+        torque_gain=torque_gain,
+        torque_gain_sigma=torque_gain * hypot(sigmas[_GAIN], limits.torque_constant_relative),
         evidence={
             "samples": len(rows),
             "residual_A": float(sigma / now["torque_constant"]),
@@ -409,7 +425,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
             "contact_sigma_rad": float(sigmas[_CONTACT]),
             "force_sigma_N": force_sigma,
             "top_force_N": float(characteristic_curve(top, curve)[0]),
-            "torque_gain": exp(x[_GAIN]),
+            "torque_gain": torque_gain,
             "torque_gain_sigma": float(sigmas[_GAIN]),
             "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
         },
@@ -442,7 +458,7 @@ def _judge(rows, fit, base, found):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
         return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"
-    if abs(fit.x[_GAIN]) > _GAIN_LIMIT:
+    if abs(log(found.torque_gain)) > _GAIN_LIMIT:
         return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} of the calibration's"
     if out_of_bounds := why_out_of_bounds(base, found.values):
         return r.OUT_OF_BOUNDS, out_of_bounds

@@ -12,11 +12,11 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
-from emb_daemon.estimator.paths import settle_paths
+from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
+from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, LOAD, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -26,8 +26,6 @@ _ROLLED_PULSES = 2
 _SNAPSHOT_NS = 10_000_000_000
 #: Age of another corner's estimate from which nothing is known of it.
 _SILENT_NS = 100_000_000
-#: Time between two samples from which some are missing.
-_GAP_S = 0.006
 #: Motor travel that counts as motion, and the time without any after which unasked motion is over.
 _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
@@ -112,7 +110,7 @@ def _collect(a, s, rows, m):
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
     # The current is a cycle's mean: it does not tell of the acceleration over a gap.
-    row.current_q, row.has_current = m.current_q, m.has_current and m.dt < _GAP_S
+    row.current_q, row.has_current = m.current_q, m.has_current and m.dt <= ONE_CYCLE_S
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
@@ -152,43 +150,40 @@ def apply_learned(s, p, scratch, rows, learned, a):
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
     angle is weighed against that, unless the pads have moved."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
-    kept = abs(moved) < contact_jump(p)
+    same = True
     for i in range(len(p.curve)):
-        kept = kept and learned.curve[i] == p.curve[i]
+        same = same and learned.curve[i] == p.curve[i]
+    kept = same and abs(moved) < contact_jump(p)
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
-    scale, gain = s.scale if kept else 1.0, s.error[GAIN]
-    gain_variance = s.covariance[GAIN, GAIN]
     first = max(0, len(rows) - _RUN_UP)
     scratch[0] = s
     t = scratch[0]
     t.contact_angle += weight * moved
-    settle_paths(t, learned, rows[first], rows[first].factor)
+    t.scale = s.scale if same else 1.0
+    settle_paths(t, learned, rows[first], rows[first].factor * t.scale)
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])
-    s.contact_angle, s.past_contact = t.contact_angle, t.past_contact
+    s.contact_angle, s.past_contact, s.scale = t.contact_angle, t.past_contact, t.scale
     s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
     s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
     s.effects = t.effects
     # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
     # what may still differ for this very curve.
-    # Stiffness, contact and friction are new; what concerns the motor and its current sensor is no part of them.
-    motor = (OFFSET, FADE, HOUSING)
     for i in range(len(s.error)):
-        if i not in motor:
+        # What was taught is new and errs on its own.
+        taught = i in (FAST, CONTACT, LOAD, COULOMB) or (i in (GAIN, SCALE) and not kept)
+        if taught:
             s.error[i] = 0.0
         for j in range(len(s.error)):
-            if i != j and (i not in motor or j not in motor):
-                s.covariance[i, j] = 0.0
+            if taught and i != j:
+                s.covariance[i, j] = s.covariance[j, i] = 0.0
     s.covariance[FAST, FAST] = 1.0
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
-    if kept:
-        s.error[GAIN], s.covariance[GAIN, GAIN] = gain, gain_variance
-    else:
-        s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
-        s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
-        # What the stroke left open of the new curve, driving may still find.
+    if not kept:
+        s.error[GAIN] = a.torque_gain - 1.0 - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
+        s.covariance[GAIN, GAIN] = a.torque_gain_sigma**2
+        # What the stroke left open of the stiffness, driving may still find.
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
-    s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
     if not kept:
         s.contact_anchor = s.contact_angle
