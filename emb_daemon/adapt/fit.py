@@ -114,7 +114,7 @@ class _Training:
     Args:
         rows: TRAINING array, the samples in order.
         calibration: in use until now, with driving's torque constant and inertia.
-        state: STATE record of the estimator at its end.
+        state: STATE record of the estimator before it.
     """
 
     def __init__(self, rows, calibration, state, scale):
@@ -355,7 +355,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     Args:
         rows: TRAINING array, the samples in order.
         calibration, base: in use until now, and as the file has it.
-        state: STATE record, the estimator's at the end of the training.
+        state: STATE record, the estimator's before the training.
         factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
 
     Returns:

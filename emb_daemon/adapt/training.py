@@ -16,7 +16,7 @@ from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, LOAD, OFFSET, SCALE
+from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, LOAD, OFFSET, SCALE, copy_errors
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -143,21 +143,24 @@ def _progress(a, limits):
 
 
 @njit
-def apply_learned(s, p, scratch, rows, learned, a):
+def apply_learned(s, p, begun, rows, learned, a):
     """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
-    path models to the last of ``rows``.
+    path models to the last of ``rows``. ``begun``: STATE from before the training, shape (1,), which is used up.
 
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that, unless the pads have moved."""
+    angle is weighed against that, unless the pads have moved. Where it does not, what the filter made of motor and friction
+    during the stroke rested on the wrong pads."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
     same = True
     for i in range(len(p.curve)):
         same = same and learned.curve[i] == p.curve[i]
     kept = same and abs(moved) < contact_jump(p)
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
+    if not kept:
+        copy_errors(s.error, s.covariance, begun[0].error, begun[0].covariance)
     first = max(0, len(rows) - _RUN_UP)
-    scratch[0] = s
-    t = scratch[0]
+    begun[0] = s
+    t = begun[0]
     t.contact_angle += weight * moved
     t.scale = s.scale if same else 1.0
     settle_paths(t, learned, rows[first], rows[first].factor * t.scale)
@@ -191,12 +194,12 @@ def apply_learned(s, p, scratch, rows, learned, a):
 
 
 @njit
-def _conclude(a, s, parameters, learned, scratch, rows):
+def _conclude(a, s, parameters, learned, begun, rows):
     """The moment for the outcome of an evaluation; ``parameters`` has shape (1,)."""
     if not a.evaluation_ready:
         end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
     elif a.evaluation == r.ACCEPTED:
-        apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
+        apply_learned(s, parameters[0], begun, rows[: a.rows], learned, a)
         parameters[0] = learned
         end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
@@ -205,7 +208,7 @@ def _conclude(a, s, parameters, learned, scratch, rows):
 
 
 @njit
-def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
+def observe(a, s, parameters, learned, limits, others_hold, begun, rows, m, estimate):
     """Advance one corner's adaptation by one estimate, and state it there.
 
     Args:
@@ -214,7 +217,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
         parameters: its PARAMETERS, shape (1,); ``learned`` the PARAMETERS record that an accepted evaluation puts there.
         limits: LIMITS record.
         others_hold: whether the car stays where it is while this corner is opened.
-        scratch: STATE array, shape (1,).
+        begun: STATE array, shape (1,): as it was before the training.
         rows: TRAINING array, shape (CAPACITY,).
         m, estimate: SAMPLE and ESTIMATE; the sample is old if the estimate is a prediction.
     """
@@ -234,12 +237,13 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
     elif a.phase == r.IDLE:
         a.parked_time = 0.0 if m.brake_request != 0.0 else a.parked_time + m.dt
         if not a.tried:
+            begun[0] = s
             if a.still_time == 0.0:
                 _begin(a, r.WATCHING)
             elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, parameters, learned, limits, scratch, rows, m)
+        _advance(a, s, parameters, learned, limits, begun, rows, m)
     estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
@@ -280,13 +284,13 @@ def _follow(a, s, p, limits, m, estimate):
 
 
 @njit
-def _advance(a, s, parameters, learned, limits, scratch, rows, m):
+def _advance(a, s, parameters, learned, limits, begun, rows, m):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
         _collect(a, s, rows, m)
         if a.rows - a.training_rows >= r.EVALUATION_SAMPLES:
-            _conclude(a, s, parameters, learned, scratch, rows)
+            _conclude(a, s, parameters, learned, begun, rows)
         return
     if a.phase == r.ASKING and a.rows == 0 and a.still_time > 0.0:
         if a.phase_time > limits.answer_time:
@@ -308,7 +312,7 @@ def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(ESTIMATE), Array(r.ADAPTER),
     Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
-def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
+def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, begun, rows):
     """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""
@@ -317,7 +321,7 @@ def answer_adapting(samples, first, count, states, parameters, learned, estimate
         k = m.corner
         answer_row(m, states[k], parameters[k], estimate)
         a, own, hold = adapters[k], parameters[k : k + 1], others_hold(adapters, limits, k, estimate.time_ns)
-        observe(a, states[k], own, learned[k], limits[k], hold, scratch, rows[k], m, estimate)
+        observe(a, states[k], own, learned[k], limits[k], hold, begun[k : k + 1], rows[k], m, estimate)
         if a.evaluation_wanted:
             return number + 1
     return count
