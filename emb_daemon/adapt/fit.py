@@ -6,8 +6,8 @@ calibration.
 
 An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
 sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
-which steel keeps for life, can. Torque constant, inertia and stiffness start from what driving has found of them: they only
-fit each other together.
+which steel keeps for life, can: it is the calibration's, whatever driving made of it. Pads that are as they were are those
+that driving knew, stiffness included.
 
 Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
@@ -46,8 +46,7 @@ from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
 from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.contact import torque_sigma
-from emb_daemon.models.fusion import FADE, GAIN, HOUSING, SLOW, VISCOUS
-from emb_daemon.models.fusion import INERTIA as INERTIA_ERROR
+from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -107,13 +106,13 @@ def _run(states, parameters, rows, residual, force):
 
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over what driving made of it, load friction over gear gain, offset friction (N m), logarithms of the
-    presliding angle and of the inertia, again over driving's, and the curve's coefficients in units of ``scale``
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the
+    presliding angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale``
     (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
-        calibration: in use until now, with driving's torque constant and inertia.
+        calibration: in use until now.
         state: STATE record of the estimator before it.
     """
 
@@ -361,15 +360,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     Returns:
         `Evaluation`; its ``outcome`` says whether it may be used.
     """
-    limits, errors = calibration.adaptation, state["error"]
-    driven_gain = 1.0 + errors[GAIN] + errors[FADE] * state["winding"] + errors[HOUSING] * state["housing"]
-    motor = calibration.motor
-    driven = {
-        TORQUE_CONSTANT: motor.torque_constant_Nm_per_A * driven_gain,
-        INERTIA: motor.inertia_kg_m2 * (1.0 + errors[INERTIA_ERROR]),
-    }
-    calibration = moved(calibration, driven)
-    now = to_parameters(calibration)
+    now, limits = to_parameters(calibration), calibration.adaptation
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
     terms = curve_terms(calibration)
@@ -393,11 +384,9 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     # The torque constant's error scales the whole curve, whose shape is known better than its size.
     along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
     constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
-    # What the fit cannot see: the dynamics' own error, and those of gear gain, inertia and pad temperature, which the curve
-    # inherits.
-    inertia_sigma = sqrt(state["covariance"][INERTIA_ERROR, INERTIA_ERROR])
-    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, inertia_sigma, factor_sigma)
-    torque_gain = driven_gain * exp(x[_GAIN])
+    # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
+    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
+    torque_gain = exp(x[_GAIN])
     if unchanged:
         values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
     else:
@@ -458,7 +447,7 @@ def _judge(rows, fit, base, found):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
         return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"
-    if abs(log(found.torque_gain)) > _GAIN_LIMIT:
+    if abs(fit.x[_GAIN]) > _GAIN_LIMIT:
         return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} of the calibration's"
     if out_of_bounds := why_out_of_bounds(base, found.values):
         return r.OUT_OF_BOUNDS, out_of_bounds

@@ -4,7 +4,7 @@ Training is asked for once per application of the park brake. Motion that comes 
 used too; then whoever moves the brake may raise BrakeRequest with it, so that only an asked training ends on it.
 """
 
-from math import hypot
+from math import hypot, sqrt
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
-from emb_daemon.estimator.unknown import contact_jump
+from emb_daemon.estimator.unknown import INERTIA_SIGMA, contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, LOAD, OFFSET, SCALE, copy_errors
+from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, INERTIA, LOAD, OFFSET, SCALE, copy_errors
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -31,6 +31,8 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
 #: time over which collecting goes on after a full stroke.
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
+#: Standard deviations up to which a stroke and driving agree on the torque constant.
+_AGREE = 3.0
 #: Rows over which the path models are run up to the moment at which learned values take effect: many time constants.
 _RUN_UP = 700
 _BAD = (
@@ -148,16 +150,19 @@ def apply_learned(s, p, begun, rows, learned, a):
     path models to the last of ``rows``. ``begun``: STATE from before the training, shape (1,), which is used up.
 
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that, unless the pads have moved. Where it does not, what the filter made of motor and friction
-    during the stroke rested on the wrong pads."""
+    angle is weighed against that, unless the pads have moved or the stroke found another torque constant. Otherwise what the
+    filter made of motor and friction during the stroke rested on the wrong pads."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
     same = True
     for i in range(len(p.curve)):
         same = same and learned.curve[i] == p.curve[i]
-    kept = same and abs(moved) < contact_jump(p)
+    b = begun[0]
+    gain = a.torque_gain - (1.0 + b.error[GAIN] + b.error[FADE] * b.winding + b.error[HOUSING] * b.housing)
+    agree = abs(gain) < _AGREE * hypot(a.torque_gain_sigma, sqrt(b.covariance[GAIN, GAIN]))
+    kept = same and agree and abs(moved) < contact_jump(p)
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
     if not kept:
-        copy_errors(s.error, s.covariance, begun[0].error, begun[0].covariance)
+        copy_errors(s.error, s.covariance, b.error, b.covariance)
     first = max(0, len(rows) - _RUN_UP)
     begun[0] = s
     t = begun[0]
@@ -174,7 +179,7 @@ def apply_learned(s, p, begun, rows, learned, a):
     # what may still differ for this very curve.
     for i in range(len(s.error)):
         # What was taught is new and errs on its own.
-        taught = i in (FAST, CONTACT, LOAD, COULOMB) or (i in (GAIN, SCALE) and not kept)
+        taught = i in (FAST, CONTACT, LOAD, COULOMB) or (i in (GAIN, SCALE, INERTIA) and not kept)
         if taught:
             s.error[i] = 0.0
         for j in range(len(s.error)):
@@ -185,7 +190,9 @@ def apply_learned(s, p, begun, rows, learned, a):
     if not kept:
         s.error[GAIN] = a.torque_gain - 1.0 - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
         s.covariance[GAIN, GAIN] = a.torque_gain_sigma**2
-        # What the stroke left open of the stiffness, driving may still find.
+        # The torque constant was found with the calibration's inertia. What the stroke left open of the stiffness, driving
+        # may still find.
+        s.covariance[INERTIA, INERTIA] = INERTIA_SIGMA**2
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
     s.contact.confirmed, s.contact.lost = True, False
     if not kept:
