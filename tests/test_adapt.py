@@ -585,7 +585,8 @@ def test_a_wrong_torque_constant_is_not_taken_for_other_pads(ideal, gain):
     rows["current_q"] /= gain
     found = fit(rows, IDEAL)
     assert found.outcome == r.ACCEPTED, found.note
-    assert found.torque_gain == pytest.approx(gain, rel=0.02)
+    assert found.evidence["torque_gain"] == pytest.approx(gain, rel=0.02)
+    assert found.torque_error == pytest.approx(1.0 / gain - 1.0, abs=0.02)
     assert np.abs(force_error(found, ideal, np.linspace(1.0, 20.0, 20))).max() < 200.0
     other = fit(rows, believed(), IDEAL)
     assert abs(force_error(other, ideal, [20.0])[0]) < 3.0 * sigma_at(other, ideal, 20.0)

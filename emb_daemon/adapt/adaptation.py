@@ -60,7 +60,7 @@ class Adaptation:
         self.limits = np.zeros(4, r.LIMITS)
         self.rows = np.zeros((4, r.CAPACITY), r.TRAINING)
         self.learned = np.zeros(4, PARAMETERS)
-        self._begun = np.zeros(4, STATE)
+        self._scratch = np.zeros(1, STATE)
         self._memory, self._clock, self._threaded = memory, clock, threaded
         self._calibrations: dict[int, Calibration] = {}
         self._stores: dict[int, Store] = {}
@@ -144,7 +144,7 @@ class Adaptation:
             while not self._done.empty():
                 self._take_evaluation(*self._done.get())
             first = answer_adapting(
-                samples, first, count, states, parameters, self.learned, estimates, self.adapters, self.limits, self._begun,
+                samples, first, count, states, parameters, self.learned, estimates, self.adapters, self.limits, self._scratch,
                 self.rows,
             )  # fmt: skip
             if any(self.adapters[name].any() for name in ("evaluation_wanted", "ended", "snapshot_wanted")):
@@ -179,7 +179,7 @@ class Adaptation:
             rows = self.rows[corner, : int(adapter["training_rows"])]
             # Records are views, and the loop goes on writing to them: what is handed over is copied.
             self._do(self._evaluate, corner, int(adapter["generation"]), rows, self._calibrations[corner],
-                     self.in_use(CORNERS[corner]), self._begun[corner].copy(), float(adapter["power_on_angle"]),
+                     self.in_use(CORNERS[corner]), state.copy(), float(adapter["power_on_angle"]),
                      float(adapter["factor_sigma"]))  # fmt: skip
 
     def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
@@ -213,7 +213,7 @@ class Adaptation:
             return
         self._evaluations[corner], self.learned[corner] = evaluation, learned
         adapter["evaluation"], adapter["evaluation_ready"] = evaluation.outcome, True
-        for name in ("contact_angle", "contact_sigma", "torque_gain", "torque_gain_sigma"):
+        for name in ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma"):
             adapter[name] = getattr(evaluation, name)
 
     def close(self, states: np.ndarray, parameters: np.ndarray) -> None:

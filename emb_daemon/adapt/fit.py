@@ -6,8 +6,7 @@ calibration.
 
 An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
 sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
-which steel keeps for life, can: it is the calibration's, whatever driving made of it. Pads that are as they were are those
-that driving knew, stiffness included.
+which steel keeps for life, can.
 
 Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
@@ -16,7 +15,7 @@ Only the paths are compiled. The fit is done once in a park brake's life of minu
 computes itself would take far longer to compile than to run.
 """
 
-from math import exp, hypot, log, sqrt
+from math import exp, expm1, hypot, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -82,7 +81,7 @@ _RANGES = 5
 def unexplained_step(s, p, row):
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
     before, speed = s.force, s.speed
-    stiffness_path(s, p, row, row.factor * s.scale)
+    stiffness_path(s, p, row, row.factor)
     torque, leverage, _ = torque_path(s, p, row)
     s.angle, s.speed = row.angle, row.speed
     force = 0.5 * (before + s.force)
@@ -97,7 +96,7 @@ def unexplained_step(s, p, row):
 def _run(states, parameters, rows, residual, force):
     """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
     s, p = states[0], parameters[0]
-    settle_paths(s, p, rows[0], rows[0].factor * s.scale)
+    settle_paths(s, p, rows[0], rows[0].factor)
     residual[0], force[0] = np.nan, s.force
     for i in range(1, len(rows)):
         residual[i] = unexplained_step(s, p, rows[i])
@@ -106,14 +105,13 @@ def _run(states, parameters, rows, residual, force):
 
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
-    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the
-    presliding angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale``
-    (N/rad^(n+1)).
+    torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
+    angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
 
     Args:
         rows: TRAINING array, the samples in order.
         calibration: in use until now.
-        state: STATE record of the estimator before it.
+        state: STATE record of the estimator at its end.
     """
 
     def __init__(self, rows, calibration, state, scale):
@@ -140,7 +138,7 @@ class _Training:
         inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
         trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
         self._states[0] = self._state
-        self._states["contact_angle"], self._states["scale"] = x[_CONTACT], 1.0
+        self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
         _run(self._states, np.atleast_1d(to_parameters(trial)), self._rows, residual, force)
         residual -= x[_TORQUE_OFFSET]
@@ -354,7 +352,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     Args:
         rows: TRAINING array, the samples in order.
         calibration, base: in use until now, and as the file has it.
-        state: STATE record, the estimator's before the training.
+        state: STATE record, the estimator's at the end of the training.
         factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
 
     Returns:
@@ -369,14 +367,12 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     training = _Training(rows, calibration, state, scale)
-    mounted = state["scale"] * now["curve"][:terms]
-    fit, unchanged = _fit_with_and_without_curve(training, x, mounted / scale, now["offset_friction"])
+    fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
     x, covariance = fit.x, fit.covariance
     values = training.values(x)
     if unchanged:
         values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
-    # Pads that are as they were keep what driving has found of their stiffness.
-    curve = to_parameters(moved(calibration, values))["curve"] * (state["scale"] if unchanged else 1.0)
+    curve = to_parameters(moved(calibration, values))["curve"]
     expected, _ = torque_sigma(*_noises(calibration))
     sigma = _deviation(fit.residual)
     sigmas = np.sqrt(np.diag(covariance))
@@ -386,7 +382,6 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
     # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
     scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
-    torque_gain = exp(x[_GAIN])
     if unchanged:
         values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
     else:
@@ -403,8 +398,8 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         },
         contact_angle=float(x[_CONTACT]),
         contact_sigma=fit.contact_sigma,
-        torque_gain=torque_gain,
-        torque_gain_sigma=torque_gain * hypot(sigmas[_GAIN], limits.torque_constant_relative),
+        torque_error=expm1(-x[_GAIN]),
+        torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
         evidence={
             "samples": len(rows),
             "residual_A": float(sigma / now["torque_constant"]),
@@ -414,7 +409,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
             "contact_sigma_rad": float(sigmas[_CONTACT]),
             "force_sigma_N": force_sigma,
             "top_force_N": float(characteristic_curve(top, curve)[0]),
-            "torque_gain": torque_gain,
+            "torque_gain": exp(x[_GAIN]),
             "torque_gain_sigma": float(sigmas[_GAIN]),
             "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
         },

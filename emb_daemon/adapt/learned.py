@@ -28,8 +28,7 @@ class Evaluation:
         outcome: ACCEPTED or why not; ``note`` says it with numbers where there are any.
         values, sigmas: by the calibration's keys.
         contact_angle: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad.
-        torque_gain, torque_gain_sigma: motor torque over what the calibration makes of the current, which is the magnets' and
-            the current sensor's.
+        torque_error, torque_error_sigma: of the torque path, as a share of the force: the magnets' and the current sensor's.
         evidence: figures for people, by name.
     """
 
@@ -39,8 +38,8 @@ class Evaluation:
     sigmas: dict[str, float] = field(default_factory=dict)
     contact_angle: float = np.nan
     contact_sigma: float = np.nan
-    torque_gain: float = 1.0
-    torque_gain_sigma: float = np.nan
+    torque_error: float = 0.0
+    torque_error_sigma: float = np.nan
     evidence: dict[str, float] = field(default_factory=dict)
 
 

@@ -63,7 +63,7 @@ ADAPTER = np.dtype(
         ("evaluation_wanted", "?"),
         ("evaluation_ready", "?"),
         ("evaluation", "i8"),
-        *fields("f8", "contact_angle contact_sigma torque_gain torque_gain_sigma"),
+        *fields("f8", "contact_angle contact_sigma torque_error torque_error_sigma"),
         ("ended", "?"),
         *fields("f8", "ambient rise factor_sigma"),
         ("time_ns", "i8"),

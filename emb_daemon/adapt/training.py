@@ -4,7 +4,7 @@ Training is asked for once per application of the park brake. Motion that comes 
 used too; then whoever moves the brake may raise BrakeRequest with it, so that only an asked training ends on it.
 """
 
-from math import hypot, sqrt
+from math import hypot
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
-from emb_daemon.estimator.unknown import INERTIA_SIGMA, contact_jump
+from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, COULOMB, FADE, FAST, GAIN, HOUSING, INERTIA, LOAD, OFFSET, SCALE, copy_errors
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -31,8 +31,6 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
 #: time over which collecting goes on after a full stroke.
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
-#: Standard deviations up to which a stroke and driving agree on the torque constant.
-_AGREE = 3.0
 #: Rows over which the path models are run up to the moment at which learned values take effect: many time constants.
 _RUN_UP = 700
 _BAD = (
@@ -145,55 +143,50 @@ def _progress(a, limits):
 
 
 @njit
-def apply_learned(s, p, begun, rows, learned, a):
+def apply_learned(s, p, scratch, rows, learned, a):
     """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
-    path models to the last of ``rows``. ``begun``: STATE from before the training, shape (1,), which is used up.
+    path models to the last of ``rows``.
 
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that, unless the pads have moved or the stroke found another torque constant. Otherwise what the
-    filter made of motor and friction during the stroke rested on the wrong pads."""
+    angle is weighed against that, unless the pads have moved."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
-    same = True
+    kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
-        same = same and learned.curve[i] == p.curve[i]
-    b = begun[0]
-    gain = a.torque_gain - (1.0 + b.error[GAIN] + b.error[FADE] * b.winding + b.error[HOUSING] * b.housing)
-    agree = abs(gain) < _AGREE * hypot(a.torque_gain_sigma, sqrt(b.covariance[GAIN, GAIN]))
-    kept = same and agree and abs(moved) < contact_jump(p)
+        kept = kept and learned.curve[i] == p.curve[i]
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
-    if not kept:
-        copy_errors(s.error, s.covariance, b.error, b.covariance)
+    scale, gain = s.scale if kept else 1.0, s.error[GAIN]
+    gain_variance = s.covariance[GAIN, GAIN]
     first = max(0, len(rows) - _RUN_UP)
-    begun[0] = s
-    t = begun[0]
+    scratch[0] = s
+    t = scratch[0]
     t.contact_angle += weight * moved
-    t.scale = s.scale if same else 1.0
-    settle_paths(t, learned, rows[first], rows[first].factor * t.scale)
+    settle_paths(t, learned, rows[first], rows[first].factor)
     for i in range(first + 1, len(rows)):
         unexplained_step(t, learned, rows[i])
-    s.contact_angle, s.past_contact, s.scale = t.contact_angle, t.past_contact, t.scale
+    s.contact_angle, s.past_contact = t.contact_angle, t.past_contact
     s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
     s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
     s.effects = t.effects
     # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
     # what may still differ for this very curve.
+    # Stiffness, contact and friction are new; what concerns the motor and its current sensor is no part of them.
+    motor = (OFFSET, FADE, HOUSING)
     for i in range(len(s.error)):
-        # What was taught is new and errs on its own.
-        taught = i in (FAST, CONTACT, LOAD, COULOMB) or (i in (GAIN, SCALE, INERTIA) and not kept)
-        if taught:
+        if i not in motor:
             s.error[i] = 0.0
         for j in range(len(s.error)):
-            if taught and i != j:
-                s.covariance[i, j] = s.covariance[j, i] = 0.0
+            if i != j and (i not in motor or j not in motor):
+                s.covariance[i, j] = 0.0
     s.covariance[FAST, FAST] = 1.0
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
-    if not kept:
-        s.error[GAIN] = a.torque_gain - 1.0 - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
-        s.covariance[GAIN, GAIN] = a.torque_gain_sigma**2
-        # The torque constant was found with the calibration's inertia. What the stroke left open of the stiffness, driving
-        # may still find.
-        s.covariance[INERTIA, INERTIA] = INERTIA_SIGMA**2
+    if kept:
+        s.error[GAIN], s.covariance[GAIN, GAIN] = gain, gain_variance
+    else:
+        s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
+        s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
+        # What the stroke left open of the new curve, driving may still find.
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
+    s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
     if not kept:
         s.contact_anchor = s.contact_angle
@@ -201,12 +194,12 @@ def apply_learned(s, p, begun, rows, learned, a):
 
 
 @njit
-def _conclude(a, s, parameters, learned, begun, rows):
+def _conclude(a, s, parameters, learned, scratch, rows):
     """The moment for the outcome of an evaluation; ``parameters`` has shape (1,)."""
     if not a.evaluation_ready:
         end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
     elif a.evaluation == r.ACCEPTED:
-        apply_learned(s, parameters[0], begun, rows[: a.rows], learned, a)
+        apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
         parameters[0] = learned
         end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
@@ -215,7 +208,7 @@ def _conclude(a, s, parameters, learned, begun, rows):
 
 
 @njit
-def observe(a, s, parameters, learned, limits, others_hold, begun, rows, m, estimate):
+def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
     """Advance one corner's adaptation by one estimate, and state it there.
 
     Args:
@@ -224,7 +217,7 @@ def observe(a, s, parameters, learned, limits, others_hold, begun, rows, m, esti
         parameters: its PARAMETERS, shape (1,); ``learned`` the PARAMETERS record that an accepted evaluation puts there.
         limits: LIMITS record.
         others_hold: whether the car stays where it is while this corner is opened.
-        begun: STATE array, shape (1,): as it was before the training.
+        scratch: STATE array, shape (1,).
         rows: TRAINING array, shape (CAPACITY,).
         m, estimate: SAMPLE and ESTIMATE; the sample is old if the estimate is a prediction.
     """
@@ -244,13 +237,12 @@ def observe(a, s, parameters, learned, limits, others_hold, begun, rows, m, esti
     elif a.phase == r.IDLE:
         a.parked_time = 0.0 if m.brake_request != 0.0 else a.parked_time + m.dt
         if not a.tried:
-            begun[0] = s
             if a.still_time == 0.0:
                 _begin(a, r.WATCHING)
             elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, parameters, learned, limits, begun, rows, m)
+        _advance(a, s, parameters, learned, limits, scratch, rows, m)
     estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
@@ -291,13 +283,13 @@ def _follow(a, s, p, limits, m, estimate):
 
 
 @njit
-def _advance(a, s, parameters, learned, limits, begun, rows, m):
+def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     """A phase other than idle, nothing being in the way."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
         _collect(a, s, rows, m)
         if a.rows - a.training_rows >= r.EVALUATION_SAMPLES:
-            _conclude(a, s, parameters, learned, begun, rows)
+            _conclude(a, s, parameters, learned, scratch, rows)
         return
     if a.phase == r.ASKING and a.rows == 0 and a.still_time > 0.0:
         if a.phase_time > limits.answer_time:
@@ -319,7 +311,7 @@ def _advance(a, s, parameters, learned, limits, begun, rows, m):
     Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(ESTIMATE), Array(r.ADAPTER),
     Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
-def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, begun, rows):
+def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
     """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""
@@ -328,7 +320,7 @@ def answer_adapting(samples, first, count, states, parameters, learned, estimate
         k = m.corner
         answer_row(m, states[k], parameters[k], estimate)
         a, own, hold = adapters[k], parameters[k : k + 1], others_hold(adapters, limits, k, estimate.time_ns)
-        observe(a, states[k], own, learned[k], limits[k], hold, begun[k : k + 1], rows[k], m, estimate)
+        observe(a, states[k], own, learned[k], limits[k], hold, scratch, rows[k], m, estimate)
         if a.evaluation_wanted:
             return number + 1
     return count

@@ -46,7 +46,7 @@ _GAIN, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
 #: range that is several times that current); and time in which it drifts as far again, s.
 _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
 #: Inertia: rotor and screw do not change, but what a calibration makes of them is no better than this, share.
-INERTIA_SIGMA = 0.02
+_INERTIA = 0.02
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
 _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
 #: Rise of friction at low speed that a calibration without it leaves, and that wear or another lubricant bring (breakaway over
@@ -130,7 +130,7 @@ def set_priors(P, p):
     P[OFFSET, OFFSET] = torque_offset(p) ** 2
     P[SCALE, SCALE] = _SCALE**2
     set_friction(P, p, _WARM_C)
-    P[INERTIA, INERTIA] = INERTIA_SIGMA**2
+    P[INERTIA, INERTIA] = _INERTIA**2
     P[SLOW, SLOW] = _SLOW**2
     P[FADE, FADE] = _FADE**2
     P[HOUSING, HOUSING] = _HOUSING**2
