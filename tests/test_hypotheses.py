@@ -8,16 +8,19 @@ import pytest
 
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
+    CERTAIN_ODDS,
     DISC_GROWTH,
     DRIFT,
     PRIOR_ODDS,
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     drift_odds,
+    least_odds,
     mix,
     open_again,
     open_all,
     settle,
+    stay_finite,
     suspected,
     to_force,
     unproven,
@@ -284,6 +287,19 @@ def test_odds_never_fall_below_their_start():
     """Or a later jump would have to make up for a long past without any."""
     assert _weighed(0.0, 0.0, 1.0, times=1000) == PRIOR_ODDS
     assert _weighed(0.0, 5.0, 0.0, times=1000) == 100.0
+
+
+def test_what_tells_two_changes_apart_outlasts_certainty(p):
+    """However much both explain what nothing does, the one that explained more stays ahead by as much."""
+    s = new_state()[0]
+    s["alternatives"]["log_odds"] = 150.0, 120.0, -7.0, 149.0
+    stay_finite(s)
+    assert s["alternatives"]["log_odds"].tolist() == [
+        CERTAIN_ODDS,
+        CERTAIN_ODDS - 30.0,
+        least_odds(DISC_GROWTH),
+        CERTAIN_ODDS - 1.0,
+    ]
 
 
 @pytest.fixture
