@@ -4,7 +4,9 @@ needs to be in step."""
 import os
 import subprocess
 import sys
+import time
 from functools import cache, partial
+from pathlib import Path
 
 import cantools
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 import wirekit
 from hypothesis import given
 from hypothesis import strategies as st
-from wirekit import MS
+from test_daemon import Running, answers
 
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.errors import InputError, Unavailable
@@ -23,13 +25,13 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
 from emb_daemon.resources import resource
 from emb_daemon.runtime import secured
-from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile
+from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile, SecuredBus
 from emb_daemon.wire import contract
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.e2e import protect
 from emb_daemon.wire.frames import FRAME, UNAUTHENTIC
 from emb_daemon.wire.keys import cmac, key_file, load_keys
 from emb_daemon.wire.secoc import FRESHNESS_SET, Signer, Verifier, authenticator, freshness_value, load_links
+from studies import attacks
 
 pytest.importorskip("cryptography", reason="NOT RUN: the extra secoc is not installed")
 
@@ -112,6 +114,12 @@ def test_authenticator_and_its_place_are_those_of_cantools(shape, trip, reset, m
     assert tail & (1 << 36) - 1 == authenticator(mac, AUTH | which << 11, octets, freshness_value(trip, reset, message))
 
 
+def test_check_value_of_the_documentation():
+    mac, page = cmac(bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")), Path(__file__).parent.parent / "docs" / "wire.md"
+    assert authenticator(mac, 0x130, bytes(16), freshness_value(1, 1, 1)) == 0xB7684ADB3
+    assert all(word in page.read_text(encoding="utf-8") for word in ("0xB7684ADB3", freshness_value(1, 1, 1).hex()))
+
+
 @cache
 def drive(seconds=4.0):
     """Frames of FL's brake and its car."""
@@ -186,46 +194,12 @@ def test_cuts_between_batches_change_nothing(cuts):
     assert wirekit.same(np.concatenate([parts.verify(part) for part in np.split(frames, sorted(cuts))]), whole)
 
 
-def forge(name, seed):
-    """Foreign frames among the genuine ones by somebody who knows all but the keys."""
-    rng, genuine = np.random.default_rng(seed), signed()
-    fast = genuine[np.isin(genuine["can_id"], [0x100, 0x110, AUTH, FRESHNESS, 0x180, VEHICLE_AUTH])].copy()
-    fast = fast[fast["time_ns"] > _START_NS + 100 * CYCLE_NS]
-    match name:
-        case "right time":
-            fast["time_ns"] -= rng.integers(1, 2 * MS, len(fast))
-            noise = rng.integers(0, 2**48, len(fast), dtype=np.uint64) << np.uint64(16)
-            keep = np.uint64(0xFFF0F00) if seed % 2 else np.uint64(0x0000F00)
-            for frame, random in zip(fast, noise, strict=True):
-                payload = (random & ~(keep | np.uint64(0xFFFF))) | (frame["data"] & keep)
-                frame["data"] = protect(frame["can_id"], payload & ~np.uint64(0xFFFF), int(payload >> np.uint64(8)) & 15, 0)
-        case "played back":
-            fast["time_ns"] += 15 * (1 + seed) * CYCLE_NS - MS // 2
-        case "played back, with the freshness that is expected":
-            fast["time_ns"] += 15 * (1 + seed) * CYCLE_NS - MS // 2
-            ours, theirs = fast[fast["can_id"] == AUTH], genuine[genuine["can_id"] == AUTH]
-            expected = theirs["data"][np.searchsorted(theirs["time_ns"], ours["time_ns"]).clip(0, len(theirs) - 1)]
-            mask = np.uint64(0xFF << 20)
-            fast["data"][fast["can_id"] == AUTH] = (ours["data"] & ~mask) | (expected & mask)
-        case "freshness of the future":
-            fast["can_id"] = np.where(np.arange(len(fast)) % 2, AUTH, FRESHNESS)
-            for index, frame in enumerate(fast):
-                payload = 1 << 16 | (9 + index) << 40 if frame["can_id"] == FRESHNESS else FRESHNESS_SET << 16 | 0x123 << 28
-                frame["data"] = protect(frame["can_id"], np.uint64(payload), index // 2 % 15, 0)
-    return fast[fast["time_ns"] < genuine["time_ns"][-1]]
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(
-    "name", ["right time", "played back", "played back, with the freshness that is expected", "freshness of the future"]
-)
-def test_of_frames_without_the_key_none_is_taken_and_the_forces_stay_the_same_to_the_bit(name, seed):
-    foreign = forge(name, seed)
-    frames = verifier().verify(merged(foreign, signed()))
-    genuine = set(zip(drive()["can_id"].tolist(), drive()["data"].tolist(), strict=True))
-    taken = frames[frames["flags"] == 0]
-    assert len(foreign) > 1000 and len(taken) == len(drive())
-    assert set(zip(taken["can_id"].tolist(), taken["data"].tolist(), strict=True)) == genuine
+@pytest.mark.parametrize("name", attacks.FORGERIES)
+def test_of_frames_without_the_key_none_is_taken_and_the_forces_stay_the_same_to_the_bit(name):
+    """A short form of studies/attacks.py."""
+    foreign = attacks.forged(name, signed(), np.random.default_rng(1), MACS | {"nobody": cmac(b"somebody's key !")})
+    frames, missing, others = attacks.believed(signed(), foreign, MACS)
+    assert len(foreign) > 500 and (missing, others) == (0, 0)
     ours, theirs = estimates_of(frames), estimates_of(drive())
     for field in NUMBERS[:-1]:
         assert ours[field].tobytes() == theirs[field].tobytes(), field
@@ -516,6 +490,30 @@ class TestConfiguration:
         setup = Setup(configured(tmp_path, "secoc: {keys: keys}\n"))
         with pytest.raises(InputError, match="expected state_directory as well"):
             secured.secure(None, setup, None)
+
+
+def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path):
+    """In the midst of forged frames: every genuine sample is answered, with the payload that the recorded bus gives, and who
+    has the key believes it."""
+    running = Running(Setup(configured(tmp_path, "realtime: {fifo_priority: null, lock_memory: false}\n")))
+    running.daemon._bus = SecuredBus(running.daemon._bus, opened(tmp_path / "state"))
+    genuine = signed()[: of(signed(), AUTH)[250] + 1]
+    foreign = attacks.forged(next(iter(attacks.FORGERIES)), signed(), np.random.default_rng(2), MACS)
+    mixed = merged(foreign[foreign["time_ns"] < genuine["time_ns"][-1]], genuine)
+    log = []
+    with running:
+        for frames in np.split(mixed, np.flatnonzero(np.diff((mixed["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
+            log.append(running.send(frames))
+            running.listen()
+            time.sleep(0.004)
+        samples = int(np.sum(genuine["can_id"] == 0x100))
+        heard = running.wait_for(lambda frames: len(answers(frames)) >= samples)
+    believed = Verifier(SENT, MACS, {}).verify(heard)
+    assert np.all(believed["flags"] == 0) and np.sum(believed["can_id"] == 0x200) == np.sum(heard["can_id"] == 0x200)
+    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",))
+    pipeline.begin(int(log[0]["time_ns"][0]))
+    _, count = pipeline.consume(verifier().verify(np.concatenate(log)), predictions=False)
+    assert np.array_equal(answers(believed), answers(pipeline.broadcast(count))) and count == samples
 
 
 def test_without_it_no_cryptography_is_loaded():
