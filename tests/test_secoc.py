@@ -106,17 +106,19 @@ def test_authenticator_and_its_place_are_those_of_cantools(shape, trip, reset, m
     specifics = AutosarMessageSpecifics()
     specifics._secoc = properties
     theirs = cantools.database.can.Message(AUTH, "Secured", 8 * messages + 6, [], autosar_specifics=specifics)
-    octets, freshness = content[: 8 * messages], trip << 32 | reset << 8 | message
+    octets = content[: 8 * messages]
+    payloads = [int.from_bytes(octets[at : at + 8], "little") for at in range(0, len(octets), 8)]
+    freshness = trip << 32 | reset << 8 | message
     secured_message = apply_authenticator(octets + bytes(6), theirs, lambda _m, data, _f: mac(data), freshness)
     assert verify_authenticator(secured_message, theirs, lambda _m, data, _f: mac(data), freshness)
     tail = int.from_bytes(secured_message[-6:]) >> 4
     assert tail >> 36 == message
-    assert tail & (1 << 36) - 1 == authenticator(mac, AUTH | which << 11, octets, freshness_value(trip, reset, message))
+    assert tail & (1 << 36) - 1 == authenticator(mac, AUTH | which << 11, payloads, freshness_value(trip, reset, message))
 
 
 def test_check_value_of_the_documentation():
     mac, page = cmac(bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")), Path(__file__).parent.parent / "docs" / "wire.md"
-    assert authenticator(mac, 0x130, bytes(16), freshness_value(1, 1, 1)) == 0xB7684ADB3
+    assert authenticator(mac, 0x130, (0, 0), freshness_value(1, 1, 1)) == 0xB7684ADB3
     assert all(word in page.read_text(encoding="utf-8") for word in ("0xB7684ADB3", freshness_value(1, 1, 1).hex()))
 
 

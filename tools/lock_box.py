@@ -1,6 +1,6 @@
 """Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`;
-requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead; and requirements-secoc.lock:
-what authenticated communication needs besides.
+requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead; and
+requirements-secoc.lock: what authenticated communication needs besides.
 
     python tools/lock_box.py [--check]
 

@@ -17,9 +17,10 @@ freshness management.
 The CMAC is passed in; nothing here knows keys or a cryptographic library.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,10 @@ FRESHNESS_SET = 15
 #: nothing is authenticated until the next start.
 LAST_MESSAGE, LAST_TRIP, LAST_RESET = 0xFF, 0xFF_FFFF, 0xFF_FFFF
 _TAG_BITS = 36
+#: Payloads of a set, as on the wire.
+_ONE, _TWO = Struct("<Q"), Struct("<QQ")
+#: With a Counter that no message has.
+_NO_PAYLOAD = 0xF00
 #: Flags of a frame of ours whose CRC is still missing.
 _BARE = 255
 #: A frame waits so long for its authentication: eight cycles, as a bus that was held up delivers; more frames of one message
@@ -119,9 +124,10 @@ def freshness_value(trip: int, reset: int, message: int) -> bytes:
     return (trip << 32 | reset << 8 | message).to_bytes(7, "big")
 
 
-def authenticator(mac: Mac, data_id: int, payloads: bytes, freshness: bytes) -> int:
-    """The first 36 bits of the CMAC, as a whole number."""
-    return int.from_bytes(mac(data_id.to_bytes(2, "big") + payloads + freshness)[:5], "big") >> 4
+def authenticator(mac: Mac, data_id: int, payloads: Sequence[int], freshness: bytes) -> int:
+    """The first 36 bits of the CMAC, as a whole number; payloads are those of FRAME."""
+    octets = _ONE.pack(*payloads) if len(payloads) == 1 else _TWO.pack(*payloads)
+    return int.from_bytes(mac(b"".join((data_id.to_bytes(2, "big"), octets, freshness)))[:5], "big") >> 4
 
 
 def _data_id(link: Link, which: int) -> int:
@@ -144,7 +150,7 @@ class _Outgoing:
     def __init__(self, link: Link, mac: Mac):
         self.link, self.mac = link, mac
         self.reset, self.message = 0, LAST_MESSAGE
-        self.payloads = [[-1] * len(ids) for ids in link.sets]
+        self.payloads = [[_NO_PAYLOAD] * len(ids) for ids in link.sets]
 
 
 class Signer:
@@ -172,51 +178,44 @@ class Signer:
         """``frames`` (FRAME array in sending order) with each set's authentication behind it; valid until the next call."""
         if 4 * len(frames) > len(self._frames):
             self._frames = np.zeros(4 * len(frames), FRAME)
-        signed, count = self._frames, 0
+        signed: list[tuple] = []
         for row in frames.tolist():
-            signed[count] = row
-            count += 1
+            signed.append(row)
             place = self._places.get(row[2])
             if place is None:
                 continue
             outgoing, which, position = place
             payloads = outgoing.payloads[which]
             payloads[position] = row[1]
-            counter = row[1] >> 8 & 15
-            if all(payload >> 8 & 15 == counter for payload in payloads):
-                for can_id, data in self._authenticate(outgoing, which, counter, payloads):
-                    signed[count] = (row[0], data, can_id, 8, 0 if can_id == outgoing.link.freshness_id else _BARE)
-                    count += 1
-                outgoing.payloads[which] = [-1] * len(payloads)
-        _protect(signed, count)
-        return signed[:count]
+            # Those of another sample are still to be replaced.
+            if len(payloads) == 1 or not any((payload ^ row[1]) & 0xF00 for payload in payloads):
+                self._authenticate(outgoing, which, row[0], payloads, signed)
+                payloads[:] = [_NO_PAYLOAD] * len(payloads)
+        self._frames[: len(signed)] = signed
+        _protect(self._frames, len(signed))
+        return self._frames[: len(signed)]
 
-    def _authenticate(self, outgoing: _Outgoing, which: int, set_counter: int, payloads: list[int]):
-        """The frames that follow a set: ids, and payloads, of authentication frames without their CRC."""
-        link = outgoing.link
+    def _authenticate(self, outgoing: _Outgoing, which: int, time_ns: int, payloads: list[int], signed: list[tuple]) -> None:
+        """Add the frames that follow a set; the CRC of authentication frames is still missing."""
         if outgoing.message == LAST_MESSAGE:
             if outgoing.reset == LAST_RESET:
                 return
             outgoing.reset += 1
             outgoing.message = 0
-            counter = outgoing.reset % COUNTER_MODULO
-            self._freshness[0] = (0, counter << 8 | self._trip << 16 | outgoing.reset << 40, link.freshness_id, 8, _BARE)
+            data = outgoing.reset % COUNTER_MODULO << 8 | self._trip << 16 | outgoing.reset << 40
+            self._freshness[0] = (time_ns, data, outgoing.link.freshness_id, 8, _BARE)
             # Before the others: this CRC is part of what is authenticated.
             _protect(self._freshness, 1)
-            data = int(self._freshness[0]["data"])
-            yield link.freshness_id, data
-            yield link.authentication_id, self._authentication(outgoing, FRESHNESS_SET, counter, [data])
+            signed += self._freshness.tolist()
+            self._append(outgoing, FRESHNESS_SET, time_ns, [signed[-1][1]], signed)
         outgoing.message += 1
-        yield link.authentication_id, self._authentication(outgoing, which, set_counter, payloads)
+        self._append(outgoing, which, time_ns, payloads, signed)
 
-    def _authentication(self, outgoing: _Outgoing, which: int, counter: int, payloads: list[int]) -> int:
-        freshness = freshness_value(self._trip, outgoing.reset, outgoing.message)
-        tag = authenticator(outgoing.mac, _data_id(outgoing.link, which), _octets(payloads), freshness)
-        return counter << 8 | which << 16 | outgoing.message << 20 | tag << 28
-
-
-def _octets(payloads: Iterable[int]) -> bytes:
-    return b"".join([payload.to_bytes(8, "little") for payload in payloads])
+    def _append(self, outgoing: _Outgoing, which: int, time_ns: int, payloads: list[int], signed: list[tuple]) -> None:
+        link, freshness = outgoing.link, freshness_value(self._trip, outgoing.reset, outgoing.message)
+        tag = authenticator(outgoing.mac, _data_id(link, which), payloads, freshness)
+        data = payloads[0] & 0xF00 | which << 16 | outgoing.message << 20 | tag << 28
+        signed.append((time_ns, data, link.authentication_id, 8, _BARE))
 
 
 class _Incoming:
@@ -282,25 +281,22 @@ class Verifier:
 def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
     """Give on the frames that an authentication frame is right about, or a refusal."""
     time_ns, data = row[:2]
-    which, counter = data >> 16 & 15, data >> 8 & 15
-    slots = incoming.held.get(which, ())
-    # The newest first: what was sent with this frame came just before it.
-    candidates = [[held for held in reversed(slot) if held[1] >> 8 & 15 == counter] for slot in slots]
-    genuine = _authentic(incoming, which, data, candidates, time_ns) if slots else None
+    slots = incoming.held.get(data >> 16 & 15)
+    genuine = _authentic(incoming, slots, data, time_ns) if slots else None
     if genuine is None:
         known.append((time_ns, 0, incoming.link.sets[0][0], 8, UNAUTHENTIC))
         return
-    for slot, frame, rivals in zip(slots, genuine, candidates, strict=True):
-        if which != FRESHNESS_SET:
-            known.append((time_ns, *frame[1:]))
-        if len(rivals) > 1:
-            known += [_refused(held, time_ns) for held in rivals if held is not frame]
-        slot[:] = [held for held in slot if held not in rivals]
+    for slot, frame in zip(slots, genuine, strict=True):
+        if data >> 16 & 15 != FRESHNESS_SET:
+            known.append((time_ns, frame[1], frame[2], 8, 0))
+        rest = [held for held in slot if held is not frame] if len(slot) > 1 else ()
+        known += [_refused(held, time_ns) for held in rest if not (held[1] ^ data) & 0xF00]
+        slot[:] = [held for held in rest if (held[1] ^ data) & 0xF00]
 
 
-def _authentic(incoming: _Incoming, which: int, data: int, candidates: list[list[tuple]], time_ns: int) -> tuple | None:
-    """Those of the candidates, one for each place of the set, that ``data`` authenticates; moves the link's freshness."""
-    message = data >> 20 & LAST_MESSAGE
+def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns: int) -> Sequence[tuple] | None:
+    """Those of the held frames, one of each place of the set, that ``data`` authenticates; moves the link's freshness."""
+    which, message = data >> 16 & 15, data >> 20 & LAST_MESSAGE
     freshness_alone = which == FRESHNESS_SET
     if incoming.mac is None or freshness_alone != (message == 0) or not (freshness_alone or incoming.in_step):
         return None
@@ -308,7 +304,8 @@ def _authentic(incoming: _Incoming, which: int, data: int, candidates: list[list
         incoming.tries, incoming.since_ns = 0, time_ns
     # A message counter that does not go on is the next reset's, whose freshness frame was lost.
     trip, reset = incoming.trip, incoming.reset + (message <= incoming.message)
-    for frames in product(*candidates):
+    # The newest first: what was sent with this frame came just before it.
+    for frames in product(*[[held for held in slot[::-1] if not (held[1] ^ data) & 0xF00] for slot in slots]):
         if freshness_alone:
             trip, reset = frames[0][1] >> 16 & LAST_TRIP, frames[0][1] >> 40
             if (trip, reset) <= (incoming.trip, incoming.reset):
@@ -316,8 +313,8 @@ def _authentic(incoming: _Incoming, which: int, data: int, candidates: list[list
         if incoming.tries == _MOST_TRIES or reset > LAST_RESET:
             return None
         incoming.tries += 1
-        octets = _octets([frame[1] for frame in frames])
-        tag = authenticator(incoming.mac, _data_id(incoming.link, which), octets, freshness_value(trip, reset, message))
+        freshness = freshness_value(trip, reset, message)
+        tag = authenticator(incoming.mac, _data_id(incoming.link, which), [frame[1] for frame in frames], freshness)
         if tag == data >> 28:
             incoming.trip, incoming.reset, incoming.message, incoming.in_step = trip, reset, message, True
             return frames
