@@ -286,12 +286,14 @@ def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
     if genuine is None:
         known.append((time_ns, 0, incoming.link.sets[0][0], 8, UNAUTHENTIC))
         return
+    if data >> 16 & 15 != FRESHNESS_SET:
+        known += [(time_ns, frame[1], frame[2], 8, 0) for frame in genuine]
     for slot, frame in zip(slots, genuine, strict=True):
-        if data >> 16 & 15 != FRESHNESS_SET:
-            known.append((time_ns, frame[1], frame[2], 8, 0))
-        rest = [held for held in slot if held is not frame] if len(slot) > 1 else ()
-        known += [_refused(held, time_ns) for held in rest if not (held[1] ^ data) & 0xF00]
-        slot[:] = [held for held in rest if (held[1] ^ data) & 0xF00]
+        if len(slot) == 1:
+            slot.clear()
+            continue
+        known += [_refused(held, time_ns) for held in slot if held is not frame and not (held[1] ^ data) & 0xF00]
+        slot[:] = [held for held in slot if (held[1] ^ data) & 0xF00]
 
 
 def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns: int) -> Sequence[tuple] | None:
@@ -304,8 +306,11 @@ def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns
         incoming.tries, incoming.since_ns = 0, time_ns
     # A message counter that does not go on is the next reset's, whose freshness frame was lost.
     trip, reset = incoming.trip, incoming.reset + (message <= incoming.message)
-    # The newest first: what was sent with this frame came just before it.
-    for frames in product(*[[held for held in slot[::-1] if not (held[1] ^ data) & 0xF00] for slot in slots]):
+    choices = [[slot[0] for slot in slots if len(slot) == 1]]
+    if len(choices[0]) != len(slots):
+        # The newest first: what was sent with this frame came just before it.
+        choices = product(*[[held for held in slot[::-1] if not (held[1] ^ data) & 0xF00] for slot in slots])
+    for frames in choices:
         if freshness_alone:
             trip, reset = frames[0][1] >> 16 & LAST_TRIP, frames[0][1] >> 40
             if (trip, reset) <= (incoming.trip, incoming.reset):
