@@ -16,11 +16,11 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Files, whose dependencies each holds (an extra, or the daemon's own), and what of them it leaves out.
+#: Files, what each holds the dependencies of (extras; ``""`` is the daemon itself), and what of them it leaves out.
 LOCKS = {
-    "requirements-box.lock": ("", ()),
-    "requirements-ahead.lock": ("", ("numba", "llvmlite")),
-    "requirements-secoc.lock": ("secoc", ()),
+    "requirements-box.lock": (("",), ()),
+    "requirements-ahead.lock": (("",), ("numba", "llvmlite")),
+    "requirements-secoc.lock": (("secoc",), ()),
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -29,8 +29,8 @@ def _name(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", _NAME.match(requirement)[0]).lower()
 
 
-def box_lock(extra: str, without: tuple[str, ...]) -> str:
-    """The content of the lock file of an ``extra``, or of the daemon, ``without`` some packages, and what only they need."""
+def box_lock(extras: tuple[str, ...], without: tuple[str, ...]) -> str:
+    """The content of a lock file of ``extras``, ``without`` some packages, and what only they need."""
     blocks = re.split(r"(?m)^(?=\S)", (ROOT / "requirements.lock").read_text())
     pinned: dict[str, str] = {}
     for block in blocks:
@@ -38,7 +38,8 @@ def box_lock(extra: str, without: tuple[str, ...]) -> str:
         if _NAME.match(block):
             pinned[_name(block)] = pinned.get(_name(block), "") + block
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    waiting = [_name(line) for line in (project["optional-dependencies"][extra] if extra else project["dependencies"])]
+    dependencies = project["optional-dependencies"] | {"": project["dependencies"]}
+    waiting = [_name(line) for extra in extras for line in dependencies[extra]]
     needed: set[str] = set()
     while waiting:
         name = waiting.pop()
@@ -50,9 +51,9 @@ def box_lock(extra: str, without: tuple[str, ...]) -> str:
 
 
 if __name__ == "__main__":
-    for file, (extra, without) in LOCKS.items():
+    for file, (extras, without) in LOCKS.items():
         path = ROOT / file
         if sys.argv[1:] != ["--check"]:
-            path.write_text(box_lock(extra, without))
-        elif path.read_text() != box_lock(extra, without):
+            path.write_text(box_lock(extras, without))
+        elif path.read_text() != box_lock(extras, without):
             sys.exit(f"{path}: out of date, run python tools/lock_box.py")
