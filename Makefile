@@ -36,7 +36,7 @@ wheel-demo: wheel
 FUZZ_SECONDS ?= 60
 fuzz: $(READY)
 	mkdir -p tests/fuzz/findings
-	for target in frames yaml candump; do \
+	for target in frames secoc state yaml candump; do \
 		$(VENV)/bin/python tests/fuzz/fuzz.py $$target -max_total_time=$(FUZZ_SECONDS) -max_len=4096 \
 			-artifact_prefix=tests/fuzz/findings/$$target- || exit; \
 	done
