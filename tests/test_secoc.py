@@ -167,11 +167,16 @@ def test_what_stands_on_the_wire():
     assert (thermocouple["Set"], thermocouple["Freshness"]) == (1, 1)
     assert [signals["Freshness"] for name, signals in decoded[1:257] if name == "EMB_FL_Auth"] == list(range(256))
     assert decoded[257][1]["ResetCounter"] == 2
-    for index in np.flatnonzero(frames["can_id"] == AUTH)[1:50]:
-        _, signals = wirekit.decode(frames[index])
-        if signals["Set"] == 0:
-            of_set = frames[:index][np.isin(frames["can_id"][:index], [0x100, 0x110])][-2:]
-            assert {wirekit.decode(frame)[1]["Counter"] for frame in of_set} == {signals["Counter"]}
+    reset, sets = 1, {0: [0x100, 0x110], 1: [0x120], FRESHNESS_SET: [FRESHNESS]}
+    for index in np.flatnonzero(frames["can_id"] == AUTH):
+        signals = wirekit.decode(frames[index])[1]
+        of_set = [frames[:index][frames["can_id"][:index] == can_id][-1] for can_id in sets[signals["Set"]]]
+        assert {wirekit.decode(frame)[1]["Counter"] for frame in of_set} == {signals["Counter"]}
+        reset += int(signals["Set"] == FRESHNESS_SET and index > 10)
+        payloads = b"".join(int(frame["data"]).to_bytes(8, "little") for frame in of_set)
+        covered = (AUTH + 2048 * signals["Set"]).to_bytes(2) + payloads + (1).to_bytes(3) + reset.to_bytes(3)
+        tag = plain_cmac(KEYS["EMB_FL_Auth"], covered + signals["Freshness"].to_bytes(1))
+        assert int.from_bytes(tag) >> 92 == signals["Authenticator"]
 
 
 def test_every_genuine_frame_is_taken_and_the_forces_are_the_same_to_the_bit():
