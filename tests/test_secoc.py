@@ -475,6 +475,14 @@ class TestConfiguration:
         with pytest.raises(InputError, match="keys: no such file"):
             Setup(configured(tmp_path, "secoc: {keys: keys}\n"))
 
+    def test_check_names_the_keys_that_are_missing(self, tmp_path, capsys):
+        from emb_daemon.cli.main import main
+
+        TestKeys().written(tmp_path, TestKeys.GOOD)
+        assert main(["check", "--config", str(configured(tmp_path, "secoc: {keys: keys}\n"))]) == 0
+        said = capsys.readouterr().out
+        assert "no key EMB_FL_EstimateAuth" in said and "no key EMB_FL_Auth" not in said and "no key VEH_Auth" not in said
+
     def test_a_dbc_without_the_messages_serves_who_does_not_authenticate(self, tmp_path):
         text = resource("dbc/emb.dbc").read_text(encoding="utf-8").replace("EMB_FL_Auth", "EMB_FL_Auht")
         (tmp_path / "other.dbc").write_text(text, encoding="utf-8")

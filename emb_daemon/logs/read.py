@@ -105,7 +105,7 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
-        raise InputError(f"{path}: not readable by python-can's {reader_name}: {error or type(error).__name__}") from None
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {str(error) or type(error).__name__}") from None
 
 
 def read_frames(path: str | Path) -> np.ndarray:
