@@ -15,12 +15,12 @@ _emb_daemon() {
         demo) options="--corners --seconds --picture" ;;
         run) options="--config -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         check) options="--config" ;;
-        replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --output --report --json" ;;
+        replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --keys --output --report --json" ;;
         convert) options="--mapping --output" ;;
         identify) options="--mapping --output --report --example" ;;
         diagnose) options="--calibration --validate --output --mapping --corner" ;;
         effect) options="" ;;
-        simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        simulate) options="--corners --seconds --scenario --calibration --reference --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         compile) options="--output --target" ;;
         bench) options="--seconds --corners --json" ;;

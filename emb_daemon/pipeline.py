@@ -42,7 +42,7 @@ _SHOWN_NS = 1_000_000_000
 #: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
 #: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
 #: ``agreed`` how many samples in a row counter and clock agreed on; ``second_sender_ns`` when somebody else
-#: last sent one of our messages.
+#: last sent one of our messages; ``unproven`` where authentication is asked for and a key is missing.
 CORNER = np.dtype(
     [
         ("active", "?"),
@@ -60,6 +60,7 @@ CORNER = np.dtype(
         ("late_ns", "i8"),
         ("agreed", "i8"),
         ("second_sender_ns", "i8"),
+        ("unproven", "?"),
     ],
     align=True,
 )
@@ -133,6 +134,11 @@ class Pipeline:
         self.states[corner] = new_state()[0]
         for name in ("started", "cycle", "announced", "predicted", "late_ns", "agreed"):
             self.corners[name][corner] = 0
+
+    def distrust(self, corners) -> None:
+        """Call the estimates of these corners a fault: whose they or their inputs are nobody can prove."""
+        for name in corners:
+            self.corners["unproven"][wire.CORNERS.index(name)] = True
 
     def collect(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
         """Take ``frames[start:]`` (FRAME array in arrival order) until all are taken or the buffer of samples is nearly full.
@@ -352,6 +358,8 @@ def _head(b, row, index, age):
     for slot in (base + wire.RESOLVER, base + wire.CURRENT):
         if now - b.receptions[slot].contested_ns < _SHOWN_NS:
             reasons |= contract.CONTESTED
+    if corner.unproven:
+        reasons |= contract.E2E_ERROR | contract.CONTESTED
     if now - corner.second_sender_ns < _SHOWN_NS:
         reasons |= contract.SECOND_SENDER
     row.reasons = reasons

@@ -1,14 +1,20 @@
-"""What somebody on the bus can do who knows ids, layouts and E2E protection, and none of the brake's secrets: there are none.
+"""What somebody on the bus can do who knows ids, layouts and E2E protection, and no key.
 
-    python -m studies.attacks [--seed N] [--seconds S]
+    python -m studies.attacks [--seed N] [--seconds S] [--frames N]
 
-Three attackers on a simulated drive: one who sends a forged resolver frame just before each genuine one; one who plays back
-old samples, resolver and current, at the right counter just before the genuine ones; one who floods the resolver's id with
-valid frames of any counter. Prints how many of their frames are taken; the share of answers from the attack's begin on, the
-20 s after it included, whose status is not Fault; and the largest change of those beyond three sigma, and without any reason.
+Without authentication, three attackers on a simulated drive: one who sends a forged resolver frame just before each genuine
+one; one who plays back old samples, resolver and current, at the right counter just before the genuine ones; one who floods
+the resolver's id with valid frames of any counter. Prints how many of their frames are taken; the share of answers from the
+attack's begin on, the 20 s after it included, whose status is not Fault; and the largest change of those beyond three sigma,
+and without any reason.
+
+With authentication (`wire.secoc`), six attackers take turns until they have sent a million frames. Prints how many of theirs
+and of the genuine frames are taken, and whether the forces are the same to the bit; and what verifying and signing cost.
 """
 
 import argparse
+from collections import Counter
+from time import thread_time_ns
 
 import numpy as np
 
@@ -23,8 +29,10 @@ from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS, FAULT
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import MOTOR_ANGLE, RESOLVER, default_layout, pack, unpack
+from emb_daemon.wire.keys import cmac
+from emb_daemon.wire.layout import CORNERS, MOTOR_ANGLE, RESOLVER, default_layout, pack, unpack
 from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
+from emb_daemon.wire.secoc import FRESHNESS_SET, Signer, Verifier, load_links
 
 _RESOLVER, _CURRENT = 0x100, 0x110
 #: From when to when the attackers are there: every sender's schedule is known by then, and what stays behind shows, s.
@@ -36,6 +44,9 @@ _AHEAD_MS, _ADDED_RAD, _SWINGS_S = (0.05, 0.5, 1.0, 2.1), 6.0, 2.0
 _OLD_S = (0.06, 0.6, 3.0)
 _FLOOD_PER_S = 6700
 _START_NS = 1_000_000_000
+#: One corner's links, and what is authenticated on them.
+_RECEIVED, _SENT = load_links(corners=("FL",))
+_AUTH, _FRESHNESS = _RECEIVED[0].authentication_id, _RECEIVED[0].freshness_id
 
 
 @njit
@@ -104,10 +115,171 @@ def flood(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return noise
 
 
+def keys_of(seed: int):
+    """CMACs of all links by name, and one of nobody's key."""
+    rng = np.random.default_rng((seed, 7))
+    macs = {link.name: cmac(rng.bytes(16)) for link in (*_RECEIVED, *_SENT)}
+    return macs, cmac(rng.bytes(16))
+
+
+def signed(frames: np.ndarray, macs) -> np.ndarray:
+    """A drive as its senders authenticate it."""
+    return Signer(_RECEIVED, macs, 1).sign(frames).copy()
+
+
+@njit
+def _protect_anew(frames):
+    for index in range(len(frames)):
+        frame = frames[index]
+        counter, status = (frame.data >> np.uint64(8)) & np.uint64(15), (frame.data >> np.uint64(12)) & np.uint64(15)
+        frame.data = protect(frame.can_id, frame.data & ~np.uint64(0xFFFF), counter, status)
+
+
+def _early(frames: np.ndarray, rng) -> np.ndarray:
+    """Copies of the frames of authenticated messages, each up to 2 ms before the genuine one."""
+    copies = frames[frames["time_ns"] > frames["time_ns"][0] + 250 * CYCLE_NS].copy()
+    copies["time_ns"] -= rng.integers(50_000, 2_000_000, len(copies))
+    return copies
+
+
+def _with_code(frames: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """Authentication frames with another authenticator."""
+    frames["data"] = frames["data"] & np.uint64((1 << 28) - 1) | code.astype(np.uint64) << np.uint64(28)
+    return frames
+
+
+def _forged_sets(genuine, rng, _macs):
+    """Values of one's own, and a guess of their authenticator under the freshness that is expected."""
+    forged = _early(genuine, rng)
+    named = np.isin(forged["can_id"], [link.authentication_id for link in _RECEIVED])
+    forged["data"] ^= np.where(named, 0, rng.integers(1, 2**16, len(forged)) << 16).astype(np.uint64)
+    forged[named] = _with_code(forged[named], rng.integers(0, 2**36, named.sum()))
+    return forged
+
+
+def _guesses(genuine, rng, _macs):
+    """Genuine values, and many guesses of their authenticator."""
+    guesses = np.repeat(_early(genuine[genuine["can_id"] == _AUTH], rng), 4)
+    return _with_code(guesses, rng.integers(0, 2**36, len(guesses)))
+
+
+def _played_back(genuine, rng, _macs):
+    """Everything as it was some turns of the counter ago, authentication included."""
+    again = _early(genuine, rng)
+    again["time_ns"] += rng.integers(1, 100) * COUNTER_MODULO * CYCLE_NS
+    return again
+
+
+def _played_back_as_expected(genuine, rng, macs):
+    """The same, with the message counter that is expected now."""
+    again = _played_back(genuine, rng, macs)
+    now, named = genuine[genuine["can_id"] == _AUTH], again["can_id"] == _AUTH
+    place = np.searchsorted(now["time_ns"], again["time_ns"][named]).clip(0, len(now) - 1)
+    message = np.uint64(0xFF << 20)
+    again["data"][named] = again["data"][named] & ~message | now["data"][place] & message
+    return again
+
+
+def _freshness_of_the_future(genuine, rng, _macs):
+    """A trip and reset far ahead, which would make all later genuine frames old ones, in pairs with a guess."""
+    forged = _early(genuine[genuine["can_id"] == _AUTH], rng)
+    forged = forged[: len(forged) // 2 * 2]
+    counters = forged["data"][::2] & np.uint64(0xF00)
+    forged["can_id"][::2] = _FRESHNESS
+    forged["data"][::2] = counters | rng.integers(2**32, 2**48, len(counters), dtype=np.uint64) << np.uint64(16)
+    forged["data"][1::2] = counters | np.uint64(FRESHNESS_SET << 16)
+    forged["time_ns"][1::2] = forged["time_ns"][::2] + 1
+    forged[1::2] = _with_code(forged[1::2], rng.integers(0, 2**36, len(counters)))
+    return forged
+
+
+def _another_key(genuine, rng, macs):
+    """Frames that a sender with another key has authenticated."""
+    theirs = Signer(_RECEIVED, dict.fromkeys(macs, macs["nobody"]), 1).sign(genuine[_of_drive(genuine)])
+    return _early(theirs.copy(), rng)
+
+
+FORGERIES = {
+    "forged values and authenticators at the right time": _forged_sets,
+    "authenticators guessed at the right time": _guesses,
+    "played back, authentication included": _played_back,
+    "played back under the freshness that is expected": _played_back_as_expected,
+    "freshness of the future": _freshness_of_the_future,
+    "authenticated with another key": _another_key,
+}
+
+
+def _of_drive(frames: np.ndarray) -> np.ndarray:
+    """Which frames are none of authentication."""
+    return ~np.isin(frames["can_id"], [can_id for link in _RECEIVED for can_id in (link.authentication_id, link.freshness_id)])
+
+
+def forged(name: str, genuine: np.ndarray, rng: np.random.Generator, macs) -> np.ndarray:
+    """Frames of one of the six attackers on the bus whose authentic frames are ``genuine``, rightly E2E protected."""
+    frames = FORGERIES[name](genuine, rng, macs)
+    _protect_anew(frames)
+    return frames[(frames["time_ns"] > _START_NS) & (frames["time_ns"] < genuine["time_ns"][-1])]
+
+
+def believed(genuine: np.ndarray, foreign: np.ndarray, macs) -> tuple[np.ndarray, int, int]:
+    """What `Verifier` gives of both together; how many frames of ``genuine`` are missing, and how many others are taken."""
+    mixed = np.concatenate([foreign, genuine])
+    heard = Verifier(_RECEIVED, macs, {}).verify(mixed[np.argsort(mixed["time_ns"], kind="stable")])
+    taken, expected = heard[heard["flags"] == 0], genuine[_of_drive(genuine)]
+    theirs, ours = (Counter(zip(part["can_id"].tolist(), part["data"].tolist(), strict=True)) for part in (taken, expected))
+    return heard, (ours - theirs).total(), (theirs - ours).total()
+
+
+def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
+    macs, nobody = keys_of(seed)
+    genuine = signed(frames, macs)
+    macs["nobody"] = nobody
+    good = _estimates(Verifier(_RECEIVED, macs, {}).verify(genuine))
+    totals = {name: np.zeros(4, int) for name in FORGERIES}
+    turn = 0
+    while sum(total[0] for total in totals.values()) < count:
+        for number, (name, total) in enumerate(totals.items()):
+            foreign = forged(name, genuine, np.random.default_rng((seed, turn, number)), macs)
+            heard, missing, others = believed(genuine, foreign, macs)
+            estimates = _estimates(heard)
+            changed = np.sum(estimates["force"] != good["force"]) if len(estimates) == len(good) else len(good)
+            total += (len(foreign), others, missing, changed)
+        turn += 1
+    genuine_frames = turn * int(_of_drive(genuine).sum())
+    print(f"\n| attack on authenticated frames | frames | taken | genuine lost, of {genuine_frames} | forces changed |")
+    print("|---|---|---|---|---|")
+    for name, total in totals.items():
+        print("| {} | {} | {} | {} | {} |".format(name, *total))
+    print("| together | {} | {} | {} | {} |".format(*sum(totals.values())))
+
+
+def _cost(seed: int) -> None:
+    """Median time of a tick of four corners, µs: on the CPU, whatever else runs."""
+    plants = np.array(
+        [plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed + k) for k in range(4)]
+    )
+    schedule = city_drive().first(20.0)
+    drive = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]
+    received, _ = load_links()
+    macs = {link.name: cmac(link.name.encode().ljust(16)) for link in received}
+    signer, spent = Signer(received, macs, 1), {"sign": [], "verify": []}
+    verifier = Verifier(received, macs, {})
+    for cycle in np.split(drive, np.flatnonzero(np.diff((drive["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
+        began = thread_time_ns()
+        authentic = signer.sign(cycle)
+        signed_at = thread_time_ns()
+        verifier.verify(authentic)
+        spent["verify"].append(thread_time_ns() - signed_at)
+        spent["sign"].append(signed_at - began)
+    figures = ", ".join(f"{name} {1e-3 * np.median(times):.0f} µs" for name, times in spent.items())
+    print(f"\nA tick of four corners, {len(drive) / len(spent['sign']):.1f} frames and their authentication: {figures}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--frames", type=int, default=1_000_000, help="foreign frames among authenticated ones, at least")
     arguments = parser.parse_args()
     rng, frames = np.random.default_rng(arguments.seed), _drive(arguments.seconds, arguments.seed)
     good = _estimates(frames)
@@ -128,6 +300,8 @@ def main() -> None:
         unsaid = off[usable["reasons"] == 0]
         figures = (len(foreign), taken, len(usable) / len(estimates), wrong.max(initial=0.0), unsaid.max(initial=0.0))
         print("| {} | {} | {} | {:.0%} | {:.0f} | {:.0f} |".format(name, *figures))
+    _authenticated(frames, arguments.seed, arguments.frames)
+    _cost(arguments.seed)
 
 
 if __name__ == "__main__":

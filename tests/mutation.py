@@ -1,8 +1,9 @@
 """Mutation testing: does a test fail when one operator, comparison or constant of a kernel is changed?
 
-Run as ``python tests/mutation.py [COUNT] [SEED]``. COUNT mutants (60) are drawn from E2E check, reception, plausibility,
-fusion, monitor, state files and runtime; each is built into a copy of the package, on which the tests that hold these run as
-plain Python until the first fails. Survivors are printed with their line.
+Run as ``python tests/mutation.py [COUNT] [SEED] [PART]``. COUNT mutants (60), of modules whose path contains PART (all), are
+drawn from E2E check, authentication, reception, plausibility, fusion, monitor, state files and runtime; each is built into a
+copy of the package, on which the tests that hold these run as plain Python until the first fails. Survivors are printed with
+their line.
 """
 
 import ast
@@ -32,6 +33,24 @@ _RUNTIME = [
     "tests/test_daemon.py::TestPacer",
     "tests/test_daemon.py::test_the_service_manager_hears_ready_watchdog_and_stopping",
 ]
+_SECOC = [
+    f"tests/test_secoc.py::{name}"
+    for name in (
+        "test_vectors_of_rfc_4493",
+        "test_check_value_of_the_documentation",
+        "test_what_stands_on_the_wire",
+        "test_after_lost_authentications_the_next_is_right",
+        "test_a_lost_freshness_frame_costs_nothing",
+        "test_who_lost_more_than_a_reset_waits_for_the_next_freshness_frame",
+        "test_a_receiver_that_starts_late_is_in_step_with_the_next_freshness_frame",
+        "test_what_was_heard_before_a_restart_is_not_believed_after_it",
+        "test_a_set_counts_whole_or_not_at_all",
+        "test_a_flood_of_authentication_frames_costs_a_bounded_number_of_tries",
+        "test_frames_of_other_kinds_pass_to_be_refused_for_that",
+        "TestFreshnessFile",
+        "TestKeys",
+    )
+]
 SCOPE = {
     "emb_daemon/wire/e2e.py": ["tests/test_wire.py"],
     "emb_daemon/wire/receive.py": [
@@ -39,6 +58,9 @@ SCOPE = {
         "tests/test_hostile.py::test_a_sender_that_was_held_up_may_catch_up",
         "tests/test_hostile.py::test_spoofed_frames_with_the_next_counter_come_too_early",
     ],
+    "emb_daemon/wire/secoc.py": _SECOC,
+    "emb_daemon/wire/keys.py": _SECOC,
+    "emb_daemon/runtime/secured.py": _SECOC,
     "emb_daemon/models/plausibility.py": ["tests/test_plausibility_kernels.py"],
     "emb_daemon/models/fusion.py": ["tests/test_kernels.py"],
     "emb_daemon/estimator/monitor.py": ["tests/test_monitor_bounds.py"],
@@ -95,8 +117,14 @@ def _noticed(copy: Path, tests: Sequence[str]) -> bool:
 
 
 def main() -> None:
-    count, seed = (int(word) for word in (*sys.argv[1:], *("60", "0")[len(sys.argv) - 1 :]))
-    mutants = [(module, place) for module in SCOPE for place in range(len(_sites(ast.parse((ROOT / module).read_text()))))]
+    words = (*sys.argv[1:], *("60", "0", "")[len(sys.argv) - 1 :])
+    count, seed, part = int(words[0]), int(words[1]), words[2]
+    mutants = [
+        (module, place)
+        for module in SCOPE
+        if part in module
+        for place in range(len(_sites(ast.parse((ROOT / module).read_text()))))
+    ]
     drawn = sorted(random.Random(seed).sample(mutants, min(count, len(mutants))))
     killed = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs import read
+from emb_daemon.logs import apart, read
 from emb_daemon.logs.candump import format_candump, parse_candump
 from emb_daemon.logs.columns import Decoder, References
 from emb_daemon.logs.read import read_frames
@@ -230,3 +230,38 @@ def test_reference_is_the_nearest_in_time_or_nothing():
     assert np.array_equal(at, [0.0, 1.0, 2.0, np.nan, 0.0], equal_nan=True)
     nothing = References(np.zeros(0, FRAME), "FL")
     assert np.all(np.isnan(nothing.at(np.array([0, 1]), nothing.clamp_force_N)))
+
+
+_READER = """
+import io, os, signal, time
+class TextIOMessageReader: ...
+class BLFReader:
+    def __init__(self, file): ...
+    def __iter__(self):
+        %s
+        yield
+"""
+
+
+@pytest.mark.parametrize(
+    ("deed", "said"),
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", r"x.blf: python-can's BLFReader crashed \(SIGSEGV\): damaged"),
+        ("while True: ...", "x.blf: python-can's BLFReader did not come to an end within 1 s: damaged"),
+        ("bytearray(1 << 45)", "x.blf: not readable by python-can's BLFReader: MemoryError"),
+        ("round(1e999)", "x.blf: not readable by python-can's BLFReader: cannot convert float infinity to integer"),
+        ("os._exit(7)", "x.blf: not readable by python-can's BLFReader"),
+    ],
+)
+def test_a_reader_that_fails_takes_nothing_with_it(tmp_path, monkeypatch, deed, said):
+    """A reader of somebody else's that does as one told by a damaged file."""
+    package = tmp_path / "can" / "io"
+    package.mkdir(parents=True)
+    (tmp_path / "can" / "__init__.py").write_text(_READER % deed)
+    (package / "__init__.py").touch()
+    (package / "generic.py").write_text("from can import TextIOMessageReader")
+    (tmp_path / "x.blf").write_bytes(bytes(100))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(apart, "_START_S", 1.0)
+    with pytest.raises(InputError, match=said):
+        read_frames(tmp_path / "x.blf")

@@ -33,7 +33,7 @@ def test_the_wheel_is_complete(built):
     with zipfile.ZipFile(built[0]) as wheel:
         names = set(wheel.namelist())
         for name in ("dbc/emb.dbc", "dbc/rig.dbc", "config/emb.yaml", "config/calibration.yaml", "systemd/emb-daemon.service",
-                     "systemd/emb-daemon.service.d/ahead.conf",
+                     "systemd/emb-daemon.service.d/ahead.conf", "systemd/emb-daemon.service.d/secoc.conf",
                      "completion/emb-daemon.bash"):  # fmt: skip
             assert wheel.read(f"emb_daemon/_resources/{name}") == (_ROOT / name).read_bytes()
         assert "emb_daemon/py.typed" in names

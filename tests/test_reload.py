@@ -1,5 +1,6 @@
 """A reload gives what a restart gives, whatever changed; signals in any number and at any moment do no harm."""
 
+import os
 import shutil
 import signal
 import threading
@@ -25,6 +26,7 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
 from emb_daemon.runtime.daemon import Daemon
 from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.runtime.realtime import use_fifo
 
 CONFIG = Path(__file__).parent.parent / "config"
 SHIPPED = load_calibration(CONFIG / "calibration.yaml")
@@ -231,3 +233,21 @@ def test_a_storm_of_signals_stops_nothing(daemon):
         signal.signal(signal.SIGHUP, before)
     reload_now(daemon)
     assert daemon.pipeline.parameters[0] == to_parameters(SHIPPED)
+
+
+def test_what_the_loop_has_read_beside_it_is_not_read_in_real_time():
+    """A thread has the scheduler of the one that starts it: a long file would be read at the loop's own priority."""
+    policies = []
+
+    def loop():
+        refused = use_fifo(1).startswith("ordinary")
+        reader = threading.Thread(target=lambda: policies.append(None if refused else os.sched_getscheduler(0)))
+        reader.start()
+        reader.join()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    thread.join()
+    if policies == [None]:
+        pytest.skip("NOT RUN: SCHED_FIFO is not allowed here")
+    assert policies == [os.SCHED_OTHER]

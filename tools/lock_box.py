@@ -1,5 +1,6 @@
 """Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`;
-and requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead.
+requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead; and
+requirements-secoc.lock: what authenticated communication needs besides.
 
     python tools/lock_box.py [--check]
 
@@ -15,8 +16,12 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Files, and what of the daemon's dependencies each leaves out.
-LOCKS = {"requirements-box.lock": (), "requirements-ahead.lock": ("numba", "llvmlite")}
+#: Files, what each holds the dependencies of (extras; ``""`` is the daemon itself), and what of them it leaves out.
+LOCKS = {
+    "requirements-box.lock": (("",), ()),
+    "requirements-ahead.lock": (("",), ("numba", "llvmlite")),
+    "requirements-secoc.lock": (("secoc",), ()),
+}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -24,15 +29,17 @@ def _name(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", _NAME.match(requirement)[0]).lower()
 
 
-def box_lock(without: tuple[str, ...]) -> str:
-    """The content of a lock file ``without`` some packages, and what only they need."""
+def box_lock(extras: tuple[str, ...], without: tuple[str, ...]) -> str:
+    """The content of a lock file of ``extras``, ``without`` some packages, and what only they need."""
     blocks = re.split(r"(?m)^(?=\S)", (ROOT / "requirements.lock").read_text())
     pinned: dict[str, str] = {}
     for block in blocks:
         # A package may stand there once for each range of Pythons.
         if _NAME.match(block):
             pinned[_name(block)] = pinned.get(_name(block), "") + block
-    waiting = [_name(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    dependencies = project["optional-dependencies"] | {"": project["dependencies"]}
+    waiting = [_name(line) for extra in extras for line in dependencies[extra]]
     needed: set[str] = set()
     while waiting:
         name = waiting.pop()
@@ -44,9 +51,9 @@ def box_lock(without: tuple[str, ...]) -> str:
 
 
 if __name__ == "__main__":
-    for file, without in LOCKS.items():
+    for file, (extras, without) in LOCKS.items():
         path = ROOT / file
         if sys.argv[1:] != ["--check"]:
-            path.write_text(box_lock(without))
-        elif path.read_text() != box_lock(without):
+            path.write_text(box_lock(extras, without))
+        elif path.read_text() != box_lock(extras, without):
             sys.exit(f"{path}: out of date, run python tools/lock_box.py")

@@ -12,7 +12,9 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration, Struct, to_parameters
 from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.wire.keys import key_file, load_keys
 from emb_daemon.wire.layout import CORNERS, load_layout
+from emb_daemon.wire.secoc import load_links
 
 
 class Bus(Struct, kw_only=True):
@@ -54,6 +56,14 @@ class Realtime(Struct, kw_only=True):
     lock_memory: bool = True
 
 
+class Secoc(Struct, kw_only=True):
+    """Authenticated communication, both ways (AUTOSAR SecOC); needs a state directory and the extra secoc."""
+
+    #: File of keys, relative to this configuration; a systemd credential of that name comes before it. Its owner alone may
+    #: read it; a line is the name of an authentication message, such as EMB_FL_Auth, and 32 hexadecimal digits.
+    keys: str
+
+
 class Configuration(Struct, kw_only=True):
     """config/emb.yaml."""
 
@@ -67,6 +77,8 @@ class Configuration(Struct, kw_only=True):
     dbc: str | None = None
     #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
     state_directory: str | None = None
+    #: Without it nothing is authenticated.
+    secoc: Secoc | None = None
     realtime: Realtime = Realtime()
     #: What the journal gets: debug, info, warning or error.
     log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"
@@ -79,6 +91,8 @@ class Setup:
         calibrations: by corner name.
         parameters: PARAMETERS array, shape (4,).
         layout: LAYOUT array, shape (1,).
+        keys: of authenticated communication, by name; None where it is not configured.
+        links: that the daemon receives, and that it sends, authenticated.
     """
 
     def __init__(self, path: Path):
@@ -96,6 +110,13 @@ class Setup:
             self.layout = load_layout(folder / dbc if dbc else None, tuple(files))
         except InputError as error:
             faults += error.faults
+        self.keys, self.links = None, ([], [])
+        if not faults and (secoc := self.configuration.secoc):
+            try:
+                self.links = load_links(folder / dbc if dbc else None, tuple(files))
+                self.keys = load_keys(key_file(secoc.keys, folder))
+            except InputError as error:
+                faults += error.faults
         loaded: dict[str, Calibration] = {}
         for file in dict.fromkeys(files.values()):
             try:

@@ -21,4 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"{name}: actuator {calibration.actuator}, calibration {calibration_hash(calibration)}, "
             f"pads {calibration.pad_thickness_mm:g} mm, effects: {effects}"
         )
+    for link in (*setup.links[0], *setup.links[1]):
+        if link.name not in setup.keys:
+            print(f"no key {link.name}: nothing under it is believed or authenticated, {link.corner or 'the vehicle'}")
     return 0

@@ -26,6 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--state", type=Path, metavar="DIR", help="adapt: read what was learned from DIR, learn, and keep it there"
     )
     parser.add_argument(
+        "--keys", type=Path, metavar="FILE", help="believe authentic frames alone, authenticate those of --output"
+    )
+    parser.add_argument(
         "--output",
         type=Path,
         metavar="FILE",
@@ -52,9 +55,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
+    sign = np.asarray
+    if arguments.keys:
+        read, sign = _secured(arguments, read)
     replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read, *window)
     if arguments.output and ending_of(arguments.output) in FRAME_ENDINGS:
-        write_frames(arguments.output, np.concatenate([part for log in arguments.logs for part in replay.frames(log)]))
+        write_frames(
+            arguments.output, np.concatenate([sign(part).copy() for log in arguments.logs for part in replay.frames(log)])
+        )
         return 0
     results = [result for log in arguments.logs for result in replay.run_corners(log)]
     if arguments.output:
@@ -69,6 +77,25 @@ def run(arguments: argparse.Namespace) -> int:
         for figures in report:
             _print(figures)
     return 0
+
+
+def _secured(arguments: argparse.Namespace, read):
+    """``read`` of authentic frames alone, and what authenticates frames, as the daemon does both."""
+    from emb_daemon.errors import InputError
+    from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile
+    from emb_daemon.wire.keys import load_keys
+    from emb_daemon.wire.secoc import load_links
+
+    kept = FreshnessFile(arguments.state).load() if arguments.state else Freshness()
+    authentication = Authentication(*load_links(), load_keys(arguments.keys), kept.next_trip())
+
+    def read_authentic(path: Path):
+        frames = authentication.verify(read(path))
+        if not len(frames):
+            raise InputError(f"{path}: nothing but authentication frames")
+        return frames
+
+    return read_authentic, authentication.sign
 
 
 def _check(arguments: argparse.Namespace) -> None:

@@ -40,12 +40,18 @@ def run(arguments: argparse.Namespace) -> int:
     set_up_logging(configuration.log_level)
     log.info("%s", library.description())
     ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
+    ids += [can_id for link in setup.links[0] for can_id in (link.authentication_id, link.freshness_id)]
     state = state_directory(configuration.state_directory, arguments.config.parent)
     if state:
         # Two daemons would write what they learned over each other's.
         hold(state)
-    bus = open_bus(**bus_options(arguments, configuration.bus), ids=ids)
+    bus, keyless = open_bus(**bus_options(arguments, configuration.bus), ids=ids), ()
+    if setup.keys is not None:
+        from emb_daemon.runtime.secured import secure
+
+        bus, keyless = secure(bus, setup, state)
     daemon = Daemon(setup, bus, ServiceManager(), state)
+    daemon.pipeline.distrust(keyless)
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()
     if compiled_for_the_next_start():

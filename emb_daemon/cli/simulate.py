@@ -15,6 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="the kind of brake; without it, the shipped one")
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="authenticate what is sent, believe nothing else (SecOC)")
+    parser.add_argument("--state", type=Path, metavar="DIR", help="with --keys: folder that keeps the trip counter")
     parser.add_argument("--seed", type=int, default=0, help="of tolerances and noise (0)")
     add_bus_arguments(parser)
 
@@ -26,14 +28,19 @@ def run(arguments: argparse.Namespace) -> int:
 
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.cli.busoptions import bus_options
+    from emb_daemon.errors import InputError
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
     from emb_daemon.plant.scenarios import scenario
     from emb_daemon.resources import resource
     from emb_daemon.runtime.bus import open_bus
+    from emb_daemon.wire.keys import load_keys
     from emb_daemon.wire.layout import CORNERS, default_layout
+    from emb_daemon.wire.secoc import load_links
 
+    if (arguments.keys is None) != (arguments.state is None):
+        raise InputError("--keys and --state: expected both or neither")
     schedule = scenario(arguments.scenario)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
@@ -41,7 +48,14 @@ def run(arguments: argparse.Namespace) -> int:
     plants = np.array([plant_from_calibration(calibration, seed) for seed in seeds])
     # What the daemon broadcasts; the car itself reacts to EMB_c_AdaptRequest only.
     ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
+    sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
+    ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
     bus = open_bus(**bus_options(arguments), ids=ids)
+    if arguments.keys:
+        from emb_daemon.runtime.secured import Authentication, FreshnessFile, SecuredBus
+
+        keys, file = load_keys(arguments.keys), FreshnessFile(arguments.state)
+        bus = SecuredBus(bus, Authentication(heard, sent, keys, file.begin_trip(), file))
     live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

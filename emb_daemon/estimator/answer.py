@@ -32,9 +32,11 @@ def answer_row(row, state, p, estimate):
     else:
         step(state, p, row, estimate)
     estimate.reasons |= row.reasons
-    if not state.started:
+    if estimate.reasons & CONTESTED:
+        estimate.mode = FAULT
+    elif not state.started:
         estimate.mode = INIT
-    elif estimate.source == INVALID or estimate.reasons & CONTESTED:
+    elif estimate.source == INVALID:
         estimate.mode = FAULT
     elif estimate.reasons and estimate.mode == RUNNING:
         estimate.mode = DEGRADED

@@ -13,12 +13,14 @@ import numpy as np
 
 from emb_daemon.bounded import read_bounded
 from emb_daemon.errors import InputError
+from emb_daemon.logs.apart import frames_apart, frames_of
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
+#: Those that a damaged file may crash or hold up.
+_APART = ("BLFReader", "MF4Reader")
 
 
 def _most_bytes() -> int:
@@ -94,25 +96,16 @@ def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray]:
-    import can
-    from can.io.generic import TextIOMessageReader
-
-    file, octets = io.BytesIO(content), bytearray()
     try:
-        kind = getattr(can, reader_name)
-        reader = kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file)
-        rows = []
-        for message in reader:
-            octets += message.data
-            flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
-            flags |= FD * message.is_fd
-            data = int.from_bytes(message.data[:8], "little")
-            rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
-        return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
+        if reader_name in _APART:
+            return frames_apart(path, content, reader_name, 2 * _most_bytes())
+        return frames_of(content, reader_name)
+    except InputError:
+        raise
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
-        raise InputError(f"{path}: not readable by python-can's {reader_name}: {error}") from None
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {str(error) or type(error).__name__}") from None
 
 
 def read_frames(path: str | Path) -> np.ndarray:

@@ -19,8 +19,8 @@ def lock_memory() -> str:
 
 def use_fifo(priority: int) -> str:
     try:
-        # The calling thread alone: helper threads stay with the ordinary scheduler.
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        # The calling thread alone: those that it starts, to read or write a file, get the ordinary scheduler.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"ordinary scheduling: SCHED_FIFO {priority} refused: {error.strerror} (raise LimitRTPRIO)"
     return f"SCHED_FIFO priority {priority}"

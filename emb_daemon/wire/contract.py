@@ -50,8 +50,8 @@ BUS_DISTURBED = 1 << 12
 DEADLINE_MISSED = 1 << 13
 OUTSIDE_RANGE = 1 << 14
 SECOND_SENDER = 1 << 15
-#: Beyond what DegradedReasons has room for: two senders contradict each other on the resolver or the current. Mode and Status
-#: say Fault, and E2E_ERROR goes with it.
+#: Beyond what DegradedReasons has room for: two senders contradict each other on the resolver or the current, or the key that
+#: would prove whose they are is missing. Mode and Status say Fault, and E2E_ERROR goes with it.
 CONTESTED = 1 << 16
 REASONS = (
     "resolver lost", "current lost", "thermocouple lost", "wheel speed lost", "wheel pulse lost", "vehicle status lost",

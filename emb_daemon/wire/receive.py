@@ -5,12 +5,12 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.wire.contract import STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, UNAUTHENTIC
 from emb_daemon.wire.layout import OURS, SIGNALS, SLOTS, unpack
 
-#: Verdicts on a frame, in the order in which they are tested.
-ACCEPTED, IGNORED, SECOND_SENDER, BAD_LENGTH, BAD_CRC, BAD_COUNTER, BAD_STATUS, BAD_RANGE = range(8)
-VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", "sender's status", "range")
+#: Verdicts on a frame, in the order in which they are tested; whether it is authentic comes first.
+ACCEPTED, IGNORED, SECOND_SENDER, BAD_LENGTH, BAD_CRC, BAD_COUNTER, BAD_STATUS, BAD_RANGE, NOT_AUTHENTIC = range(9)
+VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", "sender's status", "range", "authentication")
 
 #: Counter steps tolerated after a gap: one frame lost, plus those that the time passed accounts for.
 _TOLERATED_LOSS = 2
@@ -167,7 +167,7 @@ def receive(frame, receptions, layout):
     if slot < 0:
         return -1, SECOND_SENDER if slot == OURS else IGNORED
     reception = receptions[slot]
-    verdict = _verdict(frame, slot, reception, layout)
+    verdict = NOT_AUTHENTIC if frame.flags & UNAUTHENTIC else _verdict(frame, slot, reception, layout)
     reception.count[verdict] += 1
     if verdict != ACCEPTED:
         if verdict == BAD_RANGE:

@@ -1,11 +1,12 @@
-"""Coverage-guided fuzzing: frames through the pipeline, YAML and log readers.
+"""Coverage-guided fuzzing: frames through pipeline and authentication, files of the state directory, YAML and log readers.
 
-Run as ``python tests/fuzz/fuzz.py {frames,yaml,candump} [libFuzzer options]``; `make fuzz` runs each for a minute. Bad input
-may give an InputError or be ignored; anything else is a finding, and so is a usable estimate that is no number. Kernels run as
-plain Python, so that the fuzzer sees their branches.
+Run as ``python tests/fuzz/fuzz.py {frames,secoc,state,yaml,candump} [libFuzzer options]``; `make fuzz` runs each for a minute.
+Bad input may give an InputError or be ignored; anything else is a finding, and so is a usable estimate that is no number, or a
+frame believed that nobody authenticated. Kernels run as plain Python, so that the fuzzer sees their branches.
 """
 
 import contextlib
+import hashlib
 import os
 import sys
 import tempfile
@@ -15,6 +16,7 @@ os.environ["NUMBA_DISABLE_JIT"] = "1"
 import atheris
 
 with atheris.instrument_imports(include=["emb_daemon"]):
+    from emb_daemon.adapt import memory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.errors import InputError
@@ -24,6 +26,8 @@ with atheris.instrument_imports(include=["emb_daemon"]):
     from emb_daemon.wire.contract import INVALID
     from emb_daemon.wire.e2e import protect
     from emb_daemon.wire.frames import FRAME
+    from emb_daemon.wire.keys import cmac
+    from emb_daemon.wire.secoc import Signer, Verifier, load_links
 
 import numpy as np
 
@@ -65,6 +69,63 @@ def frames(data: bytes) -> None:
             pipeline.broadcast(count)
 
 
+def _genuine() -> list[tuple]:
+    """Rows of FRAME that a corner's sender would send in forty cycles, no two of them equal."""
+    plain = np.zeros(80, FRAME)
+    for number, frame in enumerate(plain):
+        can_id, cycle = (0x100, 0x110)[number % 2], number // 2
+        frame["data"] = protect(can_id, np.uint64((cycle + 1) << 16), cycle % 15, 0)
+        frame["time_ns"], frame["can_id"], frame["length"] = 4_000_000 * cycle, can_id, 8
+    return Signer(_links, _macs, 1).sign(plain).tolist()
+
+
+_links = load_links(corners=("FL",))[0][:1]
+_macs = {_links[0].name: cmac(bytes(16))}
+_authentic = _genuine()
+_rank = {row[1:3]: number for number, row in enumerate(_authentic)}
+
+
+def secoc(data: bytes) -> None:
+    """A byte tells what is next on the bus: what the sender sends, that with a change, something old, or anything. What is
+    believed was sent by him, and later than all that was believed before."""
+    rows, sent, now = [], 0, 0
+    for at in range(0, len(data) - 3, 4):
+        kind, first, second, third = data[at : at + 4]
+        if sent < len(_authentic) and kind < 160:
+            row = list(_authentic[sent])
+            sent += 1
+            if kind >= 140:
+                continue
+            if kind >= 100:
+                row[1] ^= second << 8 * (first & 7)
+        elif kind < 220 and sent:
+            row = list(_authentic[first % sent])
+        else:
+            row = [0, first << 20 | second << 8 | third << 40, (0x100, 0x110, 0x130, 0x140)[third & 3], 8, 0]
+        now += third * 20_000
+        row[0] = now
+        rows.append(tuple(row))
+    believed = Verifier(_links, _macs, {}).verify(np.array(rows, FRAME))
+    last = dict.fromkeys((0x100, 0x110), -1)
+    for _, payload, can_id, _, flags in believed.tolist():
+        if flags == 0 and can_id in last:
+            assert _rank.get((payload, can_id), -1) > last[can_id], (payload, can_id)
+            last[can_id] = _rank[payload, can_id]
+
+
+_STORE = (
+    b'{"format":2,"corner":"FL","actuator":"a","calibration":"c","current":{"date":"d","outcome":"accepted","note":"",'
+    b'"ambient_C":1.0,"pad_rise_K":null,"values":{"k":1.0},"sigmas":{"k":0.1},"evidence":{"e":null}},"history":[]}'
+)
+
+
+def state(data: bytes) -> None:
+    """A file of the state directory, its checksum right."""
+    body = _edited(_STORE, data)
+    with contextlib.suppress(ValueError):
+        memory.decode(b'{"sha256":"%s","content":%s}' % (hashlib.sha256(body).hexdigest().encode(), body))
+
+
 def _edited(good: bytes, data: bytes) -> bytes:
     """A good file with pieces of it replaced: random bytes alone never get past a reader's first line."""
     feed = atheris.FuzzedDataProvider(data)
@@ -92,6 +153,6 @@ def candump(data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    target = {"frames": frames, "yaml": yaml, "candump": candump}[sys.argv.pop(1)]
+    target = {"frames": frames, "secoc": secoc, "state": state, "yaml": yaml, "candump": candump}[sys.argv.pop(1)]
     atheris.Setup(sys.argv, target)
     atheris.Fuzz()

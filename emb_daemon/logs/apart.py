@@ -1,0 +1,86 @@
+"""Readers that a damaged file may crash, hold up or have take all memory, in a process of their own.
+
+python-can's BLF reader follows sizes that the file states, asammdf is compiled: neither was written for hostile files. Here
+such a reader gets the file's content on its standard input, bounded time and memory, and gives arrays back, or nothing.
+"""
+
+import io
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
+
+#: CPU time that a reader gets: to start, s, and for each megabyte, s. BLF takes python-can up to 5 s a megabyte.
+_START_S, _PER_MEGABYTE_S = 30.0, 60.0
+#: The child's words for a library that is not installed.
+_MISSING = 3
+
+
+def frames_of(content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """FRAME array and payloads, one after the other, of a log's content, by python-can's reader of that name. Raises whatever
+    that raises."""
+    import can
+    from can.io.generic import TextIOMessageReader
+
+    kind, file, octets, rows = getattr(can, reader_name), io.BytesIO(content), bytearray(), []
+    for message in kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file):
+        octets += message.data
+        flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
+        flags |= FD * message.is_fd
+        data = int.from_bytes(message.data[:8], "little")
+        rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
+    return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
+
+
+def frames_apart(path: Path, content: bytes, reader_name: str, most_bytes: int) -> tuple[np.ndarray, np.ndarray]:
+    """`frames_of` in another process, which gets ``most_bytes`` of memory.
+
+    Raises:
+        InputError: not readable, or not with that much time and memory.
+        ImportError: the reader's library is not installed.
+    """
+    seconds = _START_S + _PER_MEGABYTE_S * 1e-6 * len(content)
+    command = [sys.executable, "-m", __name__, reader_name, str(round(seconds)), str(most_bytes)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, input=content, capture_output=True, env=environment)
+    said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+    if done.returncode == _MISSING:
+        raise ImportError(said)
+    if done.returncode == -signal.SIGXCPU:
+        raise InputError(f"{path}: python-can's {reader_name} did not come to an end within {seconds:.0f} s: damaged")
+    if done.returncode < 0:
+        raise InputError(f"{path}: python-can's {reader_name} crashed ({signal.Signals(-done.returncode).name}): damaged")
+    if done.returncode:
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {said}")
+    arrays = np.load(io.BytesIO(done.stdout))
+    return arrays["frames"], arrays["octets"]
+
+
+def main() -> int:
+    reader_name, seconds, most_bytes = sys.argv[1], *(int(word) for word in sys.argv[2:])
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    content, output = sys.stdin.buffer.read(), io.BytesIO()
+    try:
+        frames, octets = frames_of(content, reader_name)
+        np.savez(output, frames=frames, octets=octets)
+    except ImportError as error:
+        print(error, file=sys.stderr)
+        return _MISSING
+    except BaseException as error:
+        print(str(error) or type(error).__name__, file=sys.stderr)
+        return 1
+    sys.stdout.buffer.write(output.getbuffer())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""Keys of authenticated communication: a file that nobody else may read, and what is made of it."""
+
+import os
+import re
+import stat
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from emb_daemon.bounded import read_bounded
+from emb_daemon.errors import InputError, InputErrors
+
+_MOST_BYTES = 65_536
+_LINE = re.compile(r"(\w+)\s+([0-9A-Fa-f]{32})")
+_EXAMPLE = "expected a name and 32 hexadecimal digits, such as EMB_FL_Auth 00112233445566778899aabbccddeeff"
+
+
+def key_file(name: str, relative_to: Path, environment: Mapping[str, str] = os.environ) -> Path:
+    """Where keys are: the systemd credential of that name (``LoadCredential=``), or else a file."""
+    folder = environment.get("CREDENTIALS_DIRECTORY")
+    if folder and (credential := Path(folder, name)).parent == Path(folder) and credential.exists():
+        return credential
+    return relative_to / name
+
+
+def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[str, bytes]:
+    """Keys of 16 bytes by name: a line each, ``#`` begins a comment.
+
+    Raises:
+        InputErrors: not readable, readable by others, or not such a file; every line that is wrong. No key is ever told.
+    """
+    try:
+        status = path.stat()
+        text = read_bounded(path, _MOST_BYTES).decode()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
+    # systemd gives a credential to its service by an access list, whose mask shows as the group's right to read.
+    credential = path.parent == Path(environment.get("CREDENTIALS_DIRECTORY") or os.devnull)
+    if status.st_mode & (0o037 if credential else 0o077):
+        raise InputError(f"{path}: mode {stat.S_IMODE(status.st_mode):o}: others may read or change it; expected 600 or 400")
+    if status.st_uid not in (0, os.geteuid()):
+        raise InputError(f"{path}: belongs to somebody else")
+    keys, faults = {}, []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not (line := line.partition("#")[0].strip()):
+            continue
+        if not (match := _LINE.fullmatch(line)):
+            faults.append(f"{path}:{number}: {_EXAMPLE}")
+        elif match[1] in keys:
+            faults.append(f"{path}:{number}: {match[1]}: stands there twice")
+        elif (key := bytes.fromhex(match[2])) in keys.values():
+            faults.append(f"{path}:{number}: {match[1]}: another has the same key; expected one for each sender and receiver")
+        else:
+            keys[match[1]] = key
+    if faults:
+        raise InputErrors(faults)
+    return keys
+
+
+def cmac(key: bytes) -> Callable[[bytes], bytes]:
+    """AES-128-CMAC under ``key`` (RFC 4493), as a function of the message.
+
+    Raises:
+        InputError: the library is not installed.
+    """
+    try:
+        from cryptography.hazmat.primitives.ciphers.algorithms import AES
+        from cryptography.hazmat.primitives.cmac import CMAC
+    except ImportError as error:
+        raise InputError(f"authentication needs an extra: pip install emb_daemon[secoc] ({error})") from None
+    # Its key schedule is made once: a copy takes 1 µs, a new one 2.5 µs.
+    keyed = CMAC(AES(key))
+
+    def of(message: bytes) -> bytes:
+        mac = keyed.copy()
+        mac.update(message)
+        return mac.finalize()
+
+    return of
