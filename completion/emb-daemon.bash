@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose effect simulate monitor compile bench adaptation --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose effect simulate monitor compile export bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -23,6 +23,7 @@ _emb_daemon() {
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         compile) options="--output --target" ;;
+        export) options="--calibration --output --kernels" ;;
         bench) options="--seconds --corners --json" ;;
         adaptation) options="--state --corner" ;;
     esac

@@ -22,6 +22,7 @@ COMMANDS = {
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
     "compile": "the kernels as one library, for a daemon without a compiler",
+    "export": "the estimator for C programs and simulators: a header, or an FMU",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
