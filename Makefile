@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation silent
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -24,6 +24,11 @@ docs: $(READY)
 wheel: $(READY)
 	rm -rf dist
 	$(VENV)/bin/python -m hatchling build
+
+# The daemon for a box with Debian of this machine's release, without a compiler; DEB_MACHINE=aarch64 for another kind.
+DEB_MACHINE ?= $(shell uname -m)
+deb: wheel
+	$(VENV)/bin/python packaging/make_deb.py dist/*.whl --machine $(DEB_MACHINE)
 
 # What a user gets: the wheel in an environment with nothing else in it.
 wheel-demo: wheel
