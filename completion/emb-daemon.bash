@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose effect simulate monitor compile export bench adaptation --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose effect simulate monitor files compile export bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -22,6 +22,7 @@ _emb_daemon() {
         effect) options="" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;
         bench) options="--seconds --corners --json" ;;

@@ -99,7 +99,9 @@ def pack(root: Path, version: str, architecture: str, python: str, folder: Path)
         "python": f"python{python}, python3 (>= {python}~), python3 (<< {major}.{int(minor) + 1}~)",
     }
     (debian / "control").write_text((ROOT / "packaging/debian/control").read_text().format(**values))
-    (debian / "conffiles").write_text("".join(f"/etc/emb_daemon/{path.name}\n" for path in sorted((root / "etc/emb_daemon").iterdir())))
+    (debian / "conffiles").write_text(
+        "".join(f"/etc/emb_daemon/{path.name}\n" for path in sorted((root / "etc/emb_daemon").iterdir()))
+    )
     for name in ("postinst", "prerm", "postrm"):
         shutil.copy(ROOT / "packaging/debian" / name, debian)
         (debian / name).chmod(0o755)

@@ -21,6 +21,7 @@ COMMANDS = {
     "effect": "a term that diagnose found, as an effect file",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
+    "files": "DBC, configuration, calibration and units that ship with the package",
     "compile": "the kernels as one library, for a daemon without a compiler",
     "export": "the estimator for C programs and simulators: a header, or an FMU",
     "bench": "whether this machine can hold the loop",
@@ -32,7 +33,7 @@ _OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
 #: Commands of a box without a compiler; all others need numba.
-_WITHOUT_NUMBA = ("run", "check", "monitor", "adaptation")
+_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "adaptation")
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
