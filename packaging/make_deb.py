@@ -28,6 +28,7 @@ _FILES = {
     "config/calibration.yaml": "etc/emb_daemon",
     "systemd/emb-daemon.service": "usr/lib/systemd/system",
     "systemd/emb-daemon.service.d/ahead.conf": "usr/lib/systemd/system/emb-daemon.service.d",
+    "systemd/emb-daemon-uds.service": "usr/lib/systemd/system",
     "systemd/60-emb-daemon.conf": "usr/lib/sysctl.d",
     "systemd/80-can0.network": "usr/share/doc/emb-daemon/examples",
     "systemd/80-can0.link": "usr/share/doc/emb-daemon/examples",

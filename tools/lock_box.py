@@ -1,4 +1,4 @@
-"""Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`;
+"""Writes requirements-box.lock: the part of requirements.lock that runs in the car, for `pip install --require-hashes`;
 and requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead.
 
     python tools/lock_box.py [--check]
@@ -32,7 +32,8 @@ def box_lock(without: tuple[str, ...]) -> str:
         # A package may stand there once for each range of Pythons.
         if _NAME.match(block):
             pinned[_name(block)] = pinned.get(_name(block), "") + block
-    waiting = [_name(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    waiting = [_name(line) for line in project["dependencies"] + project["optional-dependencies"]["workshop"]]
     needed: set[str] = set()
     while waiting:
         name = waiting.pop()

@@ -24,6 +24,7 @@ COMMANDS = {
     "files": "DBC, configuration, calibration and units that ship with the package",
     "compile": "the kernels as one library, for a daemon without a compiler",
     "export": "the estimator for C programs and simulators: a header, or an FMU",
+    "uds": "trouble codes and data for a workshop's tester, over UDS",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
@@ -33,7 +34,7 @@ _OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
 #: Commands of a box without a compiler; all others need numba.
-_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "adaptation")
+_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "adaptation")
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
@@ -75,9 +76,9 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in (*_OFFLINE, "numba"):
+        if missing not in (*_OFFLINE, "numba", "isotp"):
             raise
-        package = "numba" if missing == "numba" else "'emb_daemon[offline]'"
+        package = {"numba": "numba", "isotp": "'emb_daemon[workshop]'"}.get(missing, "'emb_daemon[offline]'")
         print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:
