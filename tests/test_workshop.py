@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import wirekit
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import emb_daemon
@@ -101,6 +101,7 @@ def test_a_damaged_file_is_set_aside_and_told(tmp_path):
     assert all(entry.status == 0x50 for entry in memory.entries.values())
 
 
+@settings(max_examples=25)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 4), st.integers(0, 0xFFFF), st.booleans()), max_size=12))
 def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
     folder = tmp_path_factory.mktemp("trouble")
@@ -141,7 +142,7 @@ def test_any_request_has_one_answer_or_a_reason(tmp_path_factory, request_):
 
 def test_a_session_ends_without_requests(tmp_path):
     server = Server(TroubleMemory(tmp_path), {})
-    assert server.answer(b"\x10\x03", 0.0) == b"\x50\x03\x00\x32\x01\xf4"
+    assert server.answer(b"\x10\x03", 0.0) == b"\x50\x03\x03\xe8\x01\xf4"
     assert server.answer(b"\x22\xf1\x86", 4.0) == b"\x62\xf1\x86\x03"
     assert server.answer(b"\x3e\x80", 8.0) == b""
     assert server.answer(b"\x22\xf1\x86", 12.9) == b"\x62\xf1\x86\x03"
@@ -219,7 +220,9 @@ def _tester(channel: str):
         stack = isotp.CanStack(bus, address=address, params={"tx_padding": 0})
         size = struct.calcsize(Frame.LAYOUT)
         identifiers = {0xF189: Rest(0), 0x1000: AsciiCodec(12), 0x1010: Rest(0), 0x1100: Bytes(size)}
-        with Client(PythonIsoTpConnection(stack), config={"data_identifiers": identifiers, "request_timeout": 2}) as client:
+        # No timed test: what the server promises is for a machine that is not busy with others.
+        config = {"data_identifiers": identifiers, "use_server_timing": False, "request_timeout": 10, "p2_timeout": 10}
+        with Client(PythonIsoTpConnection(stack), config=config) as client:
             yield client
 
 
@@ -298,8 +301,10 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path):
         assert "requests 0x710, responses 0x718" in process.stdout.readline()
         request = np.zeros(1, FRAME)
         request["can_id"], request["length"], request["data"] = 0x710, 8, 0x3E02
-        for counter in range(4):
+        # As often as the daemon: of what comes at once, the server takes the newest.
+        for counter in range(6):
             daemon.send(wirekit.frame("EMB_RR_EstimatorStatus", time.monotonic_ns(), counter, 1, Mode=3, DegradedReasons=1))
+            time.sleep(0.1)
         daemon.send(request)
         deadline = time.monotonic() + 10.0
         while not len(heard := daemon.drain()):

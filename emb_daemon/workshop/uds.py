@@ -13,8 +13,8 @@ _NO_SERVICE, _NO_SUBFUNCTION, _WRONG_LENGTH, _TOO_LONG, _OUT_OF_RANGE, _CANNOT_W
 DEFAULT_SESSION, EXTENDED_SESSION = 0x01, 0x03
 #: Without a request for this long the default session is back, s (ISO 14229-2, S3 server).
 _SESSION_S = 5.0
-#: Time to answer that is promised, ms, and after "response pending", 10 ms.
-_P2_MS, _P2_EXTENDED_10MS = 50, 500
+#: Time to answer that is promised, ms, and after "response pending", 10 ms: clearing waits for the disk.
+_P2_MS, _P2_EXTENDED_10MS = 1000, 500
 
 #: Active session, as data.
 _SESSION_DATA = 0xF186
