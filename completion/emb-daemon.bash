@@ -21,7 +21,7 @@ _emb_daemon() {
         diagnose) options="--calibration --validate --output --mapping --corner" ;;
         effect) options="" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        monitor) options="--once --json --web --udp -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        monitor) options="--once --json --web --record --udp -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;

@@ -158,6 +158,30 @@ def test_datagrams_and_events_follow_the_broadcasts():
     assert len(history) >= 2 and set(history[-1][1]) == {"FL"} and history[0][0] < history[-1][0]
 
 
+def test_what_was_heard_is_recorded(tmp_path):
+    pytest.importorskip("mcap", reason="NOT RUN: mcap is not installed")
+    from mcap.reader import make_reader
+
+    from emb_daemon.monitor.recording import Recording
+
+    recording, listener = Recording(tmp_path / "drive.mcap"), Listener()
+    for counter in range(3):
+        listener.hear(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
+        for _ in range(2):  # Nothing new the second time.
+            recording.show(listener, 100 * SECOND_NS)
+    recording.close()
+    with open(tmp_path / "drive.mcap", "rb") as file:
+        rows = [(schema, channel, message) for schema, channel, message in make_reader(file).iter_messages()]
+    assert [json.loads(message.data)["clamp_force_kN"] for _, _, message in rows] == [5.0, 6.0, 7.0]
+    schema, channel, message = rows[0]
+    assert (channel.topic, channel.message_encoding, schema.encoding) == ("/FL", "json", "jsonschema")
+    assert abs(message.log_time - time.time_ns()) < 60 * SECOND_NS
+    described, said = json.loads(schema.data)["properties"], json.loads(message.data)
+    assert described.keys() == said.keys()
+    kinds = {str: "string", float: "number", int: "number", type(None): "null", list: "array", dict: "object"}
+    assert all(kinds[type(value)] in described[name]["type"] for name, value in said.items())
+
+
 @pytest.mark.skipif(not shutil.which("chromium"), reason="NOT RUN: no Chromium here (Debian: apt-get install chromium)")
 def test_the_page_draws_four_corners_in_a_browser(tmp_path):
     """Without script errors: words and plots stand there as a reader sees them."""

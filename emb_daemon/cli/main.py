@@ -31,6 +31,8 @@ COMMANDS = {
 
 #: Libraries of the extra of the same name.
 _OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
+#: Extras of other libraries.
+_EXTRAS = {"isotp": "workshop", "mcap": "live"}
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
 #: Commands of a box without a compiler; all others need numba.
@@ -76,9 +78,9 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in (*_OFFLINE, "numba", "isotp"):
+        if missing not in (*_OFFLINE, *_EXTRAS, "numba"):
             raise
-        package = {"numba": "numba", "isotp": "'emb_daemon[workshop]'"}.get(missing, "'emb_daemon[offline]'")
+        package = "numba" if missing == "numba" else f"'emb_daemon[{_EXTRAS.get(missing, 'offline')}]'"
         print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:

@@ -1,6 +1,7 @@
 """emb-daemon monitor."""
 
 import argparse
+from pathlib import Path
 
 EXAMPLE = (
     "emb-daemon monitor -i socketcan -c can0\n  emb-daemon monitor -c can0 -i socketcan --once --json\n"
@@ -17,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
     page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
+    parser.add_argument("--record", type=Path, metavar="FILE", help="everything heard, as an MCAP file")
     parser.add_argument("--udp", metavar="HOST:PORT", help="JSON datagrams, 50 a second, for PlotJuggler")
     add_bus_arguments(parser)
 
@@ -33,9 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.json and not arguments.once:
         raise InputError("--json: expected together with --once")
-    handed_out = arguments.web is not None or arguments.udp is not None
+    handed_out = any(value is not None for value in (arguments.web, arguments.udp, arguments.record))
     if handed_out and arguments.once:
-        raise InputError("--once: expected without --web and --udp")
+        raise InputError("--once: expected without --web, --record and --udp")
     if not arguments.once and not handed_out and not sys.stdout.isatty():
         raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
     options = bus_options(arguments)
@@ -62,11 +64,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
-    """Serve browsers, Prometheus and PlotJuggler until somebody ends it."""
+    """Serve browsers, Prometheus and PlotJuggler, and record, until somebody ends it."""
+    import signal
+
+    from emb_daemon.cli.outputs import check_output
     from emb_daemon.errors import InputError
+    from emb_daemon.monitor.recording import Recording
     from emb_daemon.monitor.web import Datagrams, Web, hand_out
 
-    receivers = []
+    receivers, stopped = [], []
     if arguments.udp is not None:
         host, _, port = arguments.udp.rpartition(":")
         if not host or not port.isdecimal():
@@ -75,8 +81,13 @@ def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
     if arguments.web is not None:
         receivers.append(Web(arguments.web, title))
         print(f"http://127.0.0.1:{receivers[-1].port}/", flush=True)
+    if arguments.record is not None:
+        check_output(arguments.record, [], (".mcap",))
+        receivers.append(Recording(arguments.record))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.append(True))
     try:
-        hand_out(bus, receivers)
+        hand_out(bus, receivers, lambda: bool(stopped))
     finally:
         for receiver in receivers:
             receiver.close()

@@ -79,11 +79,10 @@ class Web:
         self._server.server_close()
 
     def _serve(self, request: BaseHTTPRequestHandler) -> None:
-        page = self._page.replace("{state}", self._state.decode()).encode()
         content = {
-            "/": (page, "text/html; charset=utf-8"),
-            "/metrics": (self._metrics, "text/plain; version=0.0.4; charset=utf-8"),
-            "/state.json": (self._state, "application/json"),
+            "/": ("text/html; charset=utf-8", lambda: self._page.replace("{state}", self._everything().decode()).encode()),
+            "/metrics": ("text/plain; version=0.0.4; charset=utf-8", lambda: self._metrics),
+            "/state.json": ("application/json", lambda: self._state),
         }.get(request.path)
         # A page of somebody else's, under a name that leads here, gets nothing.
         host = request.headers.get("Host", "").rpartition(":")[0]
@@ -94,11 +93,18 @@ class Web:
         elif content is None:
             request.send_error(404)
         else:
+            kind, make = content
+            body = make()
             request.send_response(200)
-            request.send_header("Content-Type", content[1])
-            request.send_header("Content-Length", str(len(content[0])))
+            request.send_header("Content-Type", kind)
+            request.send_header("Content-Length", str(len(body)))
             request.end_headers()
-            request.wfile.write(content[0])
+            request.wfile.write(body)
+
+    def _everything(self) -> bytes:
+        """The state with what a plot draws of the time before."""
+        with self._news:
+            return json.dumps({"history": list(self._history)} | json.loads(self._state)).encode()
 
     def _stream(self, request: BaseHTTPRequestHandler) -> None:
         """Events until the browser has gone."""
@@ -106,8 +112,7 @@ class Web:
         request.send_header("Content-Type", "text/event-stream")
         request.send_header("Cache-Control", "no-store")
         request.end_headers()
-        with self._news:
-            said = json.dumps({"history": list(self._history)}).encode()
+        said = self._everything()
         while True:
             try:
                 request.wfile.write(b"data: " + said + b"\n\n")
