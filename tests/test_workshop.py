@@ -1,6 +1,7 @@
 """Trouble codes and data over UDS: what udsoncan, a tester that is not ours, reads over ISO-TP; and what survives a kill."""
 
 import contextlib
+import errno
 import os
 import struct
 import subprocess
@@ -271,6 +272,21 @@ def test_a_tester_reads_versions_calibration_and_estimates(served):
     assert client.read_data_by_identifier(0x1010).service_data.values[0x1010] == b"{}"
     server.broadcast(0, times=1)
     assert struct.unpack(Frame.LAYOUT, client.read_data_by_identifier(0x1100).service_data.values[0x1100])[3] == 12345
+
+
+def test_codes_that_cannot_be_kept_are_told_all_the_same(served, monkeypatch):
+    server, client = served
+
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(trouble.files, "write", full)
+    server.broadcast(RESOLVER_LOST, times=5)
+    assert client.get_number_of_dtc_by_status_mask(CONFIRMED).service_data.dtc_count == 1
+    assert server.diagnostics.trouble.endswith("trouble.json: No space left on device")
+    with pytest.raises(Exception, match="GeneralProgrammingFailure"):
+        client.clear_dtc()
+    assert client.get_number_of_dtc_by_status_mask(CONFIRMED).service_data.dtc_count == 1, "forgotten all the same"
 
 
 def test_what_is_not_there_is_refused(served):

@@ -55,8 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(
             f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}", flush=True
         )
+        told = ""
         while not stopped:
             diagnostics.step()
+            if diagnostics.trouble != told:
+                told = diagnostics.trouble
+                print(told, file=sys.stderr, flush=True)
         diagnostics.memory.save()
     finally:
         bus.close()

@@ -14,7 +14,7 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.files import calibration_hash, load_calibration
 from emb_daemon.errors import InputError
 from emb_daemon.monitor.listener import Corner, Listener
 from emb_daemon.wire.contract import INIT, INVALID
@@ -55,12 +55,12 @@ def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int
     Raises:
         InputErrors: the configuration is faulty.
     """
-    memory = Memory(state)
+    memory, corners_of = Memory(state), Setup(configuration).configuration.corners
 
     def calibration(name: str) -> bytes:
         # As it is now: the daemon reads it again on reload, and refuses it if it is faulty.
         try:
-            return calibration_hash(Setup(configuration).calibrations[name]).encode()
+            return calibration_hash(load_calibration(configuration.parent / corners_of[name].calibration)).encode()
         except InputError:
             return b"faulty file"
 
@@ -73,7 +73,7 @@ def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int
         return json.dumps({"date": current.date, "values": current.values} if current else {}).encode()
 
     found: dict[int, Callable[[], bytes]] = {SOFTWARE: lambda: __version__.encode()}
-    for name in Setup(configuration).calibrations:
+    for name in corners_of:
         row = CORNERS.index(name)
         found[CALIBRATION + row] = lambda name=name: calibration(name)
         found[LEARNED + row] = lambda name=name: learned(name)
@@ -89,6 +89,9 @@ class Diagnostics:
         configuration: the daemon's.
         state: the daemon's state directory, where the trouble codes are kept too.
         request_id, response_id: 11-bit CAN ids.
+
+    Attributes:
+        trouble: why the trouble codes could not be kept the last time; empty if they always could.
     """
 
     def __init__(self, bus, configuration: Path, state: Path, request_id: int, response_id: int):
@@ -96,7 +99,8 @@ class Diagnostics:
         can-isotp."""
         import isotp
 
-        self._bus, self._request_id, self._response_id = bus, request_id, response_id
+        self._bus, self._request_id = bus, request_id
+        self.trouble = ""
         self.listener, self.memory = Listener(), TroubleMemory(state)
         self._judged = [0] * len(CORNERS)
         self._server = Server(self.memory, data_of(configuration, state, self.listener.corners))
@@ -118,7 +122,7 @@ class Diagnostics:
         self._bus.send(frame)
 
     def step(self) -> None:
-        """Take the frames of a moment, and send what is due. Raises OSError if the trouble codes cannot be kept."""
+        """Take the frames of a moment, and send what is due."""
         time.sleep(_PAUSE_S)
         frames = self._bus.drain()
         # The newest of each message is enough, and five times less work.
@@ -134,7 +138,11 @@ class Diagnostics:
             if status.received != self._judged[row]:
                 self._judged[row] = status.received
                 mode, reasons = int(status.values[0]), int(status.values[3])
-                self.memory.judge(row, mode, reasons, frame_of(corner, round(time.time())), now)
+                try:
+                    self.memory.judge(row, mode, reasons, frame_of(corner, round(time.time())), now)
+                except OSError as error:
+                    # What cannot be kept can still be told; the next judgement tries again.
+                    self.trouble = f"{self.memory.path}: {error.strerror}"
         # Once for each frame: a request may be whole, its answer's first frame due, and a flow control waiting.
         for _ in range(2 + len(self._requests)):
             self._transport.process()

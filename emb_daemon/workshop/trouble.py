@@ -147,10 +147,14 @@ class TroubleMemory:
         codes = list(self.entries) if group == _ALL else [group]
         if group != _ALL and group not in self.entries:
             return False
+        kept, self.entries = self.entries, self.entries | {code: Entry() for code in codes}
+        try:
+            self.save()
+        except OSError:
+            self.entries = kept
+            raise
         for code in codes:
-            self.entries[code] = Entry()
             self._row[_INDEX[code]] = 0
-        self.save()
         return True
 
 
