@@ -175,12 +175,13 @@ def test_each_number_of_the_calibration_has_its_place():
 
 
 def test_a_calibration_with_a_term_is_written_whole(tmp_path):
-    """What C makes of the initialiser is the estimator's own record."""
+    """What C makes of the initialiser is the estimator's own record; the actuator's name is no part of the program."""
     if not shutil.which("cc"):
         pytest.skip("NOT RUN: no C compiler is installed")
     from emb_daemon.calibration.files import load_calibration, save_calibration
 
     builtins = msgspec.to_builtins(adaptkit.shipped())
+    builtins["actuator"] = "a brake */\n#error code from a file"
     builtins["terms"] = [
         {"name": "term:a", "port": "force", "signal": "disc_temperature", "shape": "odd_power", "coefficient": 3.25,
          "exponent": 1.0, "scale": 100.0, "low": 0.0, "high": 300.0}

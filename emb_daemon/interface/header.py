@@ -162,7 +162,8 @@ def header(calibration: Calibration) -> str:
     return _TEXT.format(
         version=__version__,
         hash=calibration_hash(calibration),
-        actuator=calibration.actuator,
+        # No file brings code: a name ends no comment.
+        actuator=calibration.actuator.replace("*/", "* /"),
         cycle=CYCLE_S,
         codes="/* Codes of mode and source, and bits of reasons. */\n" + "\n".join(codes),
         sample=_struct(SAMPLE, "emb_sample", lambda field: describe(SAMPLE, field)),
