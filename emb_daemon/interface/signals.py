@@ -96,11 +96,11 @@ def field_of(record: np.dtype, path: str) -> tuple[np.dtype, int]:
 
 
 def describe(record: np.dtype, field: str) -> str:
-    """What a field of SAMPLE or ESTIMATE is, with its unit; empty for what no interface names."""
+    """What a field of SAMPLE or ESTIMATE is, with its unit, or what its elements are; empty for what no interface names."""
     if record is SAMPLE and field in BOOKKEEPING:
         return BOOKKEEPING[field]
     table = {SAMPLE: INPUTS, ESTIMATE: OUTPUTS}[record]
-    for signal in table:
-        if signal.field.partition("[")[0] == field:
-            return f"{signal.meaning}{f', {signal.unit}' if signal.unit not in ('', '1') else ''}"
-    return ""
+    found = [signal for signal in table if signal.field.partition("[")[0] == field]
+    if len(found) > 1:
+        return ", ".join(signal.name for signal in found)
+    return ", ".join(part for signal in found for part in (signal.meaning, signal.unit) if part not in ("", "1"))
