@@ -15,6 +15,8 @@ import tempfile
 import zipfile
 from pathlib import Path
 
+from emb_daemon.ahead.library import read_manifest, source_digest
+
 ROOT = Path(__file__).resolve().parent.parent
 #: Architecture, and pip's names of the oldest libc that wheels are taken for: Debian 11 has 2.31.
 MACHINES = {
@@ -128,6 +130,8 @@ def main() -> None:
         subprocess.run(compile_, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
         fetch_packages(site_of(root, python), arguments.machine, python)
         lay_out(root, arguments.wheel, kernels, python)
+        if read_manifest(kernels).sources != source_digest(site_of(root, python) / "emb_daemon"):
+            sys.exit(f"{arguments.wheel}: of other sources than {ROOT}; make wheel")
         compile_bytecode(root)
         print(pack(root, version, MACHINES[arguments.machine][0], python, arguments.wheel.parent))
 
