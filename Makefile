@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation silent sbom audit
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -24,6 +24,11 @@ docs: $(READY)
 wheel: $(READY)
 	rm -rf dist
 	$(VENV)/bin/python -m hatchling build
+
+# The daemon for a box with Debian of this machine's release, without a compiler; DEB_MACHINE=aarch64 for another kind.
+DEB_MACHINE ?= $(shell uname -m)
+deb: wheel
+	$(VENV)/bin/python packaging/make_deb.py dist/*.whl --machine $(DEB_MACHINE)
 
 # What a user gets: the wheel in an environment with nothing else in it.
 wheel-demo: wheel
@@ -85,7 +90,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra secoc --extra docs --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra secoc --extra docs --extra live --extra workshop --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 	$(VENV)/bin/pip install --quiet --require-hashes -r requirements.lock
 	$(VENV)/bin/python tools/lock_box.py

@@ -2,7 +2,10 @@
 
 import collections
 import contextlib
+import fcntl
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,37 @@ settings.register_profile("project", deadline=None, derandomize=True, max_exampl
 settings.load_profile("project")
 
 _ROOT = Path(__file__).parent.parent
+
+#: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
+_COMPILE = """
+import sys
+from emb_daemon.cli.main import main
+assert main(["compile", "--output", sys.argv[1]]) == 0
+from pathlib import Path
+from emb_daemon.ahead.build import build
+from emb_daemon.ahead.library import TARGETS, installed_digest
+from emb_daemon.jit import ENTRIES
+build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.argv[2]))
+"""
+
+
+@pytest.fixture(scope="session")
+def compiled() -> Path:
+    """A folder with the library for this machine, kernels.so, and the object for aarch64: a minute, once for each state of the
+    sources, which numba's folder is named after, and by one process of the tests for all."""
+    from numba.core import config
+
+    folder = Path(config.CACHE_DIR) / "ahead"
+    folder.mkdir(exist_ok=True)
+    library, other = folder / "kernels.so", folder / "aarch64.o"
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not other.exists():
+            command = [sys.executable, "-c", _COMPILE, library, other]
+            environment = os.environ | {"PYTHONPATH": str(_ROOT)}
+            done = subprocess.run(command, capture_output=True, text=True, env=environment)
+            assert done.returncode == 0, done.stderr
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,6 @@ import adaptkit
 import aheadkit
 import numpy as np
 import pytest
-from numba.core import config
 
 from emb_daemon.ahead import library
 from emb_daemon.ahead.library import Manifest, Refused, check, installed_digest, read_manifest, seal
@@ -26,34 +25,9 @@ from emb_daemon.runtime import bus, daemon
 _LIBM = {"cos", "exp", "hypot", "log", "pow", "sin", "sincos"}
 _LIBC = {"memcpy", "memmove", "memset"}
 
-#: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
-_COMPILE = """
-import sys
-from emb_daemon.cli.main import main
-assert main(["compile", "--output", sys.argv[1]]) == 0
-from emb_daemon.ahead.build import emit_object
-from emb_daemon.ahead.library import TARGETS
-from emb_daemon.jit import ENTRIES
-open(sys.argv[2], "wb").write(emit_object(list(ENTRIES.values()), TARGETS["aarch64"]))
-"""
-
 
 def _environment(**variables) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(aheadkit.ROOT), str(aheadkit.ROOT / "tests")])} | variables
-
-
-@pytest.fixture(scope="session")
-def compiled():
-    """The library for this machine and the object for aarch64: a minute, once for each state of the sources, which numba's
-    folder is named after."""
-    folder = Path(config.CACHE_DIR) / "ahead"
-    library, other = folder / "kernels.so", folder / "aarch64.o"
-    if not other.exists():
-        folder.mkdir(exist_ok=True)
-        command = [sys.executable, "-c", _COMPILE, library, other]
-        done = subprocess.run(command, capture_output=True, text=True, env=_environment())
-        assert done.returncode == 0, done.stderr
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +71,7 @@ def test_nothing_is_needed_beyond_libc_and_libm(compiled):
     assert bus and daemon, "imported for their entry points"
     for name in ("kernels.so", "aarch64.o"):
         defined, needed = _symbols(compiled / name)
-        assert defined == set(ENTRIES), name
+        assert defined == {library.mark(installed_digest()), *ENTRIES}, name
         assert needed <= _LIBM | _LIBC, name
 
 

@@ -14,7 +14,7 @@ _PACKAGE = Path(emb_daemon.__file__).parent
 #: The box, from the ground up: each may know those before it.
 _BOX = (
     "errors", "resources", "atomic", "bounded", "ahead", "numba_cache", "jit", "wire", "models", "effects", "estimator",
-    "calibration", "adapt", "pipeline", "runtime", "monitor",
+    "calibration", "adapt", "pipeline", "interface", "runtime", "monitor", "workshop",
 )  # fmt: skip
 #: What stands above both wings.
 _ABOVE = ("cli", "api", "__init__")

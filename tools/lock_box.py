@@ -1,4 +1,4 @@
-"""Writes requirements-box.lock: the part of requirements.lock that the daemon alone needs, for `pip install --require-hashes`;
+"""Writes requirements-box.lock: the part of requirements.lock that runs in the car, for `pip install --require-hashes`;
 requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead; and
 requirements-secoc.lock: what authenticated communication needs besides.
 
@@ -18,8 +18,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: Files, what each holds the dependencies of (extras; ``""`` is the daemon itself), and what of them it leaves out.
 LOCKS = {
-    "requirements-box.lock": (("",), ()),
-    "requirements-ahead.lock": (("",), ("numba", "llvmlite")),
+    "requirements-box.lock": (("", "workshop"), ()),
+    "requirements-ahead.lock": (("", "workshop"), ("numba", "llvmlite")),
     "requirements-secoc.lock": (("secoc",), ()),
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")

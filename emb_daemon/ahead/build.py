@@ -19,7 +19,7 @@ import numba
 from numba import types
 
 from emb_daemon import __version__
-from emb_daemon.ahead.library import Target, seal
+from emb_daemon.ahead.library import Target, mark, seal
 from emb_daemon.ahead.signature import Array, Entry, is_group
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import Unavailable
@@ -91,22 +91,23 @@ def _lowered(entry: Entry) -> str:
     )
 
 
-def _merged(entries: list[Entry], triple: str):
-    """One module of all entry points, in which nothing else can be seen from outside."""
-    whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NO_OWNERS}')
+def _merged(entries: list[Entry], sources: str, triple: str):
+    """One module of all entry points, in which nothing else but its `mark` can be seen from outside."""
+    marked = f"@{mark(sources)} = constant i8 0"
+    whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NO_OWNERS}{marked}\n')
     for entry in entries:
         # numba compiles for this machine; what it writes before it optimises is the same for all.
         text = re.sub(r'(?m)^target (datalayout|triple) = ".*"$', "", _lowered(entry))
         whole.link_in(llvm.parse_assembly(f'target triple = "{triple}"\n{text}'))
-    visible = {entry.name for entry in entries}
+    visible = {mark(sources), *(entry.name for entry in entries)}
     for symbol in (*whole.functions, *whole.global_variables):
         if not symbol.is_declaration and symbol.name not in visible:
             symbol.linkage = "internal"
     return whole
 
 
-def emit_object(entries: list[Entry], target: Target) -> bytes:
-    """The entry points as a relocatable ELF object.
+def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
+    """The entry points, and the `mark` of ``sources``, as a relocatable ELF object.
 
     Raises:
         RuntimeError: an entry point needs what is only in this process.
@@ -116,7 +117,7 @@ def emit_object(entries: list[Entry], target: Target) -> bytes:
     machine = llvm.Target.from_triple(target.triple).create_target_machine(cpu=target.cpu, opt=3, reloc="pic")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", numba.NumbaWarning)
-        module = _merged(entries, target.triple)
+        module = _merged(entries, sources, target.triple)
     module.data_layout = str(machine.target_data)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=3))
     before, after = llvm.create_new_module_pass_manager(), llvm.create_new_module_pass_manager()
@@ -166,14 +167,19 @@ def _linked(elf: bytes, command: list[str]) -> bytes:
 def build(entries: list[Entry], sources: str, target: Target, path: Path) -> None:
     """Write the library of ``entries`` that were imported from ``sources`` (`library.source_digest`).
 
+    With the ending ``.o`` it is a plain object, to be linked into a program.
+
     Raises:
         Unavailable: nothing that is installed links for the target.
         OSError: the file cannot be written.
     """
-    linker = linker_for(target.machine)
+    linker = None if path.suffix == ".o" else linker_for(target.machine)
     path.parent.mkdir(parents=True, exist_ok=True)
+    elf = emit_object(entries, sources, target)
+    if linker is None:
+        return write_atomically(path, elf)
     content = seal(
-        _linked(emit_object(entries, target), linker),
+        _linked(elf, linker),
         sources=sources,
         machine=target.machine,
         cpu=target.cpu,

@@ -85,6 +85,11 @@ def source_digest(package: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def mark(sources: str) -> str:
+    """Name of a symbol that a library of these ``sources`` has, for programs in C that must not be linked with another."""
+    return f"emb_made_from_{sources}"
+
+
 def installed_digest() -> str:
     """`source_digest` of this very package."""
     return source_digest(Path(__file__).parent.parent)

@@ -13,9 +13,8 @@ EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--output", type=Path, default=default_path(), metavar="FILE", help="library to write (%(default)s, where run looks)"
-    )
+    where = "library to write (%(default)s, where run looks), or .o for an object to link"
+    parser.add_argument("--output", type=Path, default=default_path(), metavar="FILE", help=where)
     parser.add_argument(
         "--target", default=platform.machine(), metavar="MACHINE", help="x86_64 or aarch64, or its triple (this machine)"
     )

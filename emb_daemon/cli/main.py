@@ -21,17 +21,22 @@ COMMANDS = {
     "effect": "a term that diagnose found, as an effect file",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
+    "files": "DBC, configuration, calibration and units that ship with the package",
     "compile": "the kernels as one library, for a daemon without a compiler",
+    "export": "the estimator for C programs and simulators: a header, or an FMU",
+    "uds": "trouble codes and data for a workshop's tester, over UDS",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
 
 #: Libraries of the extra of the same name.
 _OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
+#: Extras of other libraries.
+_EXTRAS = {"isotp": "workshop", "mcap": "live"}
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
 #: Commands of a box without a compiler; all others need numba.
-_WITHOUT_NUMBA = ("run", "check", "monitor", "adaptation")
+_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "adaptation")
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
@@ -73,9 +78,9 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in (*_OFFLINE, "numba"):
+        if missing not in (*_OFFLINE, *_EXTRAS, "numba"):
             raise
-        package = "numba" if missing == "numba" else "'emb_daemon[offline]'"
+        package = "numba" if missing == "numba" else f"'emb_daemon[{_EXTRAS.get(missing, 'offline')}]'"
         print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:

@@ -1,8 +1,14 @@
 """emb-daemon monitor."""
 
 import argparse
+from pathlib import Path
 
-EXAMPLE = "emb-daemon monitor -i socketcan -c can0\n  emb-daemon monitor -c can0 -i socketcan --once --json"
+EXAMPLE = (
+    "emb-daemon monitor -i socketcan -c can0\n  emb-daemon monitor -c can0 -i socketcan --once --json\n"
+    "  emb-daemon monitor -c can0 -i socketcan --web"
+)
+
+_PORT = 8250
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -10,6 +16,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("--once", action="store_true", help="listen for two seconds, print one line per corner, end")
     parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
+    page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
+    parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
+    parser.add_argument("--record", type=Path, metavar="FILE", help="everything heard, as an MCAP file")
+    parser.add_argument("--udp", metavar="HOST:PORT", help="JSON datagrams, 50 a second, for PlotJuggler")
     add_bus_arguments(parser)
 
 
@@ -25,13 +35,20 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.json and not arguments.once:
         raise InputError("--json: expected together with --once")
-    if not arguments.once and not sys.stdout.isatty():
+    handed_out = any(value is not None for value in (arguments.web, arguments.udp, arguments.record))
+    if handed_out and arguments.once:
+        raise InputError("--once: expected without --web, --record and --udp")
+    if not arguments.once and not handed_out and not sys.stdout.isatty():
         raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
     options = bus_options(arguments)
     bus = open_bus(**options, ids=Listener().ids)
+    title = " ".join(str(options[name]) for name in ("interface", "channel") if options[name])
     try:
+        if handed_out:
+            _hand_out(arguments, bus, title)
+            return 0
         if not arguments.once:
-            watch(bus, " ".join(str(options[name]) for name in ("interface", "channel") if options[name]))
+            watch(bus, title)
             return 0
         listener, now = listen(bus)
     finally:
@@ -44,3 +61,33 @@ def run(arguments: argparse.Namespace) -> int:
 
         print("\n".join(summary(listener, now)))
     return 0
+
+
+def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
+    """Serve browsers, Prometheus and PlotJuggler, and record, until somebody ends it."""
+    import signal
+
+    from emb_daemon.cli.outputs import check_output
+    from emb_daemon.errors import InputError
+    from emb_daemon.monitor.recording import Recording
+    from emb_daemon.monitor.web import Datagrams, Web, hand_out
+
+    receivers, stopped = [], []
+    if arguments.udp is not None:
+        host, _, port = arguments.udp.rpartition(":")
+        if not host or not port.isdecimal():
+            raise InputError(f"--udp {arguments.udp}: expected HOST:PORT, such as 127.0.0.1:9870")
+        receivers.append(Datagrams(host, int(port)))
+    if arguments.web is not None:
+        receivers.append(Web(arguments.web, title))
+        print(f"http://127.0.0.1:{receivers[-1].port}/", flush=True)
+    if arguments.record is not None:
+        check_output(arguments.record, [], (".mcap",))
+        receivers.append(Recording(arguments.record))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.append(True))
+    try:
+        hand_out(bus, receivers, lambda: bool(stopped))
+    finally:
+        for receiver in receivers:
+            receiver.close()

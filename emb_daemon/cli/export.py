@@ -1,0 +1,41 @@
+"""emb-daemon export."""
+
+import argparse
+from pathlib import Path
+
+from emb_daemon.ahead.library import default_path
+
+EXAMPLE = "emb-daemon export --calibration calibration.yaml --output brake.fmu"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="of the actuator")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help=".h: C header; .fmu: FMI 3.0 co-simulation",
+    )
+    parser.add_argument(
+        "--kernels", type=Path, default=default_path(), metavar="FILE", help="for .fmu, made by compile (%(default)s)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from emb_daemon.atomic import write_atomically
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.cli.outputs import check_output
+
+    check_output(arguments.output, [arguments.calibration, arguments.kernels], (".h", ".fmu"))
+    calibration = load_calibration(arguments.calibration)
+    if arguments.output.suffix == ".h":
+        from emb_daemon.interface.header import header
+
+        write_atomically(arguments.output, header(calibration).encode())
+    else:
+        from emb_daemon.interface.fmu import make_fmu
+
+        write_atomically(arguments.output, make_fmu(calibration, arguments.kernels))
+    print(f"{arguments.output}: {calibration.actuator}")
+    return 0

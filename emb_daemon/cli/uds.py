@@ -1,0 +1,67 @@
+"""emb-daemon uds."""
+
+import argparse
+from pathlib import Path
+
+from emb_daemon.cli.busoptions import add_bus_arguments
+
+EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
+
+
+def _can_id(text: str) -> int:
+    value = int(text, 0)
+    if not 0 <= value <= 0x7FF:
+        raise ValueError
+    return value
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
+    parser.add_argument(
+        "--state", type=Path, metavar="DIR", help="the daemon's state directory; trouble codes are kept there too "
+        "(default: $STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon)"
+    )  # fmt: skip
+    parser.add_argument("--request-id", type=_can_id, default=0x710, metavar="ID", help="11-bit CAN id of requests (0x710)")
+    parser.add_argument("--response-id", type=_can_id, default=0x718, metavar="ID", help="11-bit CAN id of responses (0x718)")
+    add_bus_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import signal
+    import sys
+
+    from emb_daemon.adapt.memory import state_directory
+    from emb_daemon.calibration.configuration import Setup
+    from emb_daemon.cli.busoptions import bus_options
+    from emb_daemon.errors import InputError
+    from emb_daemon.monitor.listener import Listener
+    from emb_daemon.runtime.bus import open_bus
+    from emb_daemon.workshop.serve import Diagnostics
+
+    configuration = Setup(arguments.config).configuration
+    listened = Listener().ids
+    for name in ("request_id", "response_id"):
+        if getattr(arguments, name) in listened or arguments.request_id == arguments.response_id:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(arguments, name):#x}: expected an id that nobody else has")
+    state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
+    bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
+    stopped = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.append(True))
+    try:
+        diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id)
+        if diagnostics.memory.warning:
+            print(diagnostics.memory.warning, file=sys.stderr)
+        print(
+            f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}", flush=True
+        )
+        told = ""
+        while not stopped:
+            diagnostics.step()
+            if diagnostics.trouble != told:
+                told = diagnostics.trouble
+                print(told, file=sys.stderr, flush=True)
+        diagnostics.memory.save()
+    finally:
+        bus.close()
+    return 0

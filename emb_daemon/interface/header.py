@@ -1,0 +1,177 @@
+"""The C header of the estimator: its records, two functions, and one calibration, made from the records themselves.
+
+The functions are in the header: they call the library of ``emb-daemon compile``, which must have been made from the same
+sources, or the program does not link.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from emb_daemon import __version__
+from emb_daemon.ahead import signature
+from emb_daemon.ahead.library import installed_digest, mark
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator.answer import answer
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
+from emb_daemon.interface.places import Place, places
+from emb_daemon.interface.signals import describe
+from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
+
+_KINDS = {"f": "double", "i": "int64_t", "b": "bool"}
+
+_TEXT = """\
+/* Virtual clamp force sensor: the estimator of emb_daemon {version} in C.
+ *
+ * Made by emb-daemon export from the calibration {hash} of {actuator}. Link with the library of emb-daemon compile:
+ *
+ *     cc program.c kernels.so -lm
+ *
+ * SI units, temperatures in degC. One emb_brake for each corner; nothing is allocated, no function blocks, and different
+ * brakes may be served by different threads. What adaptation learns while parked is not part of this interface.
+ */
+#ifndef EMB_H
+#define EMB_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+/* Cycle of the motor's signals, s. */
+#define EMB_CYCLE_S {cycle!r}
+
+{codes}
+
+/* One sample, or a question for what can be said without one. */
+{sample}
+
+/* The answer. */
+{estimate}
+
+/* One actuator's calibration, as the estimator takes it. */
+{parameters}
+
+/* One corner's estimator: emb_init prepares it, its content is its own. */
+typedef struct {{
+    emb_parameters parameters;
+    _Alignas(8) unsigned char state[{state}];
+}} emb_brake;
+
+{asserts}
+
+/* In the library: that it was made from the same sources as this header; arguments as eight-byte words. */
+extern const char {mark};
+int32_t {function}(int64_t *words);
+
+/* A brake that has seen nothing. */
+static inline void emb_init(emb_brake *brake, const emb_parameters *calibration) {{
+    (void)*(const volatile char *)&{mark};
+    memset(brake, 0, sizeof *brake);
+    brake->parameters = *calibration;
+}}
+
+/* Take one sample and answer it, in some microseconds. Samples come every EMB_CYCLE_S; where some are missing, the next one's
+ * dt says so. At the first the brake is released and the motor stands, or the contact angle counts as unknown until both were
+ * seen. Returns 0; anything else is a defect of the library. */
+static inline int emb_step(emb_brake *brake, const emb_sample *sample, emb_estimate *estimate) {{
+    int64_t words[] = {{
+        (int64_t)(intptr_t)sample, 1, 1, (int64_t)(intptr_t)brake->state, 1,
+        (int64_t)(intptr_t)&brake->parameters, 1, (int64_t)(intptr_t)estimate, 1,
+    }};
+    memset(estimate, 0, sizeof *estimate);
+    return {function}(words);
+}}
+
+/* {actuator}, {hash}. What is not named here is zero. */
+static const emb_parameters emb_calibration = {{
+{calibration}
+}};
+
+#endif
+"""
+
+
+def _declared(kind: np.dtype, name: str, shape: tuple[int, ...], describe_field, indent: str) -> Iterator[str]:
+    """Lines of a member of a struct."""
+    dimensions = "".join(f"[{size}]" for size in shape)
+    if kind.names:
+        yield f"{indent}struct {{"
+        for field in kind.names:
+            below = kind.fields[field][0]
+            yield from _declared(below.base, field, below.shape, lambda _: "", indent + "    ")
+        yield f"{indent}}} {name}{dimensions};"
+    else:
+        comment = describe_field(name)
+        yield f"{indent}{_KINDS[kind.kind]} {name}{dimensions};{f' /* {comment} */' if comment else ''}"
+
+
+def _struct(record: np.dtype, name: str, describe_field=lambda _: "") -> str:
+    lines = ["typedef struct {"]
+    for field in record.names:
+        kind = record.fields[field][0]
+        lines += _declared(kind.base, field, kind.shape, describe_field, "    ")
+    return "\n".join([*lines, f"}} {name};"])
+
+
+def _number(value) -> str:
+    """A C expression of exactly this number, or of an array of them."""
+    if value.ndim:
+        return f"{{{', '.join(map(_number, value))}}}"
+    if not np.issubdtype(value.dtype, np.floating):
+        return str(int(value))
+    return repr(float(value)) if np.isfinite(value) else f"{'-' if value < 0 else ''}(1.0 / 0.0)"
+
+
+def _initialised(record: np.void, offset: int, keys: dict[int, Place], indent: str) -> Iterator[str]:
+    """Lines that set what of a record is not zero, with the calibration's key and unit beside each number that has one."""
+    for field in record.dtype.names:
+        value, start = record[field], offset + record.dtype.fields[field][1]
+        if not any(value.tobytes()):
+            continue
+        if value.dtype.names is None:
+            place = keys.get(start)
+            comment = f" /* {place.key.partition('[0]')[0] if value.ndim else place.key}, {place.unit} */" if place else ""
+            yield f"{indent}.{field} = {_number(value)},{comment}"
+            continue
+        yield f"{indent}.{field} = {{"
+        if value.ndim:
+            for index, element in enumerate(value):
+                yield f"{indent}    [{index}] = {{"
+                yield from _initialised(element, start + index * value.itemsize, keys, indent + "        ")
+                yield f"{indent}    }},"
+        else:
+            yield from _initialised(value, start, keys, indent + "    ")
+        yield f"{indent}}},"
+
+
+def header(calibration: Calibration) -> str:
+    """The header's text."""
+    codes = [f"#define EMB_MODE_{word.upper()} {code}" for code, word in enumerate(MODES)]
+    codes += [f"#define EMB_SOURCE_{word.upper()} {code}" for code, word in SOURCES.items()]
+    codes += [f"#define EMB_{word.upper().replace(' ', '_')} {1 << bit:#x}" for bit, word in enumerate(REASONS)]
+    records = {"emb_sample": SAMPLE, "emb_estimate": ESTIMATE, "emb_parameters": PARAMETERS}
+    asserts = [f'_Static_assert(sizeof({name}) == {record.itemsize}, "{name}");' for name, record in records.items()]
+    asserts += [
+        f'_Static_assert(offsetof({name}, {field}) == {record.fields[field][1]}, "{name}.{field}");'
+        for name, record in records.items()
+        for field in record.names
+    ]
+    keys = {place.offset: place for place in places(calibration)}
+    return _TEXT.format(
+        version=__version__,
+        hash=calibration_hash(calibration),
+        # No file brings code: a name ends no comment.
+        actuator=calibration.actuator.replace("*/", "* /"),
+        cycle=CYCLE_S,
+        codes="/* Codes of mode and source, and bits of reasons. */\n" + "\n".join(codes),
+        sample=_struct(SAMPLE, "emb_sample", lambda field: describe(SAMPLE, field)),
+        estimate=_struct(ESTIMATE, "emb_estimate", lambda field: describe(ESTIMATE, field)),
+        parameters=_struct(PARAMETERS, "emb_parameters"),
+        state=STATE.itemsize,
+        asserts="\n".join(asserts),
+        mark=mark(installed_digest()),
+        function=signature.name_in_c(answer),
+        calibration="\n".join(_initialised(to_parameters(calibration), 0, keys, "    ")),
+    )

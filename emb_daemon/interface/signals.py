@@ -1,0 +1,106 @@
+"""The one table of what goes into the estimator and comes out of it, for interfaces that name signals.
+
+Inputs are named as `emb_daemon.api` names its arguments, outputs as replay names its columns: both state the unit.
+"""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_daemon.estimator.records import DEPTHS_M, ESTIMATE, SAMPLE
+from emb_daemon.wire.contract import MODES, SOURCES
+
+
+class Signal(NamedTuple):
+    """``field`` of a SAMPLE or an ESTIMATE, with its index if it is an array's; ``meaning`` in words; ``start`` is an input's
+    value before anything was measured."""
+
+    name: str
+    field: str
+    unit: str
+    meaning: str
+    start: float | bool | int = 0.0
+
+
+_SOURCES = ", ".join(f"{code} {word}" for code, word in SOURCES.items())
+
+INPUTS = (
+    Signal("angle_rad", "angle", "rad", "motor angle, multi-turn, any zero, at the sample"),
+    Signal("speed_rad_per_s", "speed", "rad/s", "motor speed at the sample"),
+    Signal("current_A", "current_q", "A", "torque-producing current, mean over the 4 ms before the sample"),
+    Signal("inner_backplate_C", "inner_backplate", "degC", "inner backing plate", 20.0),
+    Signal("outer_backplate_C", "outer_backplate", "degC", "outer backing plate", 20.0),
+    Signal("caliper_C", "caliper", "degC", "caliper", 20.0),
+    Signal("ambient_C", "ambient", "degC", "ambient air", 20.0),
+    Signal("wheel_speed_rad_per_s", "wheel_speed", "rad/s", "speed of the disc"),
+    Signal("wheel_pulse", "wheel_pulse", "1", "pulses of the wheel, 96 a turn, modulo 4096"),
+    Signal("vehicle_speed_m_per_s", "vehicle_speed", "m/s", "speed of the vehicle"),
+    Signal("park_brake", "park_brake", "1", "0 released, 1 applied, 2 in transition, 3 fault"),
+    Signal("brake_request", "brake_request", "1", "1 while the driver or a system brakes"),
+    Signal("brake_torque_Nm", "brake_torque", "N.m", "a rig's brake torque sensor heats the pads; not a number: there is none",
+           float("nan")),
+    Signal("has_current", "has_current", "", "current_A is fresh", True),
+    Signal("has_thermocouple", "has_thermocouple", "", "inner_backplate_C, outer_backplate_C and caliper_C are fresh", True),
+    Signal("has_wheel_speed", "has_wheel_speed", "", "wheel_speed_rad_per_s is fresh", True),
+    Signal("has_wheel_pulse", "has_wheel_pulse", "", "wheel_pulse is fresh", True),
+    Signal("has_status", "has_status", "", "ambient_C, vehicle_speed_m_per_s, park_brake and brake_request are fresh", True),
+    Signal("is_prediction", "is_prediction", "", "there is no sample: tell what can be said since the last one", False),
+    Signal("reasons_outside", "reasons", "", "bits of DegradedReasons that are known outside the estimator", 0),
+)  # fmt: skip
+
+OUTPUTS = (
+    Signal("clamp_force_N", "force", "N", "clamp force, both paths fused"),
+    Signal("clamp_force_sigma_N", "sigma", "N", "one standard deviation of clamp_force_N"),
+    Signal("stiffness_force_N", "stiffness_force", "N", "from motor angle by the characteristic curve"),
+    Signal("stiffness_force_sigma_N", "stiffness_sigma", "N", "one standard deviation of stiffness_force_N"),
+    Signal("torque_force_N", "torque_force", "N", "from motor current by the torque balance; not a number without one"),
+    Signal("torque_force_sigma_N", "torque_sigma", "N", "one standard deviation of torque_force_N"),
+    Signal("ml_force_N", "ml_force", "N", "both paths weighted by their variances, without memory"),
+    Signal("contact_angle_rad", "contact_angle", "rad", "motor angle at which the pads touch"),
+    Signal("contact_angle_sigma_rad", "contact_sigma", "rad", "one standard deviation of contact_angle_rad"),
+    Signal("stiffness_factor", "stiffness_factor", "1", "stiffness over that of the calibration"),
+    *(Signal(f"{pad}_{part}_C", f"{part}[{side}]", "degC", f"{pad} pad, {words}")
+      for side, pad in enumerate(("inner", "outer"))
+      for part, words in (("surface", "friction surface"), ("mean", "mean over its thickness"))),
+    *(Signal(f"{pad}_{1e3 * depth:.0f}mm_C", f"depth[{side}][{index}]", "degC",
+             f"{pad} pad, {1e3 * depth:.0f} mm below the friction surface")
+      for side, pad in enumerate(("inner", "outer")) for index, depth in enumerate(DEPTHS_M)),
+    Signal("disc_C", "disc", "degC", "brake disc, lumped"),
+    Signal("mode", "mode", "", "mode of the estimator: " + ", ".join(f"{code} {word}" for code, word in enumerate(MODES))),
+    Signal("source", "source", "", f"what clamp_force_N rests on: {_SOURCES}"),
+    Signal("reasons", "reasons", "", "why not to trust the estimate: bits of DegradedReasons"),
+)  # fmt: skip
+
+#: Fields of a SAMPLE that say which sample it is, in words.
+BOOKKEEPING = {
+    "time_ns": "of the sample, ns, on the caller's clock; told again in the estimate",
+    "cycle": "cycles of 4 ms since the first sample; told again",
+    "elapsed_cycles": "cycles since the last call; told again",
+    "age_cycles": "cycles since the last sample; 0 but for a prediction",
+    "corner": "0 to 3 for FL, FR, RL, RR; told again",
+    "counter": "of the sample's frames; told again",
+    "dt": "s since the last sample, 0 at the first",
+}
+
+
+def field_of(record: np.dtype, path: str) -> tuple[np.dtype, int]:
+    """Type and offset in bytes of a field such as ``depth[1][2]``."""
+    name, *indices = re.findall(r"\w+", path)
+    kind, offset = record.fields[name][:2]
+    for position, index in enumerate(map(int, indices)):
+        if not 0 <= index < kind.shape[position]:
+            raise IndexError(path)
+        offset += index * kind.base.itemsize * int(np.prod(kind.shape[position + 1 :]))
+    return kind.base, offset
+
+
+def describe(record: np.dtype, field: str) -> str:
+    """What a field of SAMPLE or ESTIMATE is, with its unit, or what its elements are; empty for what no interface names."""
+    if record is SAMPLE and field in BOOKKEEPING:
+        return BOOKKEEPING[field]
+    table = {SAMPLE: INPUTS, ESTIMATE: OUTPUTS}[record]
+    found = [signal for signal in table if signal.field.partition("[")[0] == field]
+    if len(found) > 1:
+        return ", ".join(signal.name for signal in found)
+    return ", ".join(part for signal in found for part in (signal.meaning, signal.unit) if part not in ("", "1"))

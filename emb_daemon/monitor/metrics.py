@@ -1,0 +1,66 @@
+"""A daemon's broadcasts as Prometheus takes them (text exposition format 0.0.4). What is not to be used is left out."""
+
+from collections.abc import Iterable
+
+from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.wire.contract import MODES, REASONS, SOURCES, STATUSES
+
+_TEMPERATURES = ("inner_surface", "inner_mean", "outer_surface", "outer_mean")
+
+#: Gauges: name, what it is, and its value in what `Corner.state` says.
+_GAUGES = {
+    "emb_clamp_force_newtons": ("Clamp force", lambda state: _times(state["clamp_force_kN"], 1e3)),
+    "emb_clamp_force_sigma_newtons": ("One standard deviation", lambda state: _times(state["clamp_force_sigma_kN"], 1e3)),
+    "emb_stiffness_factor": ("Stiffness over the calibration's", lambda state: state["stiffness_factor"]),
+    "emb_contact_angle_radians": ("Motor angle at which the pads touch", lambda state: state["contact_angle_rad"]),
+    "emb_input_age_seconds": ("Age of the sample answered", lambda state: _times(state["input_age_ms"], 1e-3)),
+    "emb_silent_seconds": ("Time since any good frame", lambda state: state["silent_s"]),
+    "emb_forces_per_second": ("Clamp forces heard in the last second", lambda state: state["forces_per_s"]),
+}
+_COUNTERS = {
+    "emb_frames_received_total": ("Good frames", "received"),
+    "emb_frames_missing_total": ("Frames that the E2E counter says were sent besides", "missing"),
+    "emb_frames_damaged_total": ("Frames with a wrong CRC or a counter that stands still", "damaged"),
+}
+_WORDS = {
+    "emb_mode": ("Mode of the estimator", "mode", MODES),
+    "emb_source": ("What the clamp force rests on", "source", tuple(SOURCES.values())),
+    "emb_status": ("Whether the clamp force may be used", "status", tuple(STATUSES.values())),
+}
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _family(name: str, kind: str, about: str, rows: Iterable[tuple[str, float | None]]) -> list[str]:
+    samples = [f"{name}{{{labels}}} {value:.9g}" for labels, value in rows if value is not None]
+    return [f"# HELP {name} {about}.", f"# TYPE {name} {kind}", *samples] if samples else []
+
+
+def exposition(listener: Listener, now_ns: int) -> str:
+    """Every corner that was heard, at a time on the monotonic clock."""
+    states = {corner.name: (corner, corner.state(now_ns)) for corner in listener.heard}
+    lines: list[str] = []
+    for name, (about, value) in _GAUGES.items():
+        lines += _family(name, "gauge", about, ((f'corner="{key}"', value(state)) for key, (_, state) in states.items()))
+    rows = (
+        (f'corner="{key}",place="{place}"', state[f"{place}_C"])
+        for key, (_, state) in states.items()
+        for place in _TEMPERATURES
+    )
+    lines += _family("emb_pad_temperature_celsius", "gauge", "Pad temperature", rows)
+    for name, (about, field, words) in _WORDS.items():
+        rows = ((f'corner="{key}",{field}="{word}"', float(state[field] == word)) for key, (_, state) in states.items()
+                for word in words)  # fmt: skip
+        lines += _family(name, "gauge", about, rows)
+    lines += _family("emb_reason", "gauge", "Whether the estimate is degraded for it", _reasons(states.values()))
+    for name, (about, field) in _COUNTERS.items():
+        lines += _family(name, "counter", about, ((f'corner="{key}"', state[field]) for key, (_, state) in states.items()))
+    return "\n".join([*lines, ""])
+
+
+def _reasons(states: Iterable[tuple[Corner, dict]]) -> Iterable[tuple[str, float]]:
+    for corner, state in states:
+        for word in REASONS:
+            yield f'corner="{corner.name}",reason="{word}"', float(word in state["reasons"])

@@ -1,0 +1,56 @@
+"""What the monitor hears as an MCAP file, for PlotJuggler and the like: a topic for each corner, JSON with a schema."""
+
+import json
+import time
+from pathlib import Path
+
+from emb_daemon.monitor.listener import Corner, Listener
+
+#: Bytes after which a chunk is written: some seconds of four corners are lost at most when the recorder is killed.
+_CHUNK = 1 << 16
+
+
+def _schema(value) -> dict:
+    """JSON schema of what `Corner.state` gives. What is not to be used is null, whatever it is otherwise."""
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {name: _schema(inner) for name, inner in value.items()}}
+    if isinstance(value, list):
+        return {"type": "array", "items": {"type": "string"}}
+    return {"type": ["string", "null"] if isinstance(value, str) else ["number", "null"]}
+
+
+class Recording:
+    """A file that grows while the monitor hears."""
+
+    def __init__(self, path: Path):
+        """Raises ImportError without mcap, OSError if the file cannot be written."""
+        from mcap.writer import Writer
+
+        self._file = open(path, "wb")  # noqa: SIM115 - closed by close()
+        self._writer = Writer(self._file, chunk_size=_CHUNK)
+        self._writer.start(library="emb_daemon")
+        self._channels: dict[str, int] = {}
+        self._received: dict[str, int] = {}
+
+    def show(self, listener: Listener, now_ns: int) -> None:
+        """Write each corner of which something new was heard; times on the machine's clock."""
+        stamp = time.time_ns()
+        for corner in listener.heard:
+            state = corner.state(now_ns)
+            if self._received.get(corner.name) != state["received"]:
+                self._received[corner.name] = state["received"]
+                self._writer.add_message(self._channel(corner, state), stamp, json.dumps(state).encode(), stamp)
+
+    def _channel(self, corner: Corner, state: dict) -> int:
+        if corner.name not in self._channels:
+            words = {name: value or "" for name, value in state.items() if name in ("status", "source", "mode")}
+            words["adaptation"] = {"request": "", "progress_percent": 0, "result": ""}
+            schema = self._writer.register_schema(
+                "emb_daemon.Corner", "jsonschema", json.dumps(_schema(state | words)).encode()
+            )
+            self._channels[corner.name] = self._writer.register_channel(f"/{corner.name}", "json", schema)
+        return self._channels[corner.name]
+
+    def close(self) -> None:
+        self._writer.finish()
+        self._file.close()

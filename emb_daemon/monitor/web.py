@@ -1,0 +1,159 @@
+"""The monitor for a browser, for Prometheus and for PlotJuggler: one thread hears, others hand out what it last said."""
+
+import collections
+import contextlib
+import html
+import json
+import socket
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from emb_daemon.errors import Unavailable
+from emb_daemon.monitor.listener import HISTORY_S, Listener
+from emb_daemon.monitor.metrics import exposition
+
+#: Bus and receivers of datagrams, s; browsers, which draw a minute on some hundred pixels, s.
+_HEAR_S, _SHOW_S = 0.02, 0.1
+_PAGE = Path(__file__).with_name("page.html")
+#: What a page draws, kept so that one which is opened later draws it too.
+_HISTORY = round(HISTORY_S / _SHOW_S)
+
+
+def state(listener: Listener, now_ns: int) -> dict:
+    """Everything known; times in s, on the machine's clock."""
+    return {"timestamp": time.time(), "corners": {corner.name: corner.state(now_ns) for corner in listener.heard}}
+
+
+def _forces(said: dict) -> list:
+    """What a plot draws of a `state`."""
+    corners = said["corners"].items()
+    return [said["timestamp"], {name: [corner["clamp_force_kN"], corner["clamp_force_sigma_kN"]] for name, corner in corners}]
+
+
+class Web:
+    """Serves one page, its events and metrics on this machine alone.
+
+    Args:
+        port: 0 for any that is free; `port` says which.
+        title: what the page says of the bus.
+    """
+
+    def __init__(self, port: int, title: str):
+        """Raises Unavailable if the port is taken."""
+        self._page = _PAGE.read_text(encoding="utf-8").replace("{title}", html.escape(title))
+        self._state, self._metrics = b"{}", b""
+        self._shown_s, self._news = 0.0, threading.Condition()
+        self._history: collections.deque = collections.deque(maxlen=_HISTORY)
+        web = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                web._serve(self)
+
+            def log_message(self, *_):
+                pass
+
+        try:
+            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        except OSError as error:
+            raise Unavailable(f"--web {port}: {error.strerror}") from None
+        self._server.daemon_threads = True
+        self.port = self._server.server_address[1]
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def show(self, listener: Listener, now_ns: int) -> None:
+        """Hand out what is known now, ten times a second at most."""
+        if time.monotonic() - self._shown_s < _SHOW_S:
+            return
+        with self._news:
+            self._shown_s = time.monotonic()
+            said = state(listener, now_ns)
+            self._history.append(_forces(said))
+            self._state, self._metrics = json.dumps(said).encode(), exposition(listener, now_ns).encode()
+            self._news.notify_all()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _serve(self, request: BaseHTTPRequestHandler) -> None:
+        content = {
+            "/": ("text/html; charset=utf-8", lambda: self._page.replace("{state}", self._everything().decode()).encode()),
+            "/metrics": ("text/plain; version=0.0.4; charset=utf-8", lambda: self._metrics),
+            "/state.json": ("application/json", lambda: self._state),
+        }.get(request.path)
+        # A page of somebody else's, under a name that leads here, gets nothing.
+        host = request.headers.get("Host", "").rpartition(":")[0]
+        if host not in ("127.0.0.1", "localhost"):
+            request.send_error(403)
+        elif request.path == "/events":
+            self._stream(request)
+        elif content is None:
+            request.send_error(404)
+        else:
+            kind, make = content
+            body = make()
+            request.send_response(200)
+            request.send_header("Content-Type", kind)
+            request.send_header("Content-Length", str(len(body)))
+            request.end_headers()
+            request.wfile.write(body)
+
+    def _everything(self) -> bytes:
+        """The state with what a plot draws of the time before."""
+        with self._news:
+            return json.dumps({"history": list(self._history)} | json.loads(self._state)).encode()
+
+    def _stream(self, request: BaseHTTPRequestHandler) -> None:
+        """Events until the browser has gone."""
+        request.send_response(200)
+        request.send_header("Content-Type", "text/event-stream")
+        request.send_header("Cache-Control", "no-store")
+        request.end_headers()
+        said = self._everything()
+        while True:
+            try:
+                request.wfile.write(b"data: " + said + b"\n\n")
+                request.wfile.flush()
+            except OSError:
+                return
+            with self._news:
+                self._news.wait(5.0)
+                said = self._state
+
+
+class Datagrams:
+    """JSON over UDP, as PlotJuggler's UDP server takes it. Nobody has to listen."""
+
+    def __init__(self, host: str, port: int):
+        """Raises Unavailable for a host that is not known."""
+        try:
+            [(family, kind, *_, self._address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        except OSError as error:
+            raise Unavailable(f"--udp {host}:{port}: {error.strerror}") from None
+        self._socket = socket.socket(family, kind)
+        self._socket.setblocking(False)
+
+    def show(self, listener: Listener, now_ns: int) -> None:
+        # The next one is due in a moment.
+        with contextlib.suppress(OSError):
+            self._socket.sendto(json.dumps(state(listener, now_ns)).encode(), self._address)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def hand_out(bus, receivers: list, stopped=lambda: False) -> None:
+    """Hear a bus for ``receivers``, until ``stopped()``."""
+    listener = Listener()
+    bus.drain()
+    while not stopped():
+        bus.wait(_HEAR_S)
+        # A frame wakes; a whole moment's are taken together.
+        time.sleep(_HEAR_S)
+        listener.hear(bus.drain())
+        now = time.monotonic_ns()
+        for receiver in receivers:
+            receiver.show(listener, now)

@@ -1,0 +1,151 @@
+"""The server's loop: broadcasts in, as the monitor hears them, requests in and responses out over ISO-TP (ISO 15765-2).
+
+It shares nothing with the daemon but the bus and files that it only reads; it may be killed at any moment.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon import __version__
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import calibration_hash, load_calibration
+from emb_daemon.errors import InputError
+from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.wire.contract import INIT, INVALID
+from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP
+from emb_daemon.workshop.trouble import Frame, TroubleMemory
+from emb_daemon.workshop.uds import FREEZE_FRAME, Server
+
+#: Data identifiers, the corner's number added: calibration's hash, learned values, the moment's estimate.
+SOFTWARE, CALIBRATION, LEARNED, ESTIMATE = 0xF189, 0x1000, 0x1010, FREEZE_FRAME
+#: What came meanwhile is taken together, or each frame would wake the process.
+_PAUSE_S = 0.02
+
+
+def frame_of(corner: Corner, time_s: int) -> Frame:
+    """What a corner's broadcasts say now."""
+    force, heat, status = (corner.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS))
+
+    def value(stream, column: int, scale: float = 1.0) -> float | None:
+        known = stream.values and stream.usable and math.isfinite(stream.values[column])
+        return scale * stream.values[column] if known else None
+
+    return Frame(
+        time_s=time_s,
+        mode=int(status.values[0]) if status.values else INIT,
+        source=int(force.values[3]) if force.values else INVALID,
+        force_N=value(force, 0, 1e3),
+        sigma_N=value(force, 1, 1e3),
+        temperatures_C=tuple(value(heat, column) for column in range(4)),
+        contact_angle_rad=value(status, 2),
+        stiffness_factor=value(status, 1),
+    )
+
+
+def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int, Callable[[], bytes]]:
+    """What each data identifier reads, from the files as they are when it is asked for.
+
+    Raises:
+        InputErrors: the configuration is faulty.
+    """
+    memory, corners_of = Memory(state), Setup(configuration).configuration.corners
+
+    def calibration(name: str) -> bytes:
+        # As it is now: the daemon reads it again on reload, and refuses it if it is faulty.
+        try:
+            return calibration_hash(load_calibration(configuration.parent / corners_of[name].calibration)).encode()
+        except InputError:
+            return b"faulty file"
+
+    def learned(name: str) -> bytes:
+        try:
+            store = memory.read(name)
+        except (ValueError, OSError):
+            return b"damaged file"
+        current = store.current if store else None
+        return json.dumps({"date": current.date, "values": current.values} if current else {}).encode()
+
+    found: dict[int, Callable[[], bytes]] = {SOFTWARE: lambda: __version__.encode()}
+    for name in corners_of:
+        row = CORNERS.index(name)
+        found[CALIBRATION + row] = lambda name=name: calibration(name)
+        found[LEARNED + row] = lambda name=name: learned(name)
+        found[ESTIMATE + row] = lambda row=row: frame_of(corners[row], round(time.time())).encode()
+    return found
+
+
+class Diagnostics:
+    """A bus on which a tester is answered.
+
+    Args:
+        bus: that receives the broadcasts and ``request_id`` (`ids`).
+        configuration: the daemon's.
+        state: the daemon's state directory, where the trouble codes are kept too.
+        request_id, response_id: 11-bit CAN ids.
+
+    Attributes:
+        trouble: why the trouble codes could not be kept the last time; empty if they always could.
+    """
+
+    def __init__(self, bus, configuration: Path, state: Path, request_id: int, response_id: int):
+        """Raises InputErrors for a faulty configuration, OSError for a folder that cannot be written, ImportError without
+        can-isotp."""
+        import isotp
+
+        self._bus, self._request_id = bus, request_id
+        self.trouble = ""
+        self.listener, self.memory = Listener(), TroubleMemory(state)
+        self._judged = [0] * len(CORNERS)
+        self._server = Server(self.memory, data_of(configuration, state, self.listener.corners))
+        self._requests: list = []
+        self._message = isotp.CanMessage
+        address = isotp.Address(isotp.AddressingMode.Normal_11bits, rxid=request_id, txid=response_id)
+        self._transport = isotp.TransportLayerLogic(
+            rxfn=lambda timeout: self._requests.pop(0) if self._requests else None,
+            txfn=self._send,
+            address=address,
+            # Frames of eight bytes, whatever is in them: the bus writes no others.
+            params={"tx_padding": 0xCC, "blocking_send": False},
+        )
+
+    def _send(self, message) -> None:
+        frame = np.zeros(1, FRAME)
+        frame["can_id"], frame["length"] = message.arbitration_id, 8
+        frame["data"] = int.from_bytes(bytes(message.data), "little")
+        self._bus.send(frame)
+
+    def step(self) -> None:
+        """Take the frames of a moment, and send what is due."""
+        time.sleep(_PAUSE_S)
+        frames = self._bus.drain()
+        # The newest of each message is enough, and five times less work.
+        _, newest = np.unique(frames["can_id"][::-1], return_index=True)
+        self.listener.hear(frames[::-1][newest])
+        for frame in frames[frames["can_id"] == self._request_id]:
+            if not frame["flags"] & (EXTENDED | REMOTE | FD):
+                data = int(frame["data"]).to_bytes(8, "little")[: frame["length"]]
+                self._requests.append(self._message(arbitration_id=self._request_id, data=data))
+        now = time.monotonic()
+        for row, corner in enumerate(self.listener.corners):
+            status = corner.streams[ESTIMATOR_STATUS]
+            if status.received != self._judged[row]:
+                self._judged[row] = status.received
+                mode, reasons = int(status.values[0]), int(status.values[3])
+                try:
+                    self.memory.judge(row, mode, reasons, frame_of(corner, round(time.time())), now)
+                except OSError as error:
+                    # What cannot be kept can still be told; the next judgement tries again.
+                    self.trouble = f"{self.memory.path}: {error.strerror}"
+        # Once for each frame: a request may be whole, its answer's first frame due, and a flow control waiting.
+        for _ in range(2 + len(self._requests)):
+            self._transport.process()
+            while self._transport.available():
+                if response := self._server.answer(bytes(self._transport.recv()), now):
+                    self._transport.send(response)

@@ -1,0 +1,140 @@
+"""Makes the Debian package: the daemon in an environment of its own under /opt/emb_daemon, its kernels compiled ahead.
+
+    make deb                        for this machine, in dist
+    make deb DEB_MACHINE=aarch64    for another
+
+Needs dpkg-deb, a linker for the machine (`emb-daemon compile` says which), and the wheel in dist. The package runs with the
+Python of the Debian release that it was made on: compiled wheels are for one version of it.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+from emb_daemon.ahead.library import read_manifest, source_digest
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Architecture, and pip's names of the oldest libc that wheels are taken for: Debian 11 has 2.31.
+MACHINES = {
+    "x86_64": ("amd64", ("manylinux_2_28_x86_64", "manylinux2014_x86_64")),
+    "aarch64": ("arm64", ("manylinux_2_28_aarch64", "manylinux2014_aarch64")),
+}
+_HOME = "opt/emb_daemon"
+#: Files of the project, or folders of them, and where they go; what is in /etc is the administrator's (conffiles).
+_FILES = {
+    "config/emb.yaml": "etc/emb_daemon",
+    "config/calibration.yaml": "etc/emb_daemon",
+    "systemd/emb-daemon.service": "usr/lib/systemd/system",
+    "systemd/emb-daemon.service.d/ahead.conf": "usr/lib/systemd/system/emb-daemon.service.d",
+    "systemd/emb-daemon-uds.service": "usr/lib/systemd/system",
+    "systemd/60-emb-daemon.conf": "usr/lib/sysctl.d",
+    "systemd/80-can0.network": "usr/share/doc/emb-daemon/examples",
+    "systemd/80-can0.link": "usr/share/doc/emb-daemon/examples",
+}
+
+
+def system_python() -> str:
+    """Debian's Python, as 3.11."""
+    code = "import sys; print('%d.%d' % sys.version_info[:2])"
+    return subprocess.run(["/usr/bin/python3", "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def fetch_packages(site: Path, machine: str, python: str) -> None:
+    """What the daemon depends on, as wheels with the lock's hashes."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--require-hashes",
+               "--no-deps", "--no-compile", "--only-binary=:all:", "--implementation=cp", f"--python-version={python}",
+               f"--abi=cp{python.replace('.', '')}", "--abi=abi3", "--abi=none", f"--target={site}",
+               *(f"--platform={name}" for name in MACHINES[machine][1]), "-r", ROOT / "requirements-ahead.lock"]  # fmt: skip
+    subprocess.run(command, check=True)
+    # Scripts of theirs that nobody calls, for the Python that fetched them.
+    shutil.rmtree(site / "bin", ignore_errors=True)
+
+
+def lay_out(root: Path, wheel: Path, kernels: Path, python: str) -> None:
+    """Everything but what the daemon depends on, below ``root``."""
+    home, site = root / _HOME, site_of(root, python)
+    site.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    (home / "bin").mkdir()
+    (home / "bin/python").symlink_to(f"/usr/bin/python{python}")
+    (home / "pyvenv.cfg").write_text(f"home = /usr/bin\ninclude-system-site-packages = false\nversion = {python}\n")
+    script = home / "bin/emb-daemon"
+    script.write_text(f"#!/{_HOME}/bin/python -s\nimport sys\n\nfrom emb_daemon.cli.main import main\n\nsys.exit(main())\n")
+    script.chmod(0o755)
+    for name, folder in {**_FILES, kernels: f"{_HOME}/lib/emb_daemon", ROOT / "LICENSE": "usr/share/doc/emb-daemon"}.items():
+        (root / folder).mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, root / folder)
+    (root / "usr/share/doc/emb-daemon/LICENSE").rename(root / "usr/share/doc/emb-daemon/copyright")
+    completion = root / "usr/share/bash-completion/completions/emb-daemon"
+    completion.parent.mkdir(parents=True)
+    shutil.copy(ROOT / "completion/emb-daemon.bash", completion)
+    (root / "usr/bin").mkdir()
+    (root / "usr/bin/emb-daemon").symlink_to(f"/{_HOME}/bin/emb-daemon")
+
+
+def site_of(root: Path, python: str) -> Path:
+    """Where packages are."""
+    return root / _HOME / "lib" / f"python{python}" / "site-packages"
+
+
+def compile_bytecode(root: Path) -> None:
+    """The service cannot write what Python would keep; it is for files as they are, whatever their times."""
+    command = ["/usr/bin/python3", "-m", "compileall", "-q", "-s", root, "-p", "/", "--invalidation-mode", "unchecked-hash",
+               root / _HOME / "lib"]  # fmt: skip
+    subprocess.run(command, check=True)
+
+
+def pack(root: Path, version: str, architecture: str, python: str, folder: Path) -> Path:
+    """The package of all that is below ``root``; its path in ``folder``."""
+    debian = root / "DEBIAN"
+    debian.mkdir()
+    major, minor = python.split(".")
+    size = sum(path.lstat().st_size for path in root.rglob("*") if path.is_file() and not path.is_symlink()) // 1024
+    values = {
+        "version": version,
+        "architecture": architecture,
+        "size": size,
+        "python": f"python{python}, python3 (>= {python}~), python3 (<< {major}.{int(minor) + 1}~)",
+    }
+    (debian / "control").write_text((ROOT / "packaging/debian/control").read_text().format(**values))
+    (debian / "conffiles").write_text(
+        "".join(f"/etc/emb_daemon/{path.name}\n" for path in sorted((root / "etc/emb_daemon").iterdir()))
+    )
+    for name in ("postinst", "prerm", "postrm"):
+        shutil.copy(ROOT / "packaging/debian" / name, debian)
+        (debian / name).chmod(0o755)
+    # Nobody else may write what the daemon executes; the umask of who makes it does not count.
+    for path in root.rglob("*"):
+        if not path.is_symlink():
+            path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
+    root.chmod(0o755)
+    package = folder / f"emb-daemon_{version}_{architecture}.deb"
+    subprocess.run(["dpkg-deb", "--root-owner-group", "-Zxz", "--build", root, package], check=True, stdout=subprocess.DEVNULL)
+    return package
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The Debian package, in dist.")
+    parser.add_argument("wheel", type=Path, help="of the project")
+    parser.add_argument("--machine", choices=MACHINES, default="x86_64")
+    arguments = parser.parse_args()
+    python, version = system_python(), arguments.wheel.name.split("-")[1]
+    with tempfile.TemporaryDirectory() as name:
+        root, kernels = Path(name, "root"), Path(name, "kernels.so")
+        compile_ = [sys.executable, "-m", "emb_daemon.cli.main", "compile", "--target", arguments.machine, "--output", kernels]
+        subprocess.run(compile_, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
+        fetch_packages(site_of(root, python), arguments.machine, python)
+        lay_out(root, arguments.wheel, kernels, python)
+        if read_manifest(kernels).sources != source_digest(site_of(root, python) / "emb_daemon"):
+            sys.exit(f"{arguments.wheel}: of other sources than {ROOT}; make wheel")
+        compile_bytecode(root)
+        print(pack(root, version, MACHINES[arguments.machine][0], python, arguments.wheel.parent))
+
+
+if __name__ == "__main__":
+    main()
