@@ -4,10 +4,10 @@
     emb-daemon diagnose normal/*.log --calibration normal/calibration.yaml --output normal/found
 
 C. Ruiz-Cárcel, A. Starr, Data-Based Detection and Diagnosis of Faults in Linear Actuators, IEEE Transactions on
-Instrumentation and Measurement 67(9), 2018, doi 10.1109/TIM.2018.2814067; as tables at github.com/BlueAsuka/Rocket-RAG, commit
-2942a7e, folder data/raw (no licence stated; not copied here). A ball screw of 5 mm lead moves to and fro against a constant load
-of -40, 20 or 40 kgf, ten runs of five strokes each way; another actuator makes the load. It is a brake's motor and gear with a
-clamp force that does not depend on the angle: there are no pads, and the clearance never closes.
+Instrumentation and Measurement 67(9), 2018, doi 10.1109/TIM.2018.2814067; as tables at github.com/BlueAsuka/Rocket-RAG,
+commit 2942a7e, folder data/raw (no licence stated; not copied here). A ball screw of 5 mm lead moves to and fro against a
+constant load of -40, 20 or 40 kgf, ten runs of five strokes each way; another actuator makes the load. It is a brake's motor
+and gear with a clamp force that does not depend on the angle: there are no pads, and the clearance never closes.
 
 What the set says, and how it becomes the torque path's:
 
@@ -18,8 +18,8 @@ What the set says, and how it becomes the torque path's:
     second of a stroke it charges and catches up: not measured.
     load: reference force, N; where it shall not be known it is left out (--without-load).
 
-All is sampled at 25 Hz. The nut moves at 24 mm/s, steadily, so that the way between two samples is known: both are drawn straight
-to the wire's 250 Hz.
+All is sampled at 25 Hz. The nut moves at 24 mm/s, steadily, so that the way between two samples is known: both are drawn
+straight to the wire's 250 Hz.
 """
 
 import argparse

@@ -37,12 +37,12 @@ NOMINAL_INERTIA, NOMINAL_COULOMB = 1e-4, 0.02
 #: Clearance that no motion closes, rad.
 NEVER = 1e4
 
-#: The drive's own speed is left out: beside angles with the stamps of a busy computer it would be another motion.
 MAPPING = """# Columns of the EMBiR dynamometer.
 format: 1
 time: {{signal: "time [s]", unit: s}}
 signals:
   EMB_FL_Resolver.MotorAngle: {{signal: "a1 position [rad]", unit: rad}}
+  EMB_FL_Resolver.MotorSpeed: {{signal: "a1 velocity [rad/s]", unit: rad/s}}
   EMB_FL_Current.CurrentQ: {{signal: "a1 q-axis [A]", unit: A, mean_ms: 0}}
   VEH_WheelSpeed.WheelSpeedFL: {{value: 0}}
   RIG_FL_Force.ClampForceRef: {{signal: "{sensor}", unit: N, scale: {newton_per_Nm:g}}}

@@ -161,7 +161,9 @@ class Bench:
         elif self.has_current and self.clamps:
             channels = ["innovation"]
         else:
-            both = "neither a clamp force reference nor motor current" if self.clamps else "no motor current or no load reference"
+            both = (
+                "neither a clamp force reference nor motor current" if self.clamps else "no motor current or no load reference"
+            )
             raise InputError(f"{self.trials[0].log.path}: {both} to judge by")
         if any(np.isfinite(trial.temperature_C).any() for trial in self.trials):
             channels.append("temperature")

@@ -1,6 +1,7 @@
 """Torque constant falling with the current of the moment: iron that saturates carries less of the flux that makes torque.
 
-Flux linkage is odd in the current, so that its first departure from proportion is cubic and the torque constant's is quadratic.
+Flux linkage is odd in the current, so that its first departure from proportion is cubic and the torque constant's is
+quadratic.
 """
 
 from emb_daemon.effects.base import Effect, Parameter

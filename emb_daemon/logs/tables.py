@@ -90,7 +90,9 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     import pyarrow.csv
 
     content = _as_utf8(content)
-    lines = [line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]]
+    lines = [
+        line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
+    ]
     # The header has most of the names; before it stands what the tool has to say.
     header, delimiter = max(
         ((row, mark) for row in range(min(len(lines), _PREAMBLE)) for mark in _DELIMITERS),
