@@ -32,6 +32,8 @@ _FIT, _JUDGE = range(1, 6), range(6, 11)
 #: Scatter of the normal runs 1 to 5, in standard deviations, beyond which friction has changed: with five runs one in two
 #: hundred leaves it by chance (Student, four degrees of freedom).
 _CHANGED = 5.6
+#: Share of friction below which a change is none: grease that is two or three kelvin warmer does as much.
+_MATTERS = 0.05
 #: A run of steps of the current against a damping load, and runs of other days.
 EMBIR = "27_04_2021_16-28-22"
 EMBIR_SLOW = "23_04_2021_16-51-18"
@@ -80,7 +82,7 @@ def cranfield(folder: Path) -> list[str]:
     fit = [(load, *found["normal", load, run]) for load in loads for run in _FIT]
     wanted = np.array([load for load, *_ in fit], float)
     pair = _line(np.array([[force, 1.0] for _, force, *_ in fit]), wanted)
-    strokes = [_line(np.array([[c[way], 1.0] for *_, c in fit]), wanted) for way in range(2)]
+    strokes = [_line(np.array([_plain(c[way]) for *_, c in fit]), wanted) for way in range(2)]
     normal = {load: np.array([found["normal", load, run][1] for run in _FIT]) for load in loads}
     lines = ["| state | stroke alone, kgf | pairs of passes, kgf | friction changed, runs |", "|---|---|---|---|"]
     for state in STATES:
@@ -90,13 +92,20 @@ def cranfield(folder: Path) -> list[str]:
             for load in loads:
                 force, friction, currents = found[state, load, run]
                 errors.append(pair @ [force, 1.0] - load)
-                plain += [strokes[way] @ [currents[way], 1.0] - load for way in range(2)]
-                beyond.append((friction - normal[load].mean()) / normal[load].std(ddof=1))
+                plain += [strokes[way] @ _plain(currents[way]) - load for way in range(2)]
+                change = friction - normal[load].mean()
+                certain = abs(change) > _CHANGED * normal[load].std(ddof=1)
+                beyond.append(change / normal[load].mean() if certain else 0.0)
             changed.append(max(beyond, key=abs))
-        count = int(np.sum(np.abs(changed) > _CHANGED))
+        count = int(np.sum(np.abs(changed) > _MATTERS))
         way = "" if not count else " up" if np.mean(changed) > 0.0 else " down"
         lines.append(f"| {state} | {_rms(plain):.1f} | {_rms(errors):.1f} | {count}/{len(changed)}{way} |")
     return lines
+
+
+def _plain(current: float) -> list[float]:
+    """Regressors of the load on the mean current of a stroke: what three loads can fit."""
+    return [current, current * current, 1.0]
 
 
 def _rms(values) -> float:
