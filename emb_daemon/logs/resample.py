@@ -33,6 +33,8 @@ _PAUSE = 10
 #: be sampled apart, from which the estimator takes it for a resolver that lost its zero. That happens once, not again and
 #: again: share of the steps.
 _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
+#: Least step of the wire's MotorSpeed.
+_STEP_RAD_PER_S = 0.02
 #: Signals of an E2E protected message that its protection fills.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
@@ -337,7 +339,17 @@ def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.nda
         return source
     if name.startswith("Current"):
         return source.mean(times)
-    return source.smoothed(times) if name == "MotorSpeed" and source.is_slow else source.sampled(times)
+    if name == "MotorSpeed":
+        return unrepeated(source.smoothed(times) if source.is_slow else source.sampled(times), np.arange(len(times)))
+    return source.sampled(times)
+
+
+def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray | float:
+    """Speeds in which that of a motor that stands goes to and fro by the wire's least step.
+
+    A resolver's speed has noise, and one that repeats itself to the bit hangs. An encoder at rest repeats itself for minutes,
+    as does a speed that is the change of an angle."""
+    return np.where(np.abs(speed) < _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 
 def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:
