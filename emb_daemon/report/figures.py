@@ -13,8 +13,8 @@ GRID = "#e6e9ee"
 
 #: Points that a trace may have on the page; more cannot be told apart on a screen.
 SCREEN_POINTS = 3000
-#: Samples of a figure's traces that the page holds beside them, to be shown where one zooms: five bytes each.
-DETAIL_SAMPLES = 4_000_000
+#: Samples of a figure's traces that the page holds beside them, to be shown where one zooms: six megabytes.
+DETAIL_SAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,8 @@ function rowsOf(values, first, last, points) {
   }
   return rows;
 }
-function showDetail(place) {
+// Every sample of the traces of a plot that were thinned out.
+function detailOf(place) {
   var times = {}, kept = [];
   Object.entries(place.layout.meta || {}).forEach(function (entry) { times[entry[0]] = floats(entry[1], Float64Array); });
   place.data.forEach(function (trace, number) {
@@ -88,9 +89,14 @@ function showDetail(place) {
       kept.push({number: number, times: times[trace.meta.times], values: floats(trace.meta.values, Float32Array)});
     }
   });
-  if (!kept.length) return;
+  return kept;
+}
+function showDetail(place) {
+  var kept = null;
   place.on("plotly_relayout", function (change) {
     if (!Object.keys(change).some(function (key) { return key.startsWith("xaxis"); })) return;
+    kept = kept || detailOf(place);
+    if (!kept.length) return;
     var range = place._fullLayout.xaxis.range, whole = change["xaxis.autorange"] === true, x = [], y = [];
     kept.forEach(function (trace) {
       var first = whole ? 0 : Math.max(0, rowAt(trace.times, range[0]) - 1);
