@@ -13,8 +13,8 @@ _emb_daemon() {
     esac
     case ${COMP_WORDS[1]} in
         demo) options="--corners --seconds --picture" ;;
-        run) options="--config -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        check) options="--config" ;;
+        run) options="--config --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        check) options="--config --mapping" ;;
         replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --keys --output --report --json" ;;
         convert) options="--mapping --output" ;;
         identify) options="--mapping --output --report --example" ;;
@@ -27,7 +27,7 @@ _emb_daemon() {
         export) options="--calibration --output --kernels" ;;
         uds) options="--config --state --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         bench) options="--seconds --corners --json" ;;
-        adaptation) options="--state --corner" ;;
+        adaptation) options="--state --corner --yes" ;;
     esac
     if [[ $word == -* ]]; then
         mapfile -t COMPREPLY < <(compgen -W "$options --help" -- "$word")

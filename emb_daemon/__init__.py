@@ -1,6 +1,6 @@
 """Virtual clamp force sensor for electro-mechanical brakes.
 
-For Python programs: `load_log`, `log_of_arrays`, `run`, `Estimator`, `Mapping`, `load_calibration` and more; see
+For Python programs: `load_log`, `log_of_arrays`, `run`, `table`, `Estimator`, `Mapping`, `load_calibration` and more; see
 `emb_daemon.api`.
 """
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         log_of_arrays,
         run,
         shipped_calibration,
+        table,
     )
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "log_of_arrays",
     "run",
     "shipped_calibration",
+    "table",
 ]
 
 

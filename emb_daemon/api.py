@@ -20,6 +20,7 @@ from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping as Mapping
 from emb_daemon.logs.resample import Series, fill_missing, frames_of
+from emb_daemon.logs.write import reference_columns, table_columns
 from emb_daemon.offline import Log, corner_index, estimate, log_of
 from emb_daemon.offline import load_log as load_log
 from emb_daemon.resources import resource
@@ -68,6 +69,22 @@ def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.nda
         InputErrors: the calibration file is faulty.
     """
     return estimate(log.samples, to_parameters(_calibration(calibration)))
+
+
+def table(log: Log, estimates: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns by name, with units in the names: what `replay` writes, and what the log's reference instruments measured.
+
+    ``pandas.DataFrame(table(...))``, ``polars.DataFrame(table(...))`` and ``pyarrow.table(table(...))`` take it as it is.
+
+    Args:
+        estimates: of `run`, shape (samples,).
+
+    Raises:
+        InputError: the estimates are of another log.
+    """
+    if len(estimates) != len(log.samples):
+        raise InputError(f"estimates: expected {len(log.samples)}, one for each sample of {log.path}, found {len(estimates)}")
+    return table_columns(estimates, log.time_s) | reference_columns(log.reference, log.time_ns, log.force_N)
 
 
 #: Arguments of `log_of_arrays`: message and signal of ours.

@@ -729,9 +729,12 @@ def test_people_can_look_and_reset(learned, capsys):
     assert main(["adaptation", "history", "--state", str(folder)]) == 0
     assert "accepted" in capsys.readouterr().out
     assert main(["adaptation", "reset", "--corner", "FR", "--state", str(folder)]) == 0
-    assert (folder / "adaptation-FL.json").exists()
-    assert main(["adaptation", "reset", "--state", str(folder)]) == 0
+    assert main(["adaptation", "reset", "--state", str(folder)]) == 2, "nobody is there to be asked"
+    assert "--yes" in capsys.readouterr().err
+    learned_bytes = (folder / "adaptation-FL.json").read_bytes()
+    assert main(["adaptation", "reset", "--yes", "--state", str(folder)]) == 0
     assert not (folder / "adaptation-FL.json").exists()
+    assert (folder / "adaptation-FL.forgotten").read_bytes() == learned_bytes
     assert main(["adaptation", "show", "--state", str(folder)]) == 0
     assert "nothing learned" in capsys.readouterr().out
     assert main(["adaptation", "show", "--state", str(folder / "nowhere")]) == 2

@@ -127,6 +127,61 @@ def test_a_table_may_have_decimal_commas(tmp_path):
     assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
 
 
+def _table(count: int, row: str = "{t:.3f},{a:.1f},25.0,1.5,22,0") -> str:
+    return "".join(row.format(t=0.004 * n, a=0.1 * n) + "\n" for n in range(count))
+
+
+_HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("# a tool\n# with, more, commas, than, the, table, has\n" + _HEADER + "\n" + _table(100), ""),
+        ("Measured on Monday\n\n" + _HEADER + "\n" + "s,rad,rad/s,A,degC,N\n" + _table(100), ""),
+        (_HEADER + ",\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
+        (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
+        ("\ufeff" + _HEADER.replace(",", "\t") + "\r\n" + _table(100).replace(",", "\t").replace("\n", "\r\n"), ""),
+        (_HEADER + "\n" + _table(100) + "0.400,10.0,25", "1 rows with another number of cells than 6 left out"),
+    ],
+    ids=["comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off"],
+)  # fmt: skip
+def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    (tmp_path / "a.csv").write_text(content, encoding="utf-8", newline="")
+    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+    told = capsys.readouterr().err
+    assert said in told and ("left out" in told) == bool(said)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16"])
+def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time_s", "Uhrzeit").replace("plate_C", '"Temperatur [°C]"'))
+    head = _HEADER.replace("time_s", "Uhrzeit").replace("plate_C", "Temperatur [°C]")
+    content = (
+        head + "\n" + "".join(f"2026-11-22 08:15:{10 + 0.004 * n:06.3f},{0.1 * n:.1f},25.0,1.5,22,0\n" for n in range(100))
+    )
+    (tmp_path / "a.csv").write_bytes(content.encode(encoding))
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
+    assert log.samples["inner_backplate"][50] == 22.0
+
+
+def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, capsys):
+    """The stamps of a busy computer, beside which a drive's own speed would lose the angle's zero again and again."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    time_s = 0.004 * np.arange(2000)
+    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": 0.0 * time_s}
+    columns |= {"plate_C": 22.0 + 0.0 * time_s, "force_N": 0.0 * time_s}
+    true = 90.0 * np.sin(3.0 * time_s)
+    for speed, share in ((true, 0.0), (-true, 0.9)):
+        table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"speed_rad_per_s": speed})
+        samples = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).samples
+        assert np.abs(samples["speed"][1:-1] - true[1:-1]).max() < 0.2
+        assert ("another motion" in capsys.readouterr().err) == (share > 0.0)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
@@ -221,6 +276,11 @@ def test_arrays_are_a_log(truth):
     estimates = emb_daemon.run(log, foreignkit.calibration())
     error = (estimates["force"] - log.force_N)[1:]
     assert np.sqrt(np.nanmean(error**2)) < 40.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.93
+    columns_of_replay = emb_daemon.table(log, estimates)
+    assert {len(column) for column in columns_of_replay.values()} == {len(log.samples)}
+    assert np.array_equal(columns_of_replay["clamp_force_N"], estimates["force"]) and "clamp_force_ref_N" in columns_of_replay
+    with pytest.raises(InputError, match="one for each sample of"):
+        emb_daemon.table(log, estimates[1:])
     without = emb_daemon.log_of_arrays(time_s, columns["angle_rad"])
     assert not without.samples["has_current"].any() and np.isnan(without.force_N).all()
     for wrong, expected in (

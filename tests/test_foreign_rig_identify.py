@@ -28,20 +28,20 @@ def _in_contact() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("motions", "said", "most_N"),
+    ("motions", "said", "most_N", "status"),
     [
-        ({"curve": foreignkit.slow, "random": foreignkit.random}, "thermal: no log heats the pads", 30.0),
-        ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0),
-        ({"curve": foreignkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0),
-        ({"curve": _clamp_only}, "random: no usable log", 500.0),
-        ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0),
+        ({"curve": foreignkit.slow, "random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
+        ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
+        ({"curve": foreignkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0, 3),
+        ({"curve": _clamp_only}, "random: no usable log", 500.0, 3),
+        ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0, 3),
     ],
     ids=["both", "random alone", "one slow curve", "apply alone", "no clearance"],
 )
-def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N):
+def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N, status):
     campaign = foreignkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})
     mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 0
+    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == status
     assert said in capsys.readouterr().err
     found = load_calibration(output)
     for name, angle in (("stops", None), ("random_2", foreignkit.random(seed=2))):
@@ -51,6 +51,31 @@ def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said,
         error = (estimates["force"] - log.force_N)[1:]
         inside = np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:])
         assert np.sqrt(np.mean(error**2)) < most_N and inside > 0.9, name
+
+
+def test_angle_and_force_alone_give_the_curve(tmp_path, capsys):
+    campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow())
+    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
+    lines = mapping.read_text().splitlines(keepends=True)
+    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
+    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 3
+    assert "torque: no log holds motor current" in capsys.readouterr().err
+    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(foreignkit.truth(), 500.0))
+    log = emb_daemon.load_log(table, read=Mapping(mapping).read)
+    estimates = emb_daemon.run(log, load_calibration(output))
+    error = (estimates["force"] - log.force_N)[100:]
+    # Without a random log the relaxation is the usual one; sigma holds it.
+    assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][100:]) > 0.9
+
+
+def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):
+    campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(seconds=8.0))
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=8.0)), 500.0)
+    turned = {"angle_rad": -columns["angle_rad"], "speed_rad_per_s": -columns["speed_rad_per_s"]}
+    foreignkit.write_table(tmp_path / "curve.parquet", columns | turned)
+    mapping = str(tmp_path / "mapping.yaml")
+    assert main(["identify", str(campaign), "--mapping", mapping, "--output", str(tmp_path / "c.yaml")]) == 2
+    assert "turn the angle round (`scale: -1`" in capsys.readouterr().err
 
 
 def test_a_misspelt_log_is_an_error(tmp_path, capsys):

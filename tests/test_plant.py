@@ -34,6 +34,7 @@ VISIBLE = {
     "disc_thermal_expansion": {"growth_um_per_K": 0.3},
     "pad_wear": {"wear_um_per_MJ": 50.0},
     "torque_constant_fade": {"fade_per_K": 0.0012, "disc_share": 0.3},
+    "torque_saturation": {"loss_per_A2": 1e-4},
     "motor_heat_fade": {"fade_per_A2": 4e-5, "time_constant_s": 20.0},
     "current_offset": {"offset_A": 0.5},
     "viscous_friction": {"viscous_Nms_per_rad": 3e-4},

@@ -176,12 +176,16 @@ class Memory:
         files.write(self.path(store.corner), store)
 
     def reset(self, corner: str) -> bool:
-        """Forget a corner; False if there was nothing to forget."""
+        """Forget a corner, but for a copy beside it (`forgotten`); False if there was nothing to forget."""
         try:
-            self.path(corner).unlink()
+            self.path(corner).replace(self.forgotten(corner))
         except FileNotFoundError:
             return False
         return True
+
+    def forgotten(self, corner: str) -> Path:
+        """Where the last reset left what it forgot."""
+        return self.path(corner).with_suffix(".forgotten")
 
 
 def with_entry(store: Store, entry: Entry) -> Store:

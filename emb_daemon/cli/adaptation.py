@@ -1,6 +1,7 @@
 """emb-daemon adaptation."""
 
 import argparse
+import sys
 from pathlib import Path
 
 EXAMPLE = "emb-daemon adaptation show --state /var/lib/emb_daemon"
@@ -12,6 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--state", type=Path, metavar="DIR", help="state directory (default: $STATE_DIRECTORY or /var/lib/emb_daemon)"
     )
     parser.add_argument("--corner", help="FL, FR, RL or RR (default: all)")
+    parser.add_argument("--yes", action="store_true", help="reset without asking, for scripts")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -25,10 +27,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"{folder}: no such state directory; give it with --state")
     corners = CORNERS if arguments.corner is None else (CORNERS[corner_index(arguments.corner)],)
     memory, found = Memory(folder), False
+    if arguments.action == "reset" and not arguments.yes:
+        _ask([corner for corner in corners if memory.path(corner).exists()])
     for corner in corners:
         if arguments.action == "reset":
             if memory.reset(corner):
-                print(f"{corner}: forgotten; a running daemon keeps its values until it is restarted")
+                kept = memory.forgotten(corner)
+                print(f"{corner}: forgotten, a copy is in {kept}; a running daemon keeps its values until it is restarted")
                 found = True
             continue
         try:
@@ -47,6 +52,23 @@ def run(arguments: argparse.Namespace) -> int:
     if not found:
         print(f"{folder}: nothing learned")
     return 0
+
+
+def _ask(corners: list[str]) -> None:
+    """What years may have taught is not forgotten by a slip of the finger.
+
+    Raises:
+        InputError: nobody is there to answer, or the answer is no.
+    """
+    from emb_daemon.errors import InputError
+
+    if not corners:
+        return
+    if not sys.stdin.isatty():
+        raise InputError("adaptation reset: asks before it forgets, and input is no terminal; for scripts there is --yes")
+    answer = input(f"Forget what {', '.join(corners)} learned? [y/N] ")
+    if answer.strip().lower() not in ("y", "yes"):
+        raise InputError("adaptation reset: nothing was forgotten")
 
 
 def _show(entry) -> None:

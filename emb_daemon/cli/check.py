@@ -3,18 +3,37 @@
 import argparse
 from pathlib import Path
 
+from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+
 EXAMPLE = "emb-daemon check --config config/emb.yaml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    add_mapping_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.calibration.files import calibration_hash
+    from emb_daemon.errors import InputError, InputErrors
 
-    setup = Setup(arguments.config)
+    if not arguments.config and not arguments.mapping:
+        raise InputError("check: expected --config FILE, --mapping FILE or both")
+    faults, setup = [], None
+    for path, check in ((arguments.mapping, open_mapping), (arguments.config, Setup)):
+        try:
+            checked = check(path) if path else None
+        except InputError as error:
+            faults += error.faults
+        else:
+            setup = checked
+    if faults:
+        raise InputErrors(faults)
+    if arguments.mapping:
+        print(f"{arguments.mapping}: every signal can become ours")
+    if not arguments.config:
+        return 0
     for name, calibration in setup.calibrations.items():
         effects = ", ".join(calibration.effects) or "none"
         print(

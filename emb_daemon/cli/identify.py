@@ -7,6 +7,9 @@ from pathlib import Path
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
 from emb_daemon.cli.outputs import check_output
 
+#: Exit status of a calibration that is written although a log that it rests on is missing or could not serve. Thermocouples in
+#: the pads are another rig's, which many have not.
+INCOMPLETE = 3
 EXAMPLE = "emb-daemon identify campaign.yaml --output calibration.yaml --report report"
 
 
@@ -48,8 +51,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
     _print(result.judged, result.thermal.figures)
     print(words(result.attribution))
-    print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s")
-    return 0
+    missing = [fault for fault in campaign.faults if not fault.startswith("thermal")]
+    also = f", without what {len(missing)} lines above say (exit status {INCOMPLETE})" if missing else ""
+    print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s{also}")
+    return INCOMPLETE if missing else 0
 
 
 def _example(folder: Path) -> int:

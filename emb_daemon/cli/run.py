@@ -13,6 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from emb_daemon.cli.busoptions import add_bus_arguments
 
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
     add_bus_arguments(parser)
 
 
@@ -45,7 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
     if state:
         # Two daemons would write what they learned over each other's.
         hold(state)
-    bus, keyless = open_bus(**bus_options(arguments, configuration.bus), ids=ids), ()
+    options = bus_options(arguments, configuration.bus)
+    if arguments.mapping:
+        from emb_daemon.cli.logoptions import open_mapping
+        from emb_daemon.logs.live import open_mapped
+
+        bus = open_mapped(options, open_mapping(arguments.mapping))
+    else:
+        bus = open_bus(**options, ids=ids)
+    keyless = ()
     if setup.keys is not None:
         from emb_daemon.runtime.secured import secure
 

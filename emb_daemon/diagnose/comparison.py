@@ -4,35 +4,40 @@ import numpy as np
 
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.residuals import Bench, Trial
-from emb_daemon.offline.run import estimate
+from emb_daemon.offline.run import estimate, held, run_step
 from emb_daemon.offline.score import PATHS, EpisodeErrors, conditions, first_known, is_turning
 
 _RESAMPLES = 1000
 
 
-def errors_of(bench: Bench, trial: Trial, estimates: np.ndarray) -> EpisodeErrors:
-    """Errors in N of one log's estimates: against its reference force, as `replay` counts them, or without one the difference
-    of both paths."""
-    log = trial.log
+def errors_of(bench: Bench, trial: Trial, calibration: Calibration) -> EpisodeErrors:
+    """Errors in N of the running estimator over one log: against its reference force, as `replay` counts them, or without one
+    the difference of both paths. Where nothing is clamped the load has either sign, and is the torque path's alone."""
+    log, parameters = trial.log, to_parameters(calibration)
+    turning = is_turning(log.samples)
+    if not bench.clamps:
+        errors = {"torque": bench.compared(trial, run_step(log.samples, held(parameters)))["torque"]}
+        return EpisodeErrors.of(errors, {"rotating": turning, "standing": ~turning}, trial.episode)
+    estimates = estimate(log.samples, parameters)
     if bench.has_reference:
         errors = {path: estimates[column] - log.force_N for path, column in PATHS.items()}
         errors["fused"][: first_known(estimates)] = np.nan
         return EpisodeErrors.of(errors, conditions(log.samples, estimates, log.force_N), trial.episode)
-    turning = is_turning(log.samples)
     errors = {"innovation": estimates["torque_force"] - estimates["stiffness_force"]}
     return EpisodeErrors.of(errors, {"rotating": turning, "standing": ~turning}, trial.episode)
 
 
 def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
     """Errors of the running estimator over all logs of a bench, each from a fresh start."""
-    found = [(trial, estimate(trial.log.samples, to_parameters(bench.on(trial, calibration)))) for trial in bench.trials]
-    return EpisodeErrors.joined([errors_of(bench, trial, estimates) for trial, estimates in found])
+    return EpisodeErrors.joined([errors_of(bench, trial, bench.on(trial, calibration)) for trial in bench.trials])
 
 
 def whole(bench: Bench) -> str:
     """The path that judges: what all others serve, or the only one there is."""
     if not bench.has_reference:
         return "innovation"
+    if not bench.clamps:
+        return "torque"
     return "fused" if bench.has_current else "stiffness"
 
 

@@ -10,14 +10,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.comparison import errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import UNITS, Bench
 from emb_daemon.diagnose.selection import Selection
-from emb_daemon.offline.run import estimate
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
@@ -59,8 +57,7 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
             values |= refitted(selection, channel, fold != number, without)
         # A log with pads of its own has its own contact, too.
         own = [bench.calibrated(values, trial.index if trial.mounted else None) for trial in bench.trials]
-        found = [estimate(trial.log.samples, to_parameters(c)) for trial, c in zip(bench.trials, own, strict=True)]
-        parts.append(EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, found, strict=True)]))
+        parts.append(EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, own, strict=True)]))
     result = parts[0]
     for number in range(1, _FOLDS):
         result.sums[:, :, fold == number] = parts[number].sums[:, :, fold == number]
@@ -125,7 +122,9 @@ def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
         return worst, f"withdrawn: on the validation logs it adds {-gains[worst]:.3g} {UNITS[channel]} RMS to what it explains"
     bench, main = selection.model.bench, whole(judges)
     before = errors(judges, bench.calibration)
-    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, set())
+    # Where nothing is clamped the path is all there is: no other hides what a recalibration does to it.
+    alone = set() if judges.clamps else {main}
+    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, alone)
     if not worse or not gains:
         return None
     rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in gains}

@@ -31,6 +31,9 @@ _SLIDING = 1.0
 _TOUCHING_N = 300.0
 #: Brake torque (N m) below which a sensor shows nothing but its noise.
 _BRAKING_NM = 20.0
+#: Clearance (rad) from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is
+#: some ten, and a screw of this many turns longer than a caliper.
+_NOTHING_TO_CLAMP_RAD = 1e3
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -135,6 +138,8 @@ class Bench:
 
         self.trials = list(self._pool.map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
+        #: Whether the motor can reach pads at all; else the load on the spindle is no function of its angle.
+        self.clamps = calibration.contact.clearance_rad < _NOTHING_TO_CLAMP_RAD
         self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
         self.channels = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
@@ -151,12 +156,15 @@ class Bench:
         }
 
     def _channels(self) -> list[str]:
-        if self.has_reference:
-            channels = ["stiffness", "torque"] if self.has_current else ["stiffness"]
-        elif self.has_current:
+        if self.has_reference and (self.clamps or self.has_current):
+            channels = ["stiffness"] * self.clamps + ["torque"] * self.has_current
+        elif self.has_current and self.clamps:
             channels = ["innovation"]
         else:
-            raise InputError(f"{self.trials[0].log.path}: neither a clamp force reference nor motor current to judge by")
+            both = (
+                "neither a clamp force reference nor motor current" if self.clamps else "no motor current or no load reference"
+            )
+            raise InputError(f"{self.trials[0].log.path}: {both} to judge by")
         if any(np.isfinite(trial.temperature_C).any() for trial in self.trials):
             channels.append("temperature")
         if any(np.nanmax(np.append(trial.brake_torque_Nm, 0.0)) > _BRAKING_NM for trial in self.trials):
@@ -201,12 +209,12 @@ class Bench:
         return {channel: np.concatenate([part[channel] for part in parts]) for channel in self.channels}
 
     def _residual(self, trial: Trial, values: Values) -> dict[str, np.ndarray]:
-        return self._compared(trial, run_step(trial.log.samples, self._parameters(trial, values)))
+        return self.compared(trial, run_step(trial.log.samples, self._parameters(trial, values)))
 
     def _parameters(self, trial: Trial, values: Values) -> np.void:
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
-    def _compared(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
+    def compared(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
         """Residuals of a run (TRACE rows)."""
         samples, force = trial.log.samples, trial.force_N
         judged = force if self.has_reference else trace["force"]
@@ -255,7 +263,7 @@ class Bench:
         for trial, known in zip(self.trials, heat or [None] * len(self.trials), strict=True):
             if channel in FORCE_CHANNELS and known is not None:
                 trace = run_held(trial.log.samples, self._parameters(trial, values), known)
-                parts.append(self._compared(trial, trace)[channel])
+                parts.append(self.compared(trial, trace)[channel])
             else:
                 parts.append(self._residual(trial, values)[channel])
         return np.concatenate(parts)

@@ -18,6 +18,7 @@ _NAMES = (
     "disc_thermal_expansion",
     "pad_wear",
     "torque_constant_fade",
+    "torque_saturation",
     "motor_heat_fade",
     "current_offset",
     "viscous_friction",

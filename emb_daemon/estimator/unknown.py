@@ -167,6 +167,9 @@ def add_rest(P, p, elapsed_s):
 def _draw_near(x, P, gain, state, distance, reach):
     """Take in that ``state`` is ``distance`` from what the calibration says and cannot be far from it."""
     s = P[state, state] + reach * reach
+    if s <= 0.0:
+        # A calibration without friction says that there is none to be off.
+        return
     innovation = -distance
     for i in range(len(x)):
         gain[i] = P[i, state] / s

@@ -26,6 +26,8 @@ _TOLERANCE = 0.15
 #: Turning points of the motor angle per second of motion that tell a slow clamp from random motion.
 SLOW, RANDOM = (0.0, 1.0), (1.0, 100.0)
 NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
+#: Correlation of force and angle from which a log is the wrong way round; a curve of either direction has 0.9 and more.
+_AGAINST = 0.5
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.
 _SPEED_TOLERANCE = 0.2
 
@@ -252,6 +254,13 @@ def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
     return float(force[known].max()), noise_N, reversals / moving if moving > 0.0 else 0.0
 
 
+def _runs_against(log: Log) -> bool:
+    """Whether the force falls where the motor angle rises, as a clamping brake's never does."""
+    known = np.isfinite(log.force_N)
+    angle, force = log.samples["angle"][known], log.force_N[known]
+    return bool(np.ptp(angle) > 0.0 and np.ptp(force) > 0.0 and np.corrcoef(angle, force)[0, 1] < -_AGAINST)
+
+
 @dataclass
 class Campaign:
     """A campaign with its logs; ``faults`` grows by one line for whatever could not serve or contradicts the datasheet."""
@@ -352,6 +361,8 @@ class Campaign:
             lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
         elif not np.isfinite(noise_N):
             lacking = "does not begin with the brake released"
+            if _runs_against(log):
+                lacking = "the force falls where the motor angle rises: turn the angle round (`scale: -1` of the mapping)"
         elif not reversals[0] <= reversals_per_s <= reversals[1]:
             lacking = (
                 f"motor turns round {reversals_per_s:.2f} times per second, "

@@ -86,7 +86,7 @@ class MappingFile(Struct, kw_only=True):
             raise ValueError("time: the frames of a CAN log have theirs; expected dbc or time")
 
 
-class _Source:
+class Source:
     """One foreign signal, and how it becomes ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a
     sampling period."""
 
@@ -104,6 +104,9 @@ class Mapping:
     """A mapping file, checked against both descriptions.
 
     Attributes:
+        database: the rig's (cantools), None of tables and measurements.
+        messages: sources by message and signal of ours, a number where it is a constant; a signal that another stands in for
+            is not among them.
         notes: a line for each signal that the rig does not measure and that others stand in for.
 
     Raises:
@@ -113,12 +116,11 @@ class Mapping:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
-        self._theirs = load_database(self.path.parent / self._file.dbc) if self._file.dbc else None
+        self.database = load_database(self.path.parent / self._file.dbc) if self._file.dbc else None
         self._ours = our_messages()
         self._faults: list[str] = []
         self.notes: list[str] = []
-        #: By message and signal of ours; a signal that another stands in for is not among them.
-        self._messages: dict[str, dict[str, _Source | float]] = {}
+        self.messages: dict[str, dict[str, Source | float]] = {}
         for name, mapped in self._file.signals.items():
             self._add(name, mapped)
         self._check_complete()
@@ -135,7 +137,7 @@ class Mapping:
         ours = {signal.name: signal for signal in self._ours[message_name][0].signals}.get(signal_name)
         if ours is None or signal_name in HEADER:
             return self._fault(name, f"{message_name} has no such signal to map")
-        signals = self._messages.setdefault(message_name, {})
+        signals = self.messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
             [layout] = signal_columns(self._ours[message_name][1], message_name, (signal_name,))
@@ -160,7 +162,7 @@ class Mapping:
             )
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
-        signals[signal_name] = _Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
+        signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
     def _their_unit(self, signal: str) -> str:
@@ -169,10 +171,10 @@ class Mapping:
         Raises:
             KeyError: the rig's DBC has no such signal.
         """
-        if self._theirs is None:
+        if self.database is None:
             return ""
         message, _, name = signal.rpartition(".")
-        return self._theirs.get_message_by_name(message).get_signal_by_name(name).unit or ""
+        return self.database.get_message_by_name(message).get_signal_by_name(name).unit or ""
 
     def _check_complete(self) -> None:
         """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
@@ -181,7 +183,7 @@ class Mapping:
             self._faults.append(
                 f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner"
             )
-        for name, signals in self._messages.items():
+        for name, signals in self.messages.items():
             substitutes = SUBSTITUTES.get(name.rpartition("_")[2], {})
             for signal in self._ours[name][0].signals:
                 optional = signal.name in (*_UNUSED, *HEADER) or name.startswith("RIG_")
@@ -198,11 +200,11 @@ class Mapping:
                 self._fault(name, "only constants: expected at least one signal of the rig")
         for corner in corners:
             for message, text in _LOST.items():
-                if (name := message.format(corner)) not in self._messages:
+                if (name := message.format(corner)) not in self.messages:
                     self.notes.append(f"{self.path}: {name} is not mapped: {text}")
 
-    def _sources(self, message: str) -> dict[str, _Source]:
-        return {key: source for key, source in self._messages.get(message, {}).items() if isinstance(source, _Source)}
+    def _sources(self, message: str) -> dict[str, Source]:
+        return {key: source for key, source in self.messages.get(message, {}).items() if isinstance(source, Source)}
 
     def read(self, path: str | Path) -> np.ndarray:
         """A foreign log as FRAME array of our messages, in time order; instead of `logs.read.read_frames`.
@@ -214,18 +216,18 @@ class Mapping:
 
     def read_with_digest(self, path: str | Path) -> tuple[np.ndarray, str]:
         """`read`, and the SHA-256 of the file as it was read."""
-        path, wanted = Path(path), {source.name for name in self._messages for source in self._sources(name).values()}
-        if self._theirs is None:
+        path, wanted = Path(path), {source.name for name in self.messages for source in self._sources(name).values()}
+        if self.database is None:
             raw, digest = read_table(path, sorted(wanted), self._file.time)
         else:
             recorded = read_log(path)
             raw, digest = self._decode(recorded, wanted), recorded.digest
         messages = {
             name: {
-                key: source.converted(*raw[source.name]) if isinstance(source, _Source) else source
+                key: source.converted(*raw[source.name]) if isinstance(source, Source) else source
                 for key, source in signals.items()
             }
-            for name, signals in self._messages.items()
+            for name, signals in self.messages.items()
         }
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
@@ -235,9 +237,9 @@ class Mapping:
     def _clocks(self) -> str:
         names = sorted({next(iter(self._sources(f"EMB_{corner}_Resolver").values())).name for corner in CORNERS
                         if self._sources(f"EMB_{corner}_Resolver")})  # fmt: skip
-        if self._theirs is None:
+        if self.database is None:
             return ", ".join(names)
-        messages = {name: self._theirs.get_message_by_name(name.rpartition(".")[0]) for name in names}
+        messages = {name: self.database.get_message_by_name(name.rpartition(".")[0]) for name in names}
         return ", ".join(f"{name} ({message.frame_id:#x})" for name, message in messages.items())
 
     def _decode(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -247,7 +249,7 @@ class Mapping:
         for signal in wanted:
             by_message.setdefault(signal.rpartition(".")[0], []).append(signal)
         for name, signals in by_message.items():
-            message = self._theirs.get_message_by_name(name)
+            message = self.database.get_message_by_name(name)
             flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
             mine = (frames["can_id"] == message.frame_id) & (flags == EXTENDED * message.is_extended_frame)
             rows = np.flatnonzero(mine)

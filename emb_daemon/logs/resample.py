@@ -4,6 +4,7 @@ What another rig measured becomes our messages, E2E protected, with counters tha
 stays the only way into the estimator.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +29,12 @@ _CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
 #: Periods from which a step of time is a pause.
 _PAUSE = 10
+#: Angle (rad) by which a step and the speed over it are apart, with the change of speed times a time (s) by which the two may
+#: be sampled apart, from which the estimator takes it for a resolver that lost its zero. That happens once, not again and
+#: again: share of the steps.
+_SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
+#: Least step of the wire's MotorSpeed.
+_STEP_RAD_PER_S = 0.02
 #: Signals of an E2E protected message that its protection fills.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
@@ -179,6 +186,13 @@ def fill_missing(name: str, signals: Signals) -> Signals:
     """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
+        if isinstance(angle, Series) and isinstance(speed, Series) and (apart := _apart(angle, speed)) > _MOST_APART:
+            print(
+                f"{name}: MotorSpeed is another motion than the change of MotorAngle in {100.0 * apart:.1f} % of the samples "
+                "(stamps of a busy computer, a wrong unit or sign?): left out, the change of the angle is taken",
+                file=sys.stderr,
+            )
+            speed = None
         angle = speed.integral() if angle is None else angle
         return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
     if name.endswith("_Thermocouple"):
@@ -186,6 +200,16 @@ def fill_missing(name: str, signals: Signals) -> Signals:
         caliper = signals.get("CaliperTemp", _mean(plates[0], plates[-1]))
         return {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": caliper}
     return signals
+
+
+def _apart(angle: Series, speed: Series) -> float:
+    """Share of the steps in which angle and speed tell of different motions."""
+    steps = np.diff(angle.time_ns)
+    near = (steps > 0) & (steps <= _CARRIED_PERIODS * angle.period_ns)
+    at = speed.sampled(angle.time_ns)
+    slip = np.diff(angle.values) - 0.5e-9 * (at[1:] + at[:-1]) * steps
+    beyond = np.abs(slip) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
+    return float(np.mean(beyond[near])) if near.any() and not angle.is_sparse else 0.0
 
 
 def _mean(first: Series | float, second: Series | float) -> Series | float:
@@ -315,7 +339,17 @@ def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.nda
         return source
     if name.startswith("Current"):
         return source.mean(times)
-    return source.smoothed(times) if name == "MotorSpeed" and source.is_slow else source.sampled(times)
+    if name == "MotorSpeed":
+        return unrepeated(source.smoothed(times) if source.is_slow else source.sampled(times), np.arange(len(times)))
+    return source.sampled(times)
+
+
+def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray | float:
+    """Speeds in which that of a motor that stands goes to and fro by the wire's least step.
+
+    A resolver's speed has noise, and one that repeats itself to the bit hangs. An encoder at rest repeats itself for minutes,
+    as does a speed that is the change of an angle."""
+    return np.where(np.abs(speed) < _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 
 def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:

@@ -132,6 +132,7 @@ def move_motor(p, s, demand):
     fade = e.torque_constant_fade
     warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
     factor = 1.0 - fade.fade_per_K * warm + _drawn(e.drawn_torque_constant, s, 2)
+    factor -= e.torque_saturation.loss_per_A2 * s.current * s.current
     if e.motor_heat_fade.fade_per_A2 != 0.0:
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat

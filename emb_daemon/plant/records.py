@@ -41,6 +41,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("fade_per_K", "1/K", "relative loss of torque constant as the magnets warm over 25 degC"),
         Field("disc_share", "1", "where the motor's surroundings lie between caliper and disc"),
     ),
+    "torque_saturation": (Field("loss_per_A2", "1/A2", "relative loss of torque constant per squared current"),),
     "motor_heat_fade": (
         Field("fade_per_A2", "1/A2", "relative loss of torque constant per squared current, settled"),
         Field("time_constant_s", "s", "of the heat on its way from winding to magnets"),

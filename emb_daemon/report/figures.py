@@ -1,5 +1,6 @@
 """Figures of the reports: few colours with one meaning each, time axes that zoom together, data reduced for the screen."""
 
+import base64
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -12,6 +13,8 @@ GRID = "#e6e9ee"
 
 #: Points that a trace may have on the page; more cannot be told apart on a screen.
 SCREEN_POINTS = 3000
+#: Samples of a figure's traces that the page holds beside them, to be shown where one zooms: six megabytes.
+DETAIL_SAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -94,11 +97,14 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
         row_heights=heights, subplot_titles=[panel.title for panel in panels],
     )  # fmt: skip
     shown: set[str] = set()
+    detail = _Detail()
     for row, panel in enumerate(panels, start=1):
         band_open = False
         for trace in panel.traces:
             x, y = np.asarray(trace.x), np.asarray(trace.y, dtype=float)
+            whole = None
             if reduce and trace.style.mode == "lines":
+                whole = detail.kept(x, y)
                 x, y = decimate(x, y)
             style, is_band = trace.style, trace.style is BAND
             figure.add_trace(
@@ -107,6 +113,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
                     # Single precision is beyond what an eye resolves and halves the file.
                     y=y.astype(np.float32),
                     name=trace.name,
+                    meta=whole,
                     mode=style.mode,
                     line={"color": style.colour, "width": style.width, "dash": style.dash},
                     marker={"color": style.colour, "size": style.size},
@@ -130,6 +137,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis, title_standoff=8)
     figure.update_layout(
+        meta=detail.times or None,
         height=total + 128,
         margin={"l": 64, "r": 16, "t": 80, "b": 48},
         paper_bgcolor="white",
@@ -144,8 +152,32 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
     return figure
 
 
+class _Detail:
+    """Every sample of a figure's reduced traces, in base64 as the page's script takes it; times that traces share once.
+
+    Attributes:
+        times: by name, s, double precision.
+    """
+
+    def __init__(self):
+        self.times: dict[str, str] = {}
+        self._names: dict[bytes, str] = {}
+        self._left = DETAIL_SAMPLES
+
+    def kept(self, x: np.ndarray, y: np.ndarray) -> dict[str, str] | None:
+        """What a trace carries: the name of its times, and its values in single precision; None where the page has no use or
+        no room for them."""
+        if not SCREEN_POINTS < len(y) <= self._left:
+            return None
+        self._left -= len(y)
+        times = np.ascontiguousarray(x, dtype="<f8").tobytes()
+        name = self._names.setdefault(times, f"t{len(self._names)}")
+        self.times.setdefault(name, base64.b64encode(times).decode())
+        return {"times": name, "values": base64.b64encode(np.ascontiguousarray(y, dtype="<f4").tobytes()).decode()}
+
+
 def time_figure(panels: list[Panel]):
-    """Panels over one time axis; zooming one zooms all. Data are decimated keeping peaks."""
+    """Panels over one time axis; zooming one zooms all, down to single samples. What is shown is decimated keeping peaks."""
     return _figure(panels, "time / s", reduce=True, shared=True)
 
 

@@ -117,18 +117,32 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
         InputError: no interface is named, or an unknown one.
         Unavailable: it cannot be opened now.
     """
+    chosen = _chosen({"interface": interface, "channel": channel, **options})
+    if chosen["interface"] == "socketcan":
+        return open_socketcan(str(chosen["channel"]), ids)
+    # Its multicast loops back, or programs on one machine could not hear each other.
+    return PythonCanBus(_open(chosen), ids, echoes=chosen["interface"] == "udp_multicast")
+
+
+def open_python_can(options: dict):
+    """python-can's own bus with all frames in it, by the options of `open_bus`; errors as there."""
+    return _open(_chosen(options))
+
+
+def _chosen(given: dict) -> dict:
     import can
 
     try:
         # None would hide what can.conf and the CAN_* variables say.
-        given = {"interface": interface, "channel": channel, **options}
-        chosen = can.util.load_config(config={key: value for key, value in given.items() if value is not None})
+        return can.util.load_config(config={key: value for key, value in given.items() if value is not None})
     except (can.CanInterfaceNotImplementedError, ValueError) as error:
         raise InputError(f"bus: {error}; name one with --interface and --channel") from None
-    if chosen["interface"] == "socketcan":
-        return open_socketcan(str(chosen["channel"]), ids)
+
+
+def _open(chosen: dict):
+    import can
+
     try:
-        # Its multicast loops back, or programs on one machine could not hear each other.
-        return PythonCanBus(can.Bus(**chosen), ids, echoes=chosen["interface"] == "udp_multicast")
+        return can.Bus(**chosen)
     except Exception as error:
         raise Unavailable(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None

@@ -16,6 +16,7 @@ from emb_daemon.identify.steps.torque import (
     LOAD,
     OFFSET,
     TORQUE_CONSTANT,
+    UNKNOWN_CURRENT_A,
     TorqueStep,
     Unexplained,
     unexplained_current,
@@ -152,6 +153,17 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
     series, turning, excess, gains = [], [], [], []
     first = held_out[0].found
     constant = first.values[TORQUE_CONSTANT]
+    if not any(len(left.rows) for left in held_out):
+        # No current was measured: the fit's own prior, and friction that may be as large as what it rubs against.
+        relative = np.hypot(first.sigmas[TORQUE_CONSTANT] / constant, first.sigmas[LOAD] / gear_gain)
+        return {
+            "current_A": UNKNOWN_CURRENT_A,
+            "current_correlation_s": CYCLE_S,
+            "speed_rad_per_s": speed_sigma,
+            "presliding": 1.0,
+            "torque_relative": float(relative),
+        }
+    held_out = [left for left in held_out if len(left.rows)]
     difference = np.sqrt(2.0) * first.values[INERTIA] * speed_sigma / CYCLE_S / constant
     for left in held_out:
         values = left.found.values

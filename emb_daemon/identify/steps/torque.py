@@ -18,7 +18,6 @@ from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
 from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
 from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import Campaign, Datasheet
 from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
@@ -40,6 +39,8 @@ _STEP = 1e-2
 #: deviation of its logarithm (rolling elements slide after micrometres to tens of them: Armstrong-Helouvry et al., Automatica
 #: 30(7), 1994, sec. 2.1, over a screw's micrometres per hundredth of a radian).
 _USUAL_PRESLIDING, _PRESLIDING_SPREAD = 0.03, 1.0
+#: To how much a current is known before a log has shown it, A.
+UNKNOWN_CURRENT_A = 1.0
 _NEED_TRAINING = "clamp and release with the reference force, at full frame rate"
 
 
@@ -63,8 +64,9 @@ class TorqueFit:
 
     @property
     def rms_A(self) -> float:
-        """Of the current that stays unexplained."""
-        return rmse(np.concatenate([residual for _, residual in self.residuals.values()]))
+        """Of the current that stays unexplained; NaN where none was measured."""
+        left = np.concatenate([residual for _, residual in self.residuals.values()])
+        return rmse(left) if len(left) else float("nan")
 
     def physical(self) -> dict[str, float]:
         """Values for a calibration; what noise pushed below what is physical stands at its least."""
@@ -96,15 +98,16 @@ class TorqueStep(Step):
 
 
 def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> TorqueStep:
-    """Torque path from all logs with motor current, and each gear's from its training log.
-
-    Raises:
-        InputError: no log holds motor current.
-    """
+    """Torque path from all logs with motor current, and each gear's from its training log; without any current, what the
+    datasheet says, with standard deviations as wide as that leaves them."""
     sheet = campaign.datasheet
     logs = [log for own in pads for log in own.logs if log.samples["has_current"].any()]
     if not logs:
-        raise InputError(f"{campaign.path}: curves, random: no log holds motor current; needed: EMB_*_Current frames")
+        campaign.fault(
+            "torque: no log holds motor current, so that torque constant and inertia are the datasheet's, friction is unknown "
+            f"and a force from a current is off by as much as itself; needed: the motor's current in a log of {_NEED_TRAINING}"
+        )
+        logs = [pads[len(pads) // 2].logs[-1]]
     found = fit_torque(logs, nominal, sheet)
     for key in (TORQUE_CONSTANT, INERTIA):
         campaign.compare_with_datasheet(key, found.values[key])
@@ -196,14 +199,15 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
 
 def _wide_prior(sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (4,) by the datasheet, and inverse covariance (5, 5) of them and the presliding angle's logarithm for a
-    current known to 1 A: torque constant and inertia to a third, friction no larger than what it rubs against."""
+    current known to `UNKNOWN_CURRENT_A`: torque constant and inertia to a third, friction no larger than what it rubs
+    against."""
     actuator = sheet.actuator
     constant, gear = actuator.motor_torque_constant_Nm_per_A, actuator.gear_gain_m_per_rad
     nominal = np.array([gear, actuator.lumped_inertia_kg_m2, 0.0, 0.0]) / constant
     sigma = np.array(
         [*(nominal[:2] / 3.0), gear * actuator.rated_clamp_force_N / constant, gear / constant, _PRESLIDING_SPREAD]
     )
-    return nominal, np.diag(sigma**-2)
+    return nominal, np.diag((UNKNOWN_CURRENT_A / sigma) ** 2)
 
 
 def _covariance(parts, matrices, residuals, solution, presliding, precision) -> np.ndarray:
@@ -217,7 +221,7 @@ def _covariance(parts, matrices, residuals, solution, presliding, precision) -> 
             rows = slice(start, start + EPISODE)
             normals.append(z[rows].T @ x[rows])
             scores.append(z[rows].T @ residual[rows])
-    return jackknife(np.array(normals), np.array(scores), precision)
+    return jackknife(np.array(normals), np.array(scores), precision) if normals else np.linalg.inv(precision)
 
 
 def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:

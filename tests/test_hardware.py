@@ -1,0 +1,104 @@
+"""Machines that nobody here built: an actuator without pads, sensors without noise, and the converters of measured sets."""
+
+import importlib.util
+from pathlib import Path
+
+import foreignkit
+import msgspec
+import numpy as np
+import pytest
+
+import emb_daemon
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.diagnose.comparison import errors, whole
+from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.logs import resample
+from emb_daemon.wire.contract import reason_words
+
+_TOOLS = Path(__file__).parent.parent / "tools"
+
+
+def _tool(name: str):
+    spec = importlib.util.spec_from_file_location(name, _TOOLS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def stops():
+    """Creeping about the released position, then stops: the speed of an angle in counts comes and goes while that stands."""
+    clock = np.arange(0.0, 5.0, foreignkit.FINE_S)
+    creep = np.where(clock < 0.5, 0.0, 0.2 * (1.0 - np.cos(2.0 * np.pi * (clock - 0.5) / 1.5)))
+    return foreignkit.sampled(foreignkit.truth(np.concatenate([creep, foreignkit.truth().angle])), 250.0)
+
+
+def _log(columns: dict, **more):
+    return emb_daemon.log_of_arrays(
+        columns["time_s"],
+        columns["angle_rad"],
+        current_A=columns["current_A"],
+        inner_backplate_C=22.0,
+        wheel_speed_rad_per_s=0.0,
+        force_N=columns["force_N"],
+        **more,
+    )
+
+
+def test_an_encoder_that_repeats_itself_at_rest_is_no_frozen_sensor(stops, monkeypatch):
+    """Angles that stand to the bit, and no speed but their change: nothing else is known of most rigs."""
+
+    def judged():
+        log = _log(stops)
+        estimates = emb_daemon.run(log, foreignkit.calibration())
+        stuck = np.mean(["signal stuck" in reason_words(bits) for bits in estimates["reasons"]])
+        return np.sqrt(np.nanmean((estimates["force"] - log.force_N)[100:] ** 2)), stuck
+
+    rmse_N, stuck = judged()
+    assert rmse_N < 60.0 and stuck == 0.0
+    monkeypatch.setattr(resample, "unrepeated", lambda speed, row: speed)
+    assert judged()[1] > 0.1, "what the rig's silence at rest would be taken for"
+
+
+def test_a_calibration_without_friction_gives_numbers(stops):
+    still = moved(foreignkit.calibration(), {"friction.offset_Nm": 0.0, "friction.load_m_per_rad": 0.0})
+    estimates = emb_daemon.run(_log(stops), still)
+    assert np.isfinite(estimates["force"]).all() and np.median(estimates["sigma"]) < 1000.0
+
+
+def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
+    """An actuator on a dynamometer, whose clearance never closes: no pads, no curve, and a load that may pull."""
+    base = foreignkit.calibration()
+    alone = msgspec.structs.replace(base, contact=msgspec.structs.replace(base.contact, clearance_rad=1e4))
+    motor, friction = alone.motor, alone.friction
+    time_s = 0.004 * np.arange(3000)
+    angle, speed = 20.0 * np.sin(2.0 * time_s), 40.0 * np.cos(2.0 * time_s)
+    force = 5000.0 * np.sin(0.7 * time_s)
+    torque = motor.gear_gain_m_per_rad * force - 80.0 * motor.inertia_kg_m2 * np.sin(2.0 * time_s)
+    torque += friction.offset_Nm * np.sign(speed)
+    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque / motor.torque_constant_Nm_per_A, "force_N": force}
+    without_load = moved(alone, {"friction.load_m_per_rad": 0.0})
+    bench = Bench([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], without_load)
+    assert bench.channels == ["torque"] and whole(bench) == "torque"
+    assert errors(bench, without_load).rmse("torque") < 250.0
+    assert errors(bench, moved(without_load, {"motor.torque_constant_Nm_per_A": 0.06})).rmse("torque") > 500.0
+
+
+def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):
+    tool, rows = _tool("cranfield_to_log"), []
+    clock = np.arange(0.0, 16.0, 0.04)
+    position = np.clip(np.where(clock < 8.0, 20.0 + 24.0 * clock, 140.0 - 24.0 * (clock - 8.0)), 20.0, 140.0)
+    direction = np.sign(np.gradient(position))
+    for load in (20, 40):
+        # Amperes of supply per kgf of load, and of friction.
+        current = tool.STANDSTILL_A + np.where(direction == 0.0, 0.0, 0.6 - direction * 0.005 * load)
+        rows += [f"{p},0.0,{i},trap,{load},1,0,1,{t}" for p, i, t in zip(position, current, clock, strict=True)]
+    header = "set_point,position_error,current,profile,load,run,fault_type,group,time"
+    (tmp_path / "normal.csv").write_text("\n".join([header, *rows]))
+    spec = importlib.util.spec_from_file_location("hardware", _TOOLS.parent / "studies" / "hardware.py")
+    study = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(study)
+    found = {load: study.passes(part, load)[0] for (load, _), part in tool.read(tmp_path / "normal.csv").items()}
+    force = {load: np.average(pairs[:, study.FORCE], weights=pairs[:, study.WEIGHT]) for load, pairs in found.items()}
+    constant = tool.NOMINAL_CONSTANT / tool.GEAR_GAIN_M_PER_RAD
+    assert force == pytest.approx({load: 0.005 * load * constant for load in (20, 40)}, rel=0.02)

@@ -1,0 +1,80 @@
+"""Another rig's bus, live: its frames become our samples as they would out of a log."""
+
+import can
+import cantools
+import foreignkit
+import numpy as np
+import pytest
+
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError
+from emb_daemon.logs.live import MappedBus
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.offline.log import log_of
+from emb_daemon.wire.frames import FRAME
+
+
+class _Silent:
+    """A bus on which nothing happens."""
+
+    def fileno(self):
+        raise NotImplementedError
+
+
+def _heard(folder, columns: dict) -> np.ndarray:
+    """FRAME rows that a mapped bus makes of the rig's frames, one after the other."""
+    database = cantools.database.load_string(foreignkit.DBC, "dbc")
+    drive, bench = (database.get_message_by_name(name) for name in ("Drive", "Bench"))
+    bus, rows = MappedBus(_Silent(), Mapping(folder / "mapping.yaml")), []
+    for row, time_s in enumerate(columns["time_s"]):
+        time_ns = 1_000_000_000 + round(1e9 * time_s)
+        of = {
+            bench: {"Load": 1e-3 * columns["force_N"][row], "Plate": columns["plate_C"][row] + 273.15},
+            drive: {
+                "Position": np.degrees(columns["angle_rad"][row]),
+                "Speed": columns["speed_rad_per_s"][row] * 30.0 / np.pi,
+                "Iq": -1e3 * columns["current_A"][row],
+            },
+        }
+        for message, values in of.items():
+            frame = can.Message(
+                arbitration_id=message.frame_id, is_extended_id=True, is_fd=True, data=message.encode(values, strict=False)
+            )
+            rows += bus.heard(frame, time_ns)
+    return np.array(rows, FRAME)
+
+
+@pytest.mark.parametrize("rate_Hz", [250, 500, 1000])
+def test_frames_of_another_rig_become_samples_at_our_rate(tmp_path, rate_Hz):
+    foreignkit.write_rig(tmp_path)
+    motion = foreignkit.truth(foreignkit.random(seconds=3.0))
+    columns = foreignkit.sampled(motion, rate_Hz)
+    log = log_of(_heard(tmp_path, columns))
+    samples, at = log.samples, 1e-9 * log.time_ns - 1.0
+    assert np.all(samples["dt"][1:] == 0.004) and len(samples) == pytest.approx(750, abs=2)
+    assert np.abs(samples["angle"] - np.interp(at, motion.time_s, motion.angle)).max() < 0.01
+    # Means over the cycle that ends at the sample.
+    total = np.concatenate([[0.0], np.cumsum(motion.current)]) * foreignkit.FINE_S
+    grid = np.arange(len(total)) * foreignkit.FINE_S
+    mean = (np.interp(at + foreignkit.FINE_S, grid, total) - np.interp(at + foreignkit.FINE_S - 0.004, grid, total)) / 0.004
+    assert np.std((samples["current_q"] - mean)[5:]) < 1.2 and abs(np.mean((samples["current_q"] - mean)[5:])) < 0.1
+    assert samples["has_thermocouple"][100] and samples["inner_backplate"][100] == pytest.approx(22.0, abs=0.1)
+    assert samples["has_status"][100] and not np.isfinite(log.force_N).any(), "the estimator never sees a reference"
+
+
+def test_a_mapping_of_columns_is_no_bus(tmp_path):
+    with pytest.raises(InputError, match="expected one with `dbc` for a live bus"):
+        MappedBus(_Silent(), Mapping(foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)))
+
+
+def test_check_lists_the_faults_of_mapping_and_configuration_together(tmp_path, capsys):
+    foreignkit.write_rig(tmp_path)
+    mapping, config = tmp_path / "mapping.yaml", tmp_path / "emb.yaml"
+    assert main(["check", "--mapping", str(mapping)]) == 0
+    mapping.write_text(mapping.read_text().replace("Drive.Iq", "Drive.Nothing").replace("Drive.Speed", "Drive.Missing"))
+    config.write_text("format: 1\ncorners: {XX: {calibration: c.yaml}}\n")
+    capsys.readouterr()
+    assert main(["check", "--mapping", str(mapping), "--config", str(config)]) == 2
+    said = capsys.readouterr().err
+    assert "Drive.Nothing" in said and "Drive.Missing" in said and "XX" in said
+    assert main(["check"]) == 2

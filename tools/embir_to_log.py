@@ -1,0 +1,109 @@
+"""Runs of the EMBiR actuator dynamometer as logs that `emb-daemon diagnose` reads, and the torque balance to start from.
+
+    python tools/embir_to_log.py futek_data/futek_test_27_04_2021_16-28-22.csv --output embir
+    emb-daemon diagnose embir/first_half.log --calibration embir/calibration.yaml --validate embir/second_half.log \\
+        --output embir/found
+
+K. Urs, C. E. Adu, E. J. Rouse, T. Y. Moore, Design and Characterization of 3D Printed, Open-Source Actuators for Legged
+Locomotion, IROS 2022; data at github.com/karthikurs/actuator-dynamometer, commit 1ab6e56, folder futek_data (no licence
+stated; not copied here). Two motors face to face through a torque sensor: the first one's current, angle and speed are an
+actuator's, the sensor is the load that it works against.
+
+The mapping onto the torque path, with a gear gain gamma that is a choice (0.5 mm per radian) and nothing more:
+
+    clamp force = sensor torque / gamma        torque constant: the drive's own, as its calibration log has it
+
+There are no pads, so that the clearance never closes. The drive samples its current at 60 to 200 Hz as a value of the moment.
+"""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.resources import resource
+
+GEAR_GAIN_M_PER_RAD = 5e-4
+#: Of rotor and coupling, kg m2; motor friction, N m: what a datasheet would say.
+NOMINAL_INERTIA, NOMINAL_COULOMB = 1e-4, 0.02
+#: Clearance that no motion closes, rad.
+NEVER = 1e4
+
+MAPPING = """# Columns of the EMBiR dynamometer.
+format: 1
+time: {{signal: "time [s]", unit: s}}
+signals:
+  EMB_FL_Resolver.MotorAngle: {{signal: "a1 position [rad]", unit: rad}}
+  EMB_FL_Resolver.MotorSpeed: {{signal: "a1 velocity [rad/s]", unit: rad/s}}
+  EMB_FL_Current.CurrentQ: {{signal: "a1 q-axis [A]", unit: A, mean_ms: 0}}
+  VEH_WheelSpeed.WheelSpeedFL: {{value: 0}}
+  RIG_FL_Force.ClampForceRef: {{signal: "{sensor}", unit: N, scale: {newton_per_Nm:g}}}
+"""
+
+
+def read_header(path: Path) -> tuple[float, str]:
+    """What a run states of itself: the first motor's torque constant, N m/A, and the torque sensor's column.
+
+    Raises:
+        InputError: not a run with both.
+    """
+    with path.open(errors="replace") as file:
+        header = file.read(4000)
+    constant, sensor = re.search(r"kt_1 = ([\d.]+)", header), re.search(r",(tr[sd]605\S* torque \[Nm\])", header)
+    if not constant or not sensor:
+        raise InputError(f"{path}: no torque constant (kt_1 = ...) or no torque sensor: not a run of the EMBiR dynamometer")
+    return float(constant.group(1)), sensor.group(1)
+
+
+def starting_calibration(constant: float) -> object:
+    """The thesis's torque balance: inertia and Coulomb friction, no other effect, and nothing to clamp."""
+    base = load_calibration(resource("config/calibration.yaml"))
+    replace = msgspec.structs.replace
+    return replace(
+        base,
+        actuator="EMBiR",
+        motor=replace(
+            base.motor,
+            torque_constant_Nm_per_A=constant,
+            inertia_kg_m2=NOMINAL_INERTIA,
+            gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
+            maximum_speed_rad_per_s=250.0,
+        ),
+        friction=replace(base.friction, load_m_per_rad=0.0, offset_Nm=NOMINAL_COULOMB, presliding_angle_rad=0.05),
+        contact=replace(base.contact, clearance_rad=NEVER),
+        effects={},
+        provenance=None,
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="one run, futek_test_*.csv")
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    arguments = parser.parse_args(argv)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    mapping = arguments.output / "mapping.yaml"
+    try:
+        constant, sensor = read_header(arguments.run)
+        write_atomically(mapping, MAPPING.format(sensor=sensor, newton_per_Nm=1.0 / GEAR_GAIN_M_PER_RAD).encode())
+        frames = Mapping(mapping).read(arguments.run)
+    except (OSError, InputError, InputErrors) as error:
+        print(error, file=sys.stderr)
+        return 2
+    half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
+    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
+        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
+    save_calibration(starting_calibration(constant), arguments.output / "calibration.yaml")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
