@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation silent
+.PHONY: demo test docs wheel wheel-demo lint format lock clean fuzz soak mutation silent fleet
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -59,6 +59,11 @@ current_offset,power_on_hot,wheel_pulses_pause,stribeck,start_latched,gear_wear,
 silent: $(READY)
 	$(VENV)/bin/python -m studies.silent grid --faults $(SILENT) --count 1 --processes 1 --strict
 
+# A simulated fleet of 200 units for 30 days, three batches and ten units of which have secrets: are they found, and no others?
+FLEET_SEED ?= 1
+fleet: $(READY)
+	$(VENV)/bin/python -m studies.fleet --seed $(FLEET_SEED)
+
 lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -69,7 +74,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra docs --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra docs --extra fleet --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 	$(VENV)/bin/pip install --quiet --require-hashes -r requirements.lock
 	$(VENV)/bin/python tools/lock_box.py

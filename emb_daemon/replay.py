@@ -129,7 +129,7 @@ class Replay:
     def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
         """Put a log's times on the drive's clock, in place; returns what was added."""
         if self._pipeline is None:
-            self._build(_corners_in(frames, path))
+            self._build(corners_in(frames, path))
         first = int(frames["time_ns"][0])
         if self._end_ns is None:
             self._pipeline.begin(first)
@@ -177,7 +177,7 @@ class Replay:
         return [result.since(self._start_ns(frames) - shift) for result in results] if self._start_s > 0.0 else results
 
 
-def _corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:
+def corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:
     decoder = Decoder()
     heard = set(np.unique(frames["can_id"]).tolist())
     found = tuple(corner for corner in CORNERS if decoder.can_id(f"EMB_{corner}_Resolver") in heard)

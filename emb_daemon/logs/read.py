@@ -19,6 +19,8 @@ from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
+#: Endings of log files, before ``.gz``.
+LOG_ENDINGS = (".log", *_PYTHON_CAN)
 
 
 def _most_bytes() -> int:
@@ -145,7 +147,7 @@ def read_log(path: str | Path) -> Recorded:
     """
     path = Path(path)
     ending = log_ending(path)
-    if ending != ".log" and ending not in _PYTHON_CAN:
+    if ending not in LOG_ENDINGS:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
     raw = read_file(path)
     content = unpack_gzip(path, raw)
