@@ -6,16 +6,24 @@ of a quarter of a minute, three stops and a slow clamp, because 6 000 drives hav
 more. Nothing but the drives' samples and a table of unit and batch reaches the fleet's commands.
 """
 
+import argparse
 import datetime
+import shutil
+import sys
+import time
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import calibration_hash, load_calibration
+from emb_daemon.cli.main import main as emb_daemon
 from emb_daemon.fleet import dataset
+from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import Drive
+from emb_daemon.fleet.findings import ALL, Findings, load
 from emb_daemon.fleet.ingest import ingest_frames
 from emb_daemon.fleet.scores import Questions
 from emb_daemon.offline import log_of
@@ -165,3 +173,87 @@ def drive_unit(root: Path, fleet: Fleet, unit: str) -> int:
         dataset.note(root, known | {"drives": [asdict(drive) for drive in found]})
         seconds += schedule.seconds
     return seconds
+
+
+# -- judging ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found of what is there: batches with the right cause, groups accused wrongly, faulty units, units accused
+    wrongly, and how many of the faulty ones have the right cause; whether the ageing was."""
+
+    batches: int
+    false_batches: tuple[str, ...]
+    units: int
+    named: int
+    false_units: tuple[str, ...]
+    missed: tuple[str, ...]
+    ageing: bool
+
+    def passed(self, fleet: Fleet) -> bool:
+        """All batches with the right effect, nine of ten units, and at most one false accusation of all."""
+        false = len(self.false_batches) + len(self.false_units)
+        return self.batches == len(fleet.batches) and self.units >= 0.9 * len(fleet.faults) and false <= 1
+
+
+def judge(fleet: Fleet, found: Findings) -> Verdict:
+    secrets = {f"batch {name}": secret.cause for name, secret in fleet.batches.items()}
+    right = {one.where for one in found.groups if secrets.get(one.where) == one.cause}
+    accused = {one.where.split()[0]: one.cause for one in (*found.ageing, *found.outliers)}
+    return Verdict(
+        batches=len(right),
+        false_batches=tuple(f"{one.where}: {one.cause}" for one in found.groups if secrets.get(one.where) != one.cause),
+        units=len(accused.keys() & fleet.faults.keys()),
+        named=sum(accused.get(unit) == secret.cause for unit, secret in fleet.faults.items()),
+        false_units=tuple(sorted(accused.keys() - fleet.faults.keys())),
+        missed=tuple(sorted(fleet.faults.keys() - accused.keys())),
+        ageing=any(one.where == ALL and one.cause == fleet.ageing.cause for one in found.drifts),
+    )
+
+
+def simulate(root: Path, fleet: Fleet, progress=lambda done, total: None) -> None:
+    """All drives of a fleet into a data set, and its table of units beside them."""
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "units.csv").write_text("unit,batch\n" + "".join(f"{unit},{batch}\n" for unit, batch in fleet.batch.items()))
+    with cluster() as client:
+        run(client, partial(drive_unit, root, fleet), list(fleet.batch), progress)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--units", type=int, default=200)
+    parser.add_argument("--days", type=int, default=30)
+    parser.add_argument("--output", type=Path, default=Path("build/fleet"), metavar="DIR", help="data set and report.html")
+    arguments = parser.parse_args(argv)
+    root = arguments.output.absolute()
+    shutil.rmtree(root, ignore_errors=True)
+    fleet, begin = Fleet.draw(arguments.seed, arguments.units, arguments.days), time.monotonic()
+    print(
+        f"seed {fleet.seed}: {arguments.units} simulated units, {arguments.days} days, "
+        f"calibration {calibration_hash(_calibration())}"
+    )
+    for where, secret in (*fleet.batches.items(), *fleet.faults.items()):
+        print(f"  secret of {where}: {secret.cause} {secret.size_N:+.0f} N")
+    print(f"  all units: {fleet.ageing.cause} {fleet.ageing.size_N:+.0f} N over the {arguments.days} days")
+    simulate(root, fleet)
+    simulated = time.monotonic()
+    command = ["fleet", "diagnose", str(root), "--units", str(root / "units.csv")]
+    if status := emb_daemon(command) or emb_daemon(["fleet", "report", str(root), "--output", str(root / "report.html")]):
+        return status
+    verdict, end = judge(fleet, load(root)), time.monotonic()
+    processor = sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN))
+    print(f"batches with the right effect {verdict.batches} of {len(fleet.batches)}, wrong {list(verdict.false_batches)}")
+    print(
+        f"faulty units {verdict.units} of {len(fleet.faults)} ({verdict.named} with the right cause), "
+        f"missed {list(verdict.missed)}, accused wrongly {list(verdict.false_units)}"
+    )
+    print(f"ageing {'found' if verdict.ageing else 'not found'}")
+    print(f"simulated in {simulated - begin:.0f} s, diagnosed in {end - simulated:.0f} s, {processor:.0f} s of processor time")
+    print(f"{root / 'report.html'}; {'passed' if verdict.passed(fleet) else 'FAILED'}")
+    return 0 if verdict.passed(fleet) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

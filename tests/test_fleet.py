@@ -1,17 +1,18 @@
 """The fleet's promises: the daemon's own estimates, each file once, faults listed, work that survives, honest statistics."""
 
 import gzip
+import json
 import os
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.fleet import dataset, population
+from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, jobs, log_files
 from emb_daemon.fleet.replaying import replay_drive
@@ -20,6 +21,7 @@ from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
 from emb_daemon.resources import resource
+from studies import fleet as study
 
 pytest.importorskip("distributed")
 
@@ -119,18 +121,17 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
-def _dies_once(folder: Path, number: int) -> int:
-    """A task whose worker is killed the first time it runs number 3, and always at number 5."""
-    mark = folder / f"{number}"
-    if number == 5 or (number == 3 and not mark.exists()):
-        mark.touch()
-        os.kill(os.getpid(), 9)
-    return number * number
-
-
 def test_workers_may_die(tmp_path):
+    def square(number: int) -> int:
+        """Its worker is killed the first time it squares 3, and always at 5."""
+        mark = tmp_path / f"{number}"
+        if number == 5 or (number == 3 and not mark.exists()):
+            mark.touch()
+            os.kill(os.getpid(), 9)
+        return number * number
+
     with cluster(workers=2) as client:
-        done = run(client, partial(_dies_once, tmp_path), list(range(8)), failed=lambda item, reason: f"{item}: {reason}")
+        done = run(client, square, list(range(8)), failed=lambda item, reason: f"{item}: {reason}")
     assert done[:5] + done[6:] == [0, 1, 4, 9, 16, 36, 49]
     assert done[5].startswith("5: ")
 
@@ -163,9 +164,10 @@ def _fleet(rng, units=60, size=6, causes=12):
     return values, prints, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
 
 
-def _read(values, prints, factors):
+def _read(values, prints, factors, noise=0.1):
     centre = population.centres(values, factors)
-    return centre, population.Readings(values, centre, prints)
+    covariance = np.broadcast_to(noise**2 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
+    return centre, population.Readings(values, centre, prints, covariance)
 
 
 def test_what_a_batch_shares_is_found_with_its_cause_and_size():
@@ -187,7 +189,7 @@ def test_where_nothing_is_shared_nobody_is_accused():
         values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
         centre, readings = _read(values, prints, factors)
         batches += bool(population.shared_causes(values, groups, prints, readings, beside=True))
-        units += bool(population.outliers(values - centre, readings, np.zeros((len(values), len(prints)))))
+        units += bool(population.outliers(values - centre, readings))
     # Binomial, 0.1 %.
     assert batches <= 5 and units <= 5
 
@@ -197,11 +199,11 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     values[10] += 12.0 * prints[2]
     values[20] -= 12.0 * prints[5]
     centre, readings = _read(values, prints, factors)
-    found = population.outliers(values - centre, readings, np.zeros((len(values), len(prints))))
+    found = population.outliers(values - centre, readings)
     assert {(one.row, one.cause) for one in found} == {(10, 2), (20, 5)}
     # Were its own drives as far apart, it would be none.
-    quiet = np.full((len(values), len(prints)), 12.0)
-    assert population.outliers(values - centre, readings, quiet) == []
+    centre, readings = _read(values, prints, factors, noise=20.0)
+    assert population.outliers(values - centre, readings) == []
 
 
 def test_random_effects_take_each_units_own_noise_out():
@@ -219,3 +221,96 @@ def test_random_effects_take_each_units_own_noise_out():
 def test_units_that_differ_by_their_noise_alone_have_no_spread():
     found = population.random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
     assert found.spread == 0.0 and np.allclose(found.shrunk, 1.0)
+
+
+# -- end to end -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory, calibration):
+    """Twelve units on three days, the half of which have 80 N of viscous friction; what was found of them."""
+    root = tmp_path_factory.mktemp("fleet")
+    secret = study.Secret("viscous_friction", 80.0, {"viscous_Nms_per_rad": 6e-5})
+    units = {f"unit-{number:02d}": "AB"[number % 2] for number in range(12)}
+    drawn = study.Fleet(5, 3, units, {"A": secret}, {}, study.Secret("viscous_friction", 0.0, {"viscous_Nms_per_rad": 0.0}))
+    for unit in units:
+        study.drive_unit(root, drawn, unit)
+    for drives in dataset.by_unit(dataset.drives(root)).values():
+        assert scores.score_unit(root, drives, calibration) == {}
+    factors = {unit: {"batch": batch} for unit, batch in units.items()}
+    found = findings.find(scores.read_fleet(root, calibration), scores.Questions(calibration), "", factors, {})
+    findings.save(found, root)
+    return root, found
+
+
+def test_what_no_single_car_shows_a_batch_does(fleet):
+    _, found = fleet
+    [one] = found.groups
+    # Of the two halves either may be called the one that is apart.
+    assert one.cause == "viscous_friction" and one.where in ("batch A", "batch B")
+    assert 40.0 < one.size_N * (1.0 if one.where == "batch A" else -1.0) < 120.0
+    assert not found.outliers and not found.ageing
+    assert len(found.units) == 12 and found.drives == 36
+
+
+def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
+    root, found = fleet
+    assert main(["fleet", "report", str(root), "--output", str(tmp_path / "fleet.html")]) == 0
+    page = (tmp_path / "fleet.html").read_text()
+    assert "1 batch shares something" in page and "viscous friction" in page and found.groups[0].action in page
+    assert findings.load(root) == found
+
+
+def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monkeypatch):
+    root, _ = fleet
+    drives = next(iter(dataset.by_unit(dataset.drives(root)).values()))
+    path = scores.scores_path(root, drives[0].unit, drives[0].corner)
+    before, asked = path.read_bytes(), []
+    ask = scores.Questions.ask
+    monkeypatch.setattr(scores.Questions, "ask", lambda self, log, drive: asked.append(drive) or ask(self, log, drive))
+    scores.score_unit(root, drives, calibration)
+    assert not asked
+    scores.score_unit(root, drives[:2], calibration)
+    scores.score_unit(root, drives, calibration)
+    assert asked == drives[2:] and path.read_bytes() == before
+
+
+def test_a_drive_that_says_nothing_says_why(fleet, calibration):
+    root, _ = fleet
+    drive = dataset.drives(root)[0]
+    log, _ = dataset.read_drive(root, drive)
+    still = replace(log, samples=log.samples[:100], time_ns=log.time_ns[:100])
+    with pytest.raises(InputError, match=r"the pads never touch|no brake application"):
+        scores.Questions(calibration).ask(still, drive)
+
+
+def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
+    rng = np.random.default_rng(0)
+    friction = calibration.friction.load_m_per_rad
+    values = {"friction.offset_Nm": 0.03, "friction.presliding_angle_rad": 0.03, "contact.clearance_rad": 7.5}
+    for unit in range(40):
+        own = values | {"friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal())}
+        entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
+        path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps({"calibration": calibration_hash(calibration), "entries": [entry]}))
+    save_calibration(calibration, tmp_path / "old.yaml")
+    command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
+    assert main([*command, str(tmp_path / "new.yaml")]) == 0
+    made = load_calibration(tmp_path / "new.yaml")
+    assert made.friction.load_m_per_rad == pytest.approx(1.1 * friction, rel=0.03)
+    assert made.provenance.sigmas["friction.load_m_per_rad"] == pytest.approx(0.05 * friction, rel=0.4)
+    # Four such widths of the friction at full force, a fifth of which is the offset's.
+    assert 0.1 < made.adaptation.friction_change < 0.3
+
+
+def test_without_trainings_there_is_no_prior(tmp_path, calibration):
+    with pytest.raises(InputError, match="fleet learn"):
+        learning.prior(tmp_path, calibration)
+
+
+@pytest.mark.parametrize("text", ["", "unit\na\n", "car,batch\na,b\n", "unit,batch\na,b\na,c\n", "unit,batch\na\n"])
+def test_a_table_of_units_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "units.csv").write_text(text)
+    with pytest.raises(InputError, match=r"units\.csv"):
+        findings.read_units(tmp_path / "units.csv")

@@ -228,30 +228,28 @@ class _Study:
         }
         return unit_of(scores, self.directions, np.column_stack([columns[name] for name in self.covariates]))
 
-    def vectors(self, covariate: str) -> np.ndarray:
-        return np.array([unit.values[self.covariates.index(covariate)] for unit in self.units])
-
-    def noise(self, covariate: str, readings: Readings) -> np.ndarray:
-        """Of the units' readings from drive to drive, shape (N, K)."""
-        return readings.noise([unit.noise[self.covariates.index(covariate)] for unit in self.units])
+    def read(self, covariate: str) -> tuple[np.ndarray, np.ndarray, Readings]:
+        """The units' vectors, the same about their groups' centres, and readings of them."""
+        row = self.covariates.index(covariate)
+        vectors = np.array([unit.values[row] for unit in self.units])
+        centre = centres(vectors, self.levels)
+        noise = np.array([unit.noise[row] for unit in self.units])
+        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints, noise)
 
     def findings(self, calibration: str, silent: dict[str, str], left_out: dict[str, str]) -> Findings:
         prints = self.directions.prints
-        level = self.vectors("level")
-        centre = centres(level, self.levels)
-        readings = Readings(level, centre, prints)
+        level, apart, readings = self.read("level")
         groups = shared_causes(level, self.groups, prints, readings, beside=True)
         over: dict[str, list[Finding]] = {"day": [], "warmth": []}
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
-            slopes = self.vectors(name)
-            own = Readings(slopes, centres(slopes, self.levels), prints)
+            slopes, uneven, own = self.read(name)
             shared = shared_causes(slopes, {ALL: self.masks[ALL]}, prints, own, beside=False)
             shared += shared_causes(slopes, self.groups, prints, own, beside=True)
             over[name] = [self._shared(s, _ACTIONS[name]) for s in shared]
             if name == "day":
-                ageing = self._outliers(slopes - centres(slopes, self.levels), own, name, "ages unlike the others")
-        unlike = self._outliers(level - centre, readings, "level", "is unlike the others")
+                ageing = self._outliers(uneven, own, "ages unlike the others")
+        unlike = self._outliers(apart, readings, "is unlike the others")
         return Findings(
             calibration=calibration,
             first_day=_date(self.start),
@@ -266,7 +264,7 @@ class _Study:
             seasons=over["warmth"],
             outliers=unlike,
             ageing=ageing,
-            units=self._placed(level - centre, readings, {finding.where for finding in (*unlike, *ageing)}),
+            units=self._placed(apart, readings, {finding.where for finding in (*unlike, *ageing)}),
             population=self._population(level, readings),
             trends=self._trends([*groups][:3], over["day"], readings),
         )
@@ -295,7 +293,7 @@ class _Study:
             shared.group, int(members.sum()), shared.cause, shared.amount, shared.sigma, shared.chance, shared.rivals, action
         )
 
-    def _outliers(self, deviations: np.ndarray, readings: Readings, covariate: str, how: str) -> list[Finding]:
+    def _outliers(self, deviations: np.ndarray, readings: Readings, how: str) -> list[Finding]:
         def action(where: str, cause: Cause) -> str:
             return f"{where} {how}: train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}"
 
@@ -303,13 +301,13 @@ class _Study:
             self._finding(
                 " ".join(self.keys[o.row]), 1, o.cause, o.amount, abs(o.amount / o.deviation), o.q_value, o.rivals, action
             )
-            for o in outliers(deviations, readings, self.noise(covariate, readings))
+            for o in outliers(deviations, readings)
         ]
 
     def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
         amounts, rows = readings.of(deviations), readings.ordinary
         spread = np.sqrt((amounts[rows] ** 2).mean(axis=0))
-        noise = self.noise("level", readings)
+        noise = readings.noise()
         worst = np.argmax(np.abs(amounts) / spread, axis=1)
         result = []
         for row, (unit, corner) in enumerate(self.keys):
@@ -326,7 +324,7 @@ class _Study:
         return result
 
     def _population(self, level: np.ndarray, readings: Readings) -> list[Spread]:
-        amounts, noise = readings.of(level), self.noise("level", readings)
+        amounts, noise = readings.of(level), readings.noise()
         result = []
         for row, cause in enumerate(self.causes):
             own, size = (

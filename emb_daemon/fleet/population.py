@@ -95,23 +95,19 @@ class Scatter:
     Attributes:
         mean: shape (q,).
         covariance: shape (q, q), of one unit.
-        ordinary: units it was estimated from.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
-    ordinary: np.ndarray
 
 
-def scatter_of(units: np.ndarray) -> Scatter:
+def scatter_of(units: np.ndarray, noise: np.ndarray) -> Scatter:
     """Mean and covariance of most of the rows, shape (N, q), whatever the others are.
 
     Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
-    then once more with all that are not outlying. Between few units the covariance is drawn towards its own diagonal by as
-    many rows as it has columns."""
-    from scipy.stats import chi2
-
-    count, size = units.shape
+    then once more with all that are not outlying. The covariance is drawn towards ``noise``, that of one row by its own
+    drives, with the weight of as many rows as it has columns: few units say little of all directions."""
+    count = len(units)
     mean = np.median(units, axis=0)
     spread = 1.4826 * np.median(np.abs(units - mean), axis=0)
     covariance = np.diag(np.maximum(spread, 1e-9 * max(float(spread.max()), 1e-300)) ** 2)
@@ -123,21 +119,23 @@ def scatter_of(units: np.ndarray) -> Scatter:
         if np.array_equal(chosen, core):
             break
         core = chosen
-        mean, covariance = _moments(units[core])
-    distance = _distances(units - mean, covariance)
-    distance *= chi2.median(size) / max(float(np.median(distance)), 1e-300)
-    ordinary = (distance <= chi2.ppf(_OUTLYING, size)) | core
-    mean, covariance = _moments(units[ordinary])
-    return Scatter(mean, covariance, ordinary)
+        mean, covariance = _moments(units[core], noise)
+    ordinary = _ordinary(_distances(units - mean, covariance), units) | core
+    mean, covariance = _moments(units[ordinary], noise)
+    return Scatter(mean, covariance)
 
 
-def _moments(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    count, size = rows.shape
-    mean = rows.mean(axis=0)
-    own = (rows - mean).T @ (rows - mean)
-    free = max(count - 1, 1)
-    diagonal = np.diag(np.maximum(np.diag(own) / free, 1e-12 * max(float(np.trace(own)) / size, 1e-300)))
-    return mean, (own + size * diagonal) / (free + size)
+def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    (count, size), mean = rows.shape, rows.mean(axis=0)
+    return mean, ((rows - mean).T @ (rows - mean) + size * noise) / (max(count - 1, 1) + size)
+
+
+def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Which squared distances are those of a normal population whose median they have."""
+    from scipy.stats import chi2
+
+    size = units.shape[1]
+    return distance / max(float(np.median(distance)), 1e-300) <= chi2.ppf(_OUTLYING, size) / chi2.median(size)
 
 
 def _distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -151,29 +149,36 @@ class Readings:
         units: shape (N, q).
         centre: what the units' groups have in common, shape (N, q); scatter is about it.
         prints: of the causes, shape (K, q).
+        noise: covariance of each unit by its own drives, shape (N, q, q).
 
     Attributes:
         ordinary: units that are like the others, shape (N,).
     """
 
-    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray):
+    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray):
+        # Of few drives not even the noise is known in all directions: half of it is taken as independent.
+        typical = noise.mean(axis=0)
+        typical = 0.5 * (typical + np.diag(np.diag(typical)))
         fold = np.arange(len(units)) % min(_FOLDS, len(units))
-        self.ordinary = scatter_of(units - centre).ordinary
-        self._inverse = np.array(
-            [np.linalg.inv(scatter_of((units - centre)[fold != f]).covariance) for f in range(fold.max() + 1)]
+        apart = units - centre
+        others = [scatter_of(apart[fold != part], typical) for part in range(fold.max() + 1)]
+        self._inverse = np.array([np.linalg.inv(scatter.covariance) for scatter in others])
+        means = np.array([scatter.mean for scatter in others])
+        self.ordinary = _ordinary(
+            np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
         )
         along = np.einsum("fab,kb->fka", self._inverse, prints)
         self.filters = (along / np.einsum("fka,ka->fk", along, prints)[:, :, None])[fold]
-        self._prints = prints
+        self._prints, self._noise = prints, noise
         self.inverse = self._inverse.mean(axis=0)
 
     def of(self, units: np.ndarray) -> np.ndarray:
         """Amount of each cause, shape (N, K)."""
         return np.einsum("uka,ua->uk", self.filters, units)
 
-    def noise(self, covariances: Sequence[np.ndarray]) -> np.ndarray:
+    def noise(self) -> np.ndarray:
         """Standard deviation of the amounts from drive to drive, shape (N, K)."""
-        return np.sqrt(np.einsum("uka,uab,ukb->uk", self.filters, np.array(covariances), self.filters))
+        return np.sqrt(np.einsum("uka,uab,ukb->uk", self.filters, self._noise, self.filters))
 
     def gain(self, total: np.ndarray) -> np.ndarray:
         """Fall of the squared distance that each cause explains of a vector, shape (K,)."""
@@ -298,9 +303,9 @@ class Outlier:
     rivals: tuple[int, ...]
 
 
-def outliers(deviations: np.ndarray, readings: Readings, noise: np.ndarray) -> list[Outlier]:
+def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
     """Units unlike their group, shape (N, q) about its centre, the most unlike first; each by more than units differ, and by
-    more than its own drives do: ``noise`` of its readings, shape (N, K)."""
+    more than its own drives do."""
     from scipy.stats import t as student
 
     from emb_daemon.diagnose.evidence import false_discovery
@@ -308,7 +313,7 @@ def outliers(deviations: np.ndarray, readings: Readings, noise: np.ndarray) -> l
     amounts, rows = readings.of(deviations), readings.ordinary
     freedom = max(int(rows.sum()) - 1, 1)
     spread = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom)
-    size = amounts / np.maximum(np.maximum(spread, noise), 1e-300)
+    size = amounts / np.maximum(np.maximum(spread, readings.noise()), 1e-300)
     # As many questions as causes were asked of each unit.
     chances = np.minimum(1.0, 2.0 * student.sf(np.abs(size), freedom).min(axis=1) * size.shape[1])
     q_values = false_discovery(chances)

@@ -30,9 +30,9 @@ from emb_daemon.offline import Log
 LOADED_N = 300.0
 #: Motor travel (rad) in contact below which a drive has no brake application to tell anything: one of 3 kN.
 _LEAST_TRAVEL_RAD = 10.0
-#: The contact angle is found before anything else, by Newton's steps: until one moves it by less than what is next to nothing
-#: beside a slide of the gear (rad), and at most so many. A drive that begins clamped does not get there.
-_SETTLED_RAD, _STEPS = 0.01, 6
+#: The contact angle is found before anything else, by Newton's steps: until one moves it by less than over what the curve's
+#: slope changes by a fiftieth (rad), and at most so many. A drive that begins clamped does not get there.
+_SETTLED_RAD, _STEPS = 0.1, 6
 #: Residual of a log without reference.
 _CHANNEL = "innovation"
 _FORCE_CHANNELS = ("stiffness", "torque")
@@ -124,10 +124,10 @@ class Questions:
         """
         # What a fleet is asked must be the same of every unit, a rig's force sensor or not.
         bench = Bench([replace(log, force_N=np.full(len(log.samples), np.nan))], self.calibration, workers=1)
-        values, residual = {self._contact: self._contact.start}, {}
+        values = {self._contact: self._contact.start}
         for _ in range(_STEPS):
             residual = bench.residuals(values)
-            [column] = bench.regressors(values, [Probe(self._contact)], residual)
+            column, *others = bench.regressors(values, [Probe(self._contact), *self._probes], residual)
             if not (size := float(column @ column)):
                 raise InputError("the pads never touch")
             move = float(column @ residual[_CHANNEL]) / size
@@ -136,7 +136,7 @@ class Questions:
             values[self._contact] += move
         else:
             raise InputError("the contact angle is not found; does the drive begin with the brake applied?")
-        table = np.column_stack([*bench.regressors(values, self._probes, residual), residual[_CHANNEL]])
+        table = np.column_stack([*others, residual[_CHANNEL]])
         # The curve's coefficients, each by its own size: together, the force.
         curve = [row for row, cause in enumerate(self.causes) if cause.key.startswith("stiffness.curves")]
         loaded = np.abs(table[:, curve].sum(axis=1)) > LOADED_N
