@@ -359,12 +359,13 @@ def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
     """Of units' values with their own standard deviations, shape (N,), by Paule and Mandel (J. Research NBS 87, 1982)."""
     from scipy.optimize import brentq
 
-    def excess(spread_2: float) -> float:
-        weight = 1.0 / (sigmas**2 + spread_2)
-        return float(weight @ (values - weight @ values / weight.sum()) ** 2) - (len(values) - 1)
+    def excess(share: float) -> float:
+        weight = variance / np.maximum(sigmas**2 + share * variance, 1e-300)
+        return float(weight @ (values - weight @ values / weight.sum()) ** 2) / variance - (len(values) - 1)
 
-    most = float(np.var(values)) * len(values) + 1e-300
-    spread_2 = brentq(excess, 0.0, most) if len(values) > 1 and excess(0.0) > 0.0 > excess(most) else 0.0
+    # As a share of the values' own variance: the root finder's tolerance knows no units.
+    variance = max(float(np.var(values, ddof=1)) if len(values) > 1 else 0.0, 1e-300)
+    spread_2 = brentq(excess, 1e-9, 10.0) * variance if len(values) > 1 and excess(1e-9) > 0.0 > excess(10.0) else 0.0
     weight = 1.0 / np.maximum(sigmas**2 + spread_2, 1e-300)
     mean = float(weight @ values / weight.sum())
     share = spread_2 / np.maximum(spread_2 + sigmas**2, 1e-300)
