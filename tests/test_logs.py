@@ -230,3 +230,32 @@ def test_reference_is_the_nearest_in_time_or_nothing():
     assert np.array_equal(at, [0.0, 1.0, 2.0, np.nan, 0.0], equal_nan=True)
     nothing = References(np.zeros(0, FRAME), "FL")
     assert np.all(np.isnan(nothing.at(np.array([0, 1]), nothing.clamp_force_N)))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: raw,
+        lambda raw: raw + raw,
+        lambda raw: raw[:-3],
+        lambda raw: raw[:200],
+        lambda raw: raw[:5],
+        lambda raw: raw[:30] + b"xxxx" + raw[34:],
+        lambda raw: raw[:-8] + b"12345678",
+        lambda raw: raw + b"rubbish",
+        lambda raw: raw + bytes(100),
+    ],
+)
+def test_a_fast_library_changes_nothing_of_what_is_read_or_said(damage, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("isal")
+    raw = damage(gzip.compress(np.random.default_rng(0).integers(0, 40, 100_000, np.uint8).tobytes()))
+
+    def outcome():
+        try:
+            return read.unpack_gzip(tmp_path, raw), capsys.readouterr().err
+        except InputError as error:
+            return str(error), capsys.readouterr().err
+
+    fast = outcome()
+    monkeypatch.setattr(read, "isal_zlib", None)
+    assert outcome() == fast

@@ -17,6 +17,7 @@ _COMMANDS = {
     "diagnose": "what sets units and batches apart, what drifts, by the disagreement of the force paths",
     "prior": "a calibration with the population's values, their spread, and bounds for adaptation",
     "report": "one page: map of units, worst ten, batches, trend, next action",
+    "bench": "how fast one core of this machine replays a log, stage by stage",
 }
 
 
@@ -36,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ingest.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
     for name in ("replay", "learn", "diagnose", "prior", "report"):
         parsers[name].add_argument("data", type=Path, metavar="DIR", help="data set of emb-daemon fleet ingest")
-    for name in ("replay", "learn", "diagnose", "prior"):
+    parsers["bench"].add_argument("log", type=Path, metavar="LOG", help="a log of a minute or more")
+    for name in ("replay", "learn", "diagnose", "prior", "bench"):
         parsers[name].add_argument(
             "--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A"
         )
@@ -197,4 +199,21 @@ def _prior(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_RUN = {"ingest": _ingest, "replay": _replay, "learn": _learn, "diagnose": _diagnose, "prior": _prior, "report": _report}
+def _bench(arguments: argparse.Namespace) -> int:
+    from emb_daemon.fleet.speed import stages
+
+    print(f"{'stage':<24}µs a sample   × real time")
+    for stage in stages(arguments.log, _calibration(arguments)):
+        print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
+    return 0
+
+
+_RUN = {
+    "ingest": _ingest,
+    "replay": _replay,
+    "learn": _learn,
+    "diagnose": _diagnose,
+    "prior": _prior,
+    "report": _report,
+    "bench": _bench,
+}
