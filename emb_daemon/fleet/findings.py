@@ -30,6 +30,9 @@ from emb_daemon.fleet.scores import Cause, Questions, Score
 PER_DAYS, PER_K = 30.0, 10.0
 #: A fleet is asked for drift if its drives span so many days, and for season if their surroundings span so many kelvins.
 _LEAST_DAYS, _LEAST_K = 5, 5.0
+#: Least force that is worth saying, N: of a group two parts in a thousand of a usual stop of 5 kN, as `diagnose` has it of a
+#: log; of a single unit the same of the 18 kN that training reaches, or no workshop could confirm it.
+_LEAST_SHARED_N, _LEAST_UNIT_N = 10.0, 36.0
 #: Points of a trend.
 _WINDOWS = 8
 #: Drives of a unit below which its own scatter is not known.
@@ -246,7 +249,7 @@ class _Study:
             slopes, uneven, own = self.read(name)
             shared = shared_causes(slopes, {ALL: self.masks[ALL]}, prints, own, beside=False)
             shared += shared_causes(slopes, self.groups, prints, own, beside=True)
-            over[name] = [self._shared(s, _ACTIONS[name]) for s in shared]
+            over[name] = self._shared(shared, _ACTIONS[name])
             if name == "day":
                 ageing = self._outliers(uneven, own, "ages unlike the others")
         unlike = self._outliers(apart, readings, "is unlike the others")
@@ -259,7 +262,7 @@ class _Study:
             left_out=left_out,
             directions=prints.shape[1],
             causes=len(self.causes),
-            groups=[self._shared(s, _ACTIONS["level"]) for s in groups],
+            groups=self._shared(groups, _ACTIONS["level"]),
             drifts=over["day"],
             seasons=over["warmth"],
             outliers=unlike,
@@ -287,22 +290,24 @@ class _Study:
             rivals=tuple(dict.fromkeys(self.causes[r].name for r in rivals if self.causes[r].name != own.name)),
         )  # fmt: skip
 
-    def _shared(self, shared: Shared, action: Callable[[str, Cause], str]) -> Finding:
-        members = self.masks[shared.group]
-        return self._finding(
-            shared.group, int(members.sum()), shared.cause, shared.amount, shared.sigma, shared.chance, shared.rivals, action
-        )
+    def _shared(self, shared: Sequence[Shared], action: Callable[[str, Cause], str]) -> list[Finding]:
+        found = [
+            self._finding(s.group, int(self.masks[s.group].sum()), s.cause, s.amount, s.sigma, s.chance, s.rivals, action)
+            for s in shared
+        ]
+        return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
     def _outliers(self, deviations: np.ndarray, readings: Readings, how: str) -> list[Finding]:
         def action(where: str, cause: Cause) -> str:
             return f"{where} {how}: train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}"
 
-        return [
+        found = [
             self._finding(
                 " ".join(self.keys[o.row]), 1, o.cause, o.amount, abs(o.amount / o.deviation), o.q_value, o.rivals, action
             )
             for o in outliers(deviations, readings)
         ]
+        return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
 
     def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
         amounts, rows = readings.of(deviations), readings.ordinary
