@@ -14,7 +14,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
-from emb_daemon.fleet.ingest import Job, ingest, jobs, log_files
+from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
 from emb_daemon.fleet.replaying import replay_drive
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.plant import scenarios as sc
@@ -282,6 +282,17 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
     still = replace(log, samples=log.samples[:100], time_ns=log.time_ns[:100])
     with pytest.raises(InputError, match=r"the pads never touch|no brake application"):
         scores.Questions(calibration).ask(still, drive)
+
+
+def test_a_training_is_learned_once(tmp_path, calibration):
+    plant = plant_from_calibration(calibration, 3)
+    frames, _ = simulate_log(plant, sc.rest(1.0) + sc.training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
+    drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
+    told = learning.learn_unit(tmp_path, drives, calibration)
+    [entry] = told["entries"]
+    assert told["trainings"] == 1 and entry["outcome"] == "accepted"
+    assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
+    assert learning.learn_unit(tmp_path, drives, calibration) == told
 
 
 def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):

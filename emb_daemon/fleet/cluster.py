@@ -80,8 +80,9 @@ def run(
 
     Raises:
         InputError: of a task, where ``failed`` is None.
+        Unavailable: the scheduler is gone.
     """
-    from distributed import as_completed
+    from distributed import CancelledError, as_completed
     from distributed.scheduler import KilledWorker
 
     results: list = [None] * len(items)
@@ -105,6 +106,8 @@ def run(
             if failed is None:
                 raise InputError(str(error)) from None
             results[row] = failed(items[row], str(error))
+        except CancelledError:
+            raise Unavailable("the scheduler is gone; the same command with --resume goes on when it is back") from None
         future.release()
         progress(done, len(items))
         if (following := submit()) is not None:

@@ -56,8 +56,8 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
             estimate(log.samples, pipeline.parameters, pipeline.states, adaptation)
             after = memory.read(corner)
             if after and after != before:
-                # The last entries are new; a file remembers more than one drive can hold.
-                new = after.history[-1:] if before is None else after.history[len(before.history) :] or after.history[-1:]
+                # A file that is full drops its oldest entry for a new one.
+                new = after.history[len(before.history) if before else 0 :] or after.history[-1:]
                 trainings += [{"day": drive.day, **msgspec.to_builtins(entry)} for entry in new]
     told |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
     told["trainings"] = sum(bool(entry["values"]) for entry in trainings)

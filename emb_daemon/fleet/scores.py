@@ -155,9 +155,6 @@ def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
     """Ask every drive of one unit's corner and keep what they say; returns why some say nothing, by digest.
 
     ``resume``: what is there of the same calibration is kept.
-
-    Raises:
-        InputError: a drive's file is missing or damaged.
     """
     questions, path = Questions(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
