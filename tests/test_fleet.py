@@ -228,9 +228,9 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory, calibration):
-    """Twelve units on three days, the half of which have 80 N of viscous friction; what was found of them."""
+    """Twelve units on three days, the half of which have 130 N of viscous friction; what was found of them."""
     root = tmp_path_factory.mktemp("fleet")
-    secret = study.Secret("viscous_friction", 80.0, {"viscous_Nms_per_rad": 6e-5})
+    secret = study.Secret("viscous_friction", 130.0, {"viscous_Nms_per_rad": 1e-4})
     units = {f"unit-{number:02d}": "AB"[number % 2] for number in range(12)}
     drawn = study.Fleet(5, 3, units, {"A": secret}, {}, study.Secret("viscous_friction", 0.0, {"viscous_Nms_per_rad": 0.0}))
     for unit in units:
@@ -243,12 +243,12 @@ def fleet(tmp_path_factory, calibration):
     return root, found
 
 
-def test_what_no_single_car_shows_a_batch_does(fleet):
+def test_what_a_batch_shares_is_named_without_a_force_sensor(fleet):
     _, found = fleet
     [one] = found.groups
     # Of the two halves either may be called the one that is apart.
     assert one.cause == "viscous_friction" and one.where in ("batch A", "batch B")
-    assert 40.0 < one.size_N * (1.0 if one.where == "batch A" else -1.0) < 120.0
+    assert 65.0 < one.size_N * (1.0 if one.where == "batch A" else -1.0) < 195.0
     assert not found.outliers and not found.ageing
     assert len(found.units) == 12 and found.drives == 36
 

@@ -35,8 +35,8 @@ _LEAST_DAYS, _LEAST_K = 5, 5.0
 _LEAST_SHARED_N, _LEAST_UNIT_N = 10.0, 36.0
 #: Points of a trend.
 _WINDOWS = 8
-#: Drives of a unit below which its own scatter is not known.
-_LEAST_DRIVES = 3
+#: Drives of a unit below which its own scatter is not known, and from which slopes over two covariates leave as many for it.
+_LEAST_DRIVES, _SLOPE_DRIVES = 3, 6
 ALL = "all units"
 
 Fleet = Mapping[tuple[str, str], Sequence[Score]]
@@ -181,21 +181,23 @@ def find(
     Raises:
         InputError: too few units to tell one from the others.
     """
+    slopes = np.median([len(scores) for scores in fleet.values()] or [0]) >= _SLOPE_DRIVES
+    least = _SLOPE_DRIVES if slopes else _LEAST_DRIVES
+    placed = {key: scores for key, scores in fleet.items() if len(scores) >= least}
     left_out = {
-        f"{unit} {corner}": f"{len(scores)} drives that say something, expected {_LEAST_DRIVES}"
+        f"{unit} {corner}": f"{len(scores)} drives that say something, expected {least}"
         for (unit, corner), scores in fleet.items()
-        if len(scores) < _LEAST_DRIVES
+        if (unit, corner) not in placed
     }
-    placed = {key: scores for key, scores in fleet.items() if len(scores) >= _LEAST_DRIVES}
     if len(placed) < 2 * LEAST_UNITS:
-        raise InputError(f"{len(placed)} units with {_LEAST_DRIVES} drives or more, expected at least {2 * LEAST_UNITS}")
-    return _Study(placed, questions, factors).findings(calibration, dict(silent), left_out)
+        raise InputError(f"{len(placed)} units with {least} drives or more, expected at least {2 * LEAST_UNITS}")
+    return _Study(placed, questions, factors, bool(slopes)).findings(calibration, dict(silent), left_out)
 
 
 class _Study:
     """The population's vectors, and findings made of them."""
 
-    def __init__(self, fleet: Fleet, questions: Questions, factors: Mapping[str, Mapping[str, str]]):
+    def __init__(self, fleet: Fleet, questions: Questions, factors: Mapping[str, Mapping[str, str]], slopes: bool):
         self.keys, self.scores, self.causes = list(fleet), list(fleet.values()), questions.causes
         self.every = [score for scores in self.scores for score in scores]
         self.directions = Directions.of(self.every)
@@ -205,9 +207,9 @@ class _Study:
         warmth = np.array([score.ambient_C for score in self.every])
         self.warmth_C = float(np.nanmean(warmth)) if np.isfinite(warmth).any() else 0.0
         self.covariates = ["level"]
-        if self.span >= _LEAST_DAYS - 1:
+        if slopes and self.span >= _LEAST_DAYS - 1:
             self.covariates.append("day")
-        if np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
+        if slopes and np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
             self.covariates.append("warmth")
         self.units = [self._unit(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
         named = sorted({name for levels in factors.values() for name in levels})
