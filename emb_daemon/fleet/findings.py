@@ -253,8 +253,8 @@ class _Study:
             shared += shared_causes(slopes, self.groups, prints, own, beside=True)
             over[name] = self._shared(shared, _ACTIONS[name])
             if name == "day":
-                ageing = self._outliers(uneven, own, "ages unlike the others")
-        unlike = self._outliers(apart, readings, "is unlike the others")
+                ageing = self._outliers(uneven, own, _ACTIONS["ageing"])
+        unlike = self._outliers(apart, readings, _ACTIONS["unit"])
         return Findings(
             calibration=calibration,
             first_day=_date(self.start),
@@ -283,26 +283,23 @@ class _Study:
         sigma: float,
         chance: float,
         rivals: Sequence[int],
-        action: Callable[[str, Cause], str],
+        action: Callable[[Cause], str],
     ) -> Finding:
         own, size = self.causes[cause], float(self.directions.size_N[cause])
         return Finding(
             where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=amount, sigma=sigma, unit=own.unit,
-            size_N=amount * size, sigma_N=sigma * size, chance=chance, action=action(where, own),
+            size_N=amount * size, sigma_N=sigma * size, chance=chance, action=action(own),
             rivals=tuple(dict.fromkeys(self.causes[r].name for r in rivals if self.causes[r].name != own.name)),
         )  # fmt: skip
 
-    def _shared(self, shared: Sequence[Shared], action: Callable[[str, Cause], str]) -> list[Finding]:
+    def _shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
         found = [
             self._finding(s.group, int(self.masks[s.group].sum()), s.cause, s.amount, s.sigma, s.chance, s.rivals, action)
             for s in shared
         ]
         return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
-    def _outliers(self, deviations: np.ndarray, readings: Readings, how: str) -> list[Finding]:
-        def action(where: str, cause: Cause) -> str:
-            return f"{where} {how}: train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}"
-
+    def _outliers(self, deviations: np.ndarray, readings: Readings, action: Callable[[Cause], str]) -> list[Finding]:
         found = [
             self._finding(
                 " ".join(self.keys[o.row]), 1, o.cause, o.amount, abs(o.amount / o.deviation), o.q_value, o.rivals, action
@@ -386,11 +383,10 @@ def _manoeuvre(cause: Cause) -> str:
     )
 
 
-_ACTIONS: dict[str, Callable[[str, Cause], str]] = {
-    "level": lambda where, cause: (
-        f"take two units of {where} to a rig with a force sensor; {_manoeuvre(cause)}; "
-        "until then fleet prior, with this group alone, gives it a calibration of its own"
-    ),
-    "day": lambda where, cause: f"have the daemons of {where} train more often, or the calibration follow {cause.name}",
-    "warmth": lambda where, cause: f"{cause.name} of {where} follows the surroundings: an effect over temperature is missing",
+_ACTIONS: dict[str, Callable[[Cause], str]] = {
+    "level": lambda cause: f"Take two units to a rig with a force sensor, and emb-daemon diagnose; {_manoeuvre(cause)}.",
+    "day": lambda _: "Have the daemons train more often, or let the calibration follow.",
+    "warmth": lambda _: "The calibration lacks an effect over temperature: emb-daemon diagnose on cold and warm drives.",
+    "unit": lambda cause: f"Train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}.",
+    "ageing": lambda cause: f"It ages unlike the others: train it, and look at it again in a month; {_manoeuvre(cause)}.",
 }

@@ -10,7 +10,7 @@ from emb_daemon import __version__
 from emb_daemon.fleet.dataset import ingested
 from emb_daemon.fleet.findings import PER_DAYS, PER_K, Finding, Findings, Placed, load
 from emb_daemon.report.figures import ACCENT, GRID, INK, Panel, Style, Trace, xy_figure
-from emb_daemon.report.page import Page
+from emb_daemon.report.page import Page, Section
 
 #: Rows of the page's tables: what is read in five minutes; findings.json has all.
 _WORST, _SPREAD_ROWS, _FAULT_ROWS = 10, 12, 10
@@ -34,7 +34,8 @@ def fleet_page(root: Path) -> Page:
     )
     unlike = [*found.outliers, *found.ageing]
     page.verdict(not (found.groups or unlike), _headline(found))
-    actions = list(dict.fromkeys(one.action for one in (*found.groups, *unlike[:_WORST], *found.drifts, *found.seasons)))
+    accused = [*found.groups, *unlike[:_WORST], *found.drifts, *found.seasons]
+    actions = [f"{one.where}: {_words(one.cause)}, {one.size_N:+.0f} N. {one.action}" for one in accused]
     page.section("What to do next").items(actions or ["Nothing: units differ as healthy units do."])
     caption = (
         "What a group has over all other units: RMS of the force in contact ± a standard deviation from how units differ; "
@@ -46,9 +47,10 @@ def fleet_page(root: Path) -> Page:
         "One mark for each unit by what sets it furthest apart from its group, in standard deviations of ordinary units. "
         f"Ringed ones are named below. The colour is full at {_FULL:g}.",
     )
+    more = f" {len(unlike) - _WORST} more in findings.json." if len(unlike) > _WORST else ""
     caption = (
         "The worst first, over the unit's own group; chance that a row is false (Benjamini and Hochberg): these are "
-        f"only looked at in a workshop. {max(len(unlike) - _WORST, 0)} more in findings.json."
+        f"only looked at in a workshop.{more}"
     )
     _table(page, "Units unlike the others", unlike[:_WORST], caption, "None is proven to be.")
     _trends(page, found)
@@ -75,7 +77,7 @@ def _quantity(value: float, unit: str) -> str:
     return f"{value:+.3g}" if unit == "1" else f"{value:+.3g} {unit}"
 
 
-def _table(page: Page, title: str, findings: list[Finding], caption: str, otherwise: str) -> None:
+def _table(page: Page, title: str, findings: list[Finding], caption: str, otherwise: str) -> Section:
     rows = [
         [
             one.where, str(one.units), _words(one.cause), f"{one.size_N:+.0f} ± {one.sigma_N:.0f}",
@@ -84,10 +86,7 @@ def _table(page: Page, title: str, findings: list[Finding], caption: str, otherw
         for one in findings
     ]  # fmt: skip
     section = page.section(title)
-    if rows:
-        section.table(_COLUMNS, rows, caption)
-    else:
-        section.text(otherwise)
+    return section.table(_COLUMNS, rows, caption) if rows else section.text(otherwise)
 
 
 def _map(units: list[Placed]):
@@ -137,7 +136,7 @@ def _map(units: list[Placed]):
 def _trends(page: Page, found: Findings) -> None:
     caption = f"Drift per {PER_DAYS:g} days, season per {PER_K:g} K of the surroundings' temperature; chance as for batches."
     otherwise = "Nothing drifts, and nothing follows the surroundings' temperature."
-    _table(page, "Trend", [*found.drifts, *found.seasons], caption, otherwise)
+    section = _table(page, "Trend", [*found.drifts, *found.seasons], caption, otherwise)
     style = Style(ACCENT, mode="lines+markers")
     panels = [
         Panel(
@@ -150,8 +149,9 @@ def _trends(page: Page, found: Findings) -> None:
         if len(trend.days) > 1
     ]
     if panels:
-        page.section("Month", "All drives of a group together, window by window, ± one standard deviation.").figure(
-            xy_figure(panels, "days since the first drive")
+        section.figure(
+            xy_figure(panels, "days since the first drive"),
+            "All drives of a group together, window by window, ± one standard deviation.",
         )
 
 
