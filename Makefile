@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit fleet
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -80,6 +80,11 @@ audit: $(SUPPLY)/pip-audit
 	$(SUPPLY)/pip-audit --strict --disable-pip --require-hashes -r requirements-box.lock
 	$(SUPPLY)/pip-audit --strict --disable-pip --require-hashes -r requirements-secoc.lock
 
+# A simulated fleet of 200 units for 30 days, three batches and ten units of which have secrets: are they found, and no others?
+FLEET_SEED ?= 1
+fleet: $(READY)
+	$(VENV)/bin/python -m studies.fleet --seed $(FLEET_SEED)
+
 lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -90,7 +95,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra secoc --extra docs --extra live --extra workshop --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra secoc --extra docs --extra fleet --extra live --extra workshop --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 	$(VENV)/bin/pip install --quiet --require-hashes -r requirements.lock
 	$(VENV)/bin/python tools/lock_box.py

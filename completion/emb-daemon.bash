@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose effect simulate monitor files compile export uds bench adaptation --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose fleet effect simulate monitor files compile export uds bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -19,6 +19,7 @@ _emb_daemon() {
         convert) options="--mapping --output" ;;
         identify) options="--mapping --output --report --example" ;;
         diagnose) options="--calibration --validate --output --mapping --corner" ;;
+        fleet) options="" ;;
         effect) options="" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         monitor) options="--once --json --web --record --udp -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;

@@ -129,7 +129,7 @@ class Replay:
     def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
         """Put a log's times on the drive's clock, in place; returns what was added."""
         if self._pipeline is None:
-            self._build(_corners_in(frames, path))
+            self._build(corners_in(frames, path))
         first = int(frames["time_ns"][0])
         if self._end_ns is None:
             self._pipeline.begin(first)
@@ -164,7 +164,11 @@ class Replay:
         shift = self._on_the_drive(frames, path)
         pipeline = self._pipeline
         samples = collect(frames, pipeline)
-        mine = {corner: samples["corner"] == corner_index(corner) for corner in self.corners}
+        if len(self.corners) == 1:
+            # Views: rows of a long log are half a kilobyte each.
+            mine: dict = {self.corners[0]: slice(None)}
+        else:
+            mine = {corner: samples["corner"] == corner_index(corner) for corner in self.corners}
         logs = {corner: make_log(samples[rows], frames, corner, Path(path)) for corner, rows in mine.items()}
         if self._measured_torque:
             for corner, log in logs.items():
@@ -177,7 +181,7 @@ class Replay:
         return [result.since(self._start_ns(frames) - shift) for result in results] if self._start_s > 0.0 else results
 
 
-def _corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:
+def corners_in(frames: np.ndarray, path: Path) -> tuple[str, ...]:
     decoder = Decoder()
     heard = set(np.unique(frames["can_id"]).tolist())
     found = tuple(corner for corner in CORNERS if decoder.can_id(f"EMB_{corner}_Resolver") in heard)

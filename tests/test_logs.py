@@ -265,3 +265,32 @@ def test_a_reader_that_fails_takes_nothing_with_it(tmp_path, monkeypatch, deed, 
     monkeypatch.setattr(apart, "_START_S", 1.0)
     with pytest.raises(InputError, match=said):
         read_frames(tmp_path / "x.blf")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: raw,
+        lambda raw: raw + raw,
+        lambda raw: raw[:-3],
+        lambda raw: raw[:200],
+        lambda raw: raw[:5],
+        lambda raw: raw[:30] + b"xxxx" + raw[34:],
+        lambda raw: raw[:-8] + b"12345678",
+        lambda raw: raw + b"rubbish",
+        lambda raw: raw + bytes(100),
+    ],
+)
+def test_a_fast_library_changes_nothing_of_what_is_read_or_said(damage, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("isal")
+    raw = damage(gzip.compress(np.random.default_rng(0).integers(0, 40, 100_000, np.uint8).tobytes()))
+
+    def outcome():
+        try:
+            return read.unpack_gzip(tmp_path, raw), capsys.readouterr().err
+        except InputError as error:
+            return str(error), capsys.readouterr().err
+
+    fast = outcome()
+    monkeypatch.setattr(read, "isal_zlib", None)
+    assert outcome() == fast

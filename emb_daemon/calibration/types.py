@@ -358,11 +358,20 @@ class Calibration(Struct, kw_only=True):
         if faults:
             raise InvalidValue("\n".join(faults))
 
+    def __reduce__(self):
+        # A default that is left out is told by identity: field by field, a copy in another process would state it and have
+        # another hash.
+        return _decoded, (msgspec.json.encode(self),)
+
     @property
     def training_force_N(self) -> float:
         """Clamp force up to which training motion is asked for."""
         share_of_maximum = _TRAINING_SHARE * self.stiffness.maximum_force_N
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
+
+
+def _decoded(content: bytes) -> Calibration:
+    return msgspec.json.decode(content, type=Calibration)
 
 
 def _fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:

@@ -18,6 +18,7 @@ COMMANDS = {
     "convert": "another rig's log as ours, by a mapping file",
     "identify": "calibration from a rig campaign, with its evidence",
     "diagnose": "find what the model lacks, add it, and show the error before and after",
+    "fleet": "many units and drives: ingest, replay, learn, diagnose, prior, report",
     "effect": "a term that diagnose found, as an effect file",
     "simulate": "the simulated car on a bus",
     "monitor": "live view of a running daemon's broadcasts",
@@ -29,12 +30,15 @@ COMMANDS = {
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
 
-#: Libraries of the extra of the same name.
-_OFFLINE = ("matplotlib", "plotly", "pyarrow", "scipy")
-#: Extras of other libraries.
-_EXTRAS = {"isotp": "workshop", "mcap": "live"}
+#: Extras by the library that only they bring.
+_EXTRAS = dict.fromkeys(("matplotlib", "plotly", "pyarrow", "scipy"), "offline") | {
+    "dask": "fleet",
+    "distributed": "fleet",
+    "isotp": "workshop",
+    "mcap": "live",
+}
 #: Commands that end in one of them and begin with long work.
-_NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly")}
+_NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly"), "fleet": ("distributed",)}
 #: Commands of a box without a compiler; all others need numba.
 _WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "adaptation")
 
@@ -78,9 +82,9 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in (*_OFFLINE, *_EXTRAS, "numba"):
+        if missing not in (*_EXTRAS, "numba"):
             raise
-        package = "numba" if missing == "numba" else f"'emb_daemon[{_EXTRAS.get(missing, 'offline')}]'"
+        package = f"'emb_daemon[{_EXTRAS[missing]}]'" if missing in _EXTRAS else missing
         print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:

@@ -129,14 +129,15 @@ class Bench:
         """``mounted``: for each log what the calibration says otherwise of it alone (`Trial.mounted`). ``own_data``:
         the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
         self.calibration, self.own_data = calibration, own_data
-        self._pool = ThreadPoolExecutor(workers)
+        # A thread that waits for one other costs more than what most of these tasks do.
+        self._map = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
 
         def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
             force = run_step(log.samples, held(to_parameters(moved(calibration, here))))["force"]
             return make_trial(log, index, force, here)
 
-        self.trials = list(self._pool.map(trial, range(len(logs)), logs, mounted))
+        self.trials = list(self._map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
         #: Whether the motor can reach pads at all; else the load on the spindle is no function of its angle.
         self.clamps = calibration.contact.clearance_rad < _NOTHING_TO_CLAMP_RAD
@@ -203,7 +204,7 @@ class Bench:
 
     def residuals(self, values: Values) -> dict[str, np.ndarray]:
         """Residual by channel over all logs."""
-        return self._joined(list(self._pool.map(lambda trial: self._residual(trial, values), self.trials)))
+        return self._joined(list(self._map(lambda trial: self._residual(trial, values), self.trials)))
 
     def _joined(self, parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
         return {channel: np.concatenate([part[channel] for part in parts]) for channel in self.channels}
@@ -245,7 +246,7 @@ class Bench:
         force does to its own heat is a hundredth of a hundredth of it."""
         heat: list = []
         if any(probe.coordinate.channel in FORCE_CHANNELS for probe in probes):
-            heat = list(self._pool.map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
+            heat = list(self._map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
 
         def answer(probe: Probe) -> np.ndarray:
             coordinate, tried = probe.coordinate, {**values, **dict(probe.shape)}
@@ -255,7 +256,7 @@ class Bench:
             known = [] if coordinate.name == HISTORY_TIME else heat
             return (at[coordinate.channel] - self._probed(tried, coordinate.channel, known)) / step
 
-        return list(self._pool.map(answer, probes))
+        return list(self._map(answer, probes))
 
     def _probed(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
         """One channel's residual, a force path's with heat held."""

@@ -1,5 +1,7 @@
 """Signals of a log as columns: reference instruments for judging, and any message for plots."""
 
+from functools import cache
+
 import numpy as np
 
 from emb_daemon.jit import njit
@@ -41,11 +43,17 @@ def crc_is_right(frames):
     return right
 
 
+@cache
+def _database(dbc: str):
+    """Parsing a DBC takes as long as replaying half a minute."""
+    return load_database(resource(dbc))
+
+
 class Decoder:
     """Whole columns out of FRAME arrays, by message and signal name of a DBC."""
 
     def __init__(self, dbc: str = "dbc/emb.dbc"):
-        self._database = load_database(resource(dbc))
+        self._database = _database(dbc)
 
     def can_id(self, message: str) -> int:
         return self._database.get_message_by_name(message).frame_id

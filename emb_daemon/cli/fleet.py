@@ -1,0 +1,219 @@
+"""emb-daemon fleet."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
+  emb-daemon fleet diagnose fleet --units units.csv
+  emb-daemon fleet report fleet --output fleet.html"""
+
+_COMMANDS = {
+    "ingest": "log files into a data set partitioned by unit, corner and day: each once, damaged ones listed",
+    "replay": "estimates, figures and integrity of every drive, equal to those of emb-daemon replay",
+    "learn": "what park brake adaptation learns of each unit, drive by drive",
+    "diagnose": "what sets units and batches apart, what drifts, by the disagreement of the force paths",
+    "prior": "a calibration with the population's values, their spread, and bounds for adaptation",
+    "report": "one page: map of units, worst ten, batches, trend, next action",
+    "bench": "how fast one core of this machine replays a log, stage by stage",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="fleet_command", metavar="COMMAND", required=True)
+    parsers = {name: commands.add_parser(name, help=text, description=text) for name, text in _COMMANDS.items()}
+    ingest = parsers["ingest"]
+    ingest.add_argument(
+        "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"
+    )
+    ingest.add_argument("--output", type=Path, required=True, metavar="DIR", help="the data set, made if it is not there")
+    ingest.add_argument(
+        "--unit",
+        metavar="REGEX",
+        help="finds (?P<unit>…), and (?P<day>…) if it has that, in a log's path; default: its folder",
+    )
+    ingest.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
+    for name in ("replay", "learn", "diagnose", "prior", "report"):
+        parsers[name].add_argument("data", type=Path, metavar="DIR", help="data set of emb-daemon fleet ingest")
+    parsers["bench"].add_argument("log", type=Path, metavar="LOG", help="a log of a minute or more")
+    for name in ("replay", "learn", "diagnose", "prior", "bench"):
+        parsers[name].add_argument(
+            "--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A"
+        )
+    for name in ("ingest", "replay", "learn", "diagnose"):
+        parsers[name].add_argument(
+            "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see DIR; default: this machine"
+        )
+        parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
+    for name in ("ingest", "replay", "learn", "diagnose"):
+        parsers[name].add_argument("--resume", action="store_true", help="go on: keep what is there of the same calibration")
+    parsers["diagnose"].add_argument(
+        "--units", type=Path, metavar="FILE.csv", help="what units have in common: columns unit, batch, supplier, ..."
+    )
+    parsers["prior"].add_argument("--output", type=Path, required=True, metavar="FILE.yaml", help="the calibration to write")
+    parsers["report"].add_argument("--output", type=Path, required=True, metavar="FILE.html", help="the page to write")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return _RUN[arguments.fleet_command](arguments)
+
+
+def _calibration(arguments: argparse.Namespace):
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.resources import resource
+
+    return load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+
+
+def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable | None = None) -> list:
+    """``task`` of every item on the cluster, with a bar on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from emb_daemon.fleet.cluster import cluster
+    from emb_daemon.fleet.cluster import run as run_on
+
+    if not items:
+        return []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        row = bar.add_task(text, total=len(items))
+        with cluster(arguments.scheduler, arguments.workers) as client:
+            return run_on(client, task, items, lambda done, total: bar.update(row, completed=done), failed)
+
+
+def _ingest(arguments: argparse.Namespace) -> int:
+    from functools import partial
+
+    from emb_daemon.fleet import ingest
+
+    root = arguments.output.absolute()
+    paths = ingest.log_files(arguments.logs)
+    jobs = ingest.jobs(root, paths, arguments.unit or ingest.UNIT_OF_PATH, arguments.mapping and arguments.mapping.absolute())
+    done = _work(arguments, "reading logs", partial(ingest.ingest, root), jobs, partial(ingest.give_up, root))
+    damaged = [known for known in done if known["fault"]]
+    drives = sum(len(known["drives"]) for known in done)
+    print(f"{len(done)} of {len(paths)} logs are new: {drives} drives, {len(damaged)} damaged")
+    for known in damaged:
+        print(f"  {known['fault']}", file=sys.stderr)
+    for known in done:
+        if known["notes"]:
+            print(f"  {known['notes']}", file=sys.stderr)
+    return 0
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from functools import partial
+
+    from emb_daemon.calibration.files import calibration_hash
+    from emb_daemon.fleet import dataset, replaying
+
+    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    drives, mark = dataset.drives(root), calibration_hash(calibration)
+    left = [d for d in drives if not (arguments.resume and replaying.is_replayed(root, d, mark))]
+    done = _work(arguments, "replaying", partial(replaying.replay_drive, root, calibration=calibration), left, _fault)
+    faults = [text for text in done if isinstance(text, str)]
+    seconds = sum(figures["seconds"] for figures in done if not isinstance(figures, str))
+    print(f"{len(done) - len(faults)} of {len(drives)} drives replayed, {seconds / 3600.0:.2f} h")
+    for text in faults:
+        print(f"  {text}", file=sys.stderr)
+    return 0
+
+
+def _fault(_item: Any, reason: str) -> str:
+    return reason
+
+
+def _diagnose(arguments: argparse.Namespace) -> int:
+    from functools import partial
+
+    from emb_daemon.calibration.files import calibration_hash
+    from emb_daemon.fleet import dataset, findings, scores
+
+    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    factors = findings.read_units(arguments.units) if arguments.units else {}
+    groups = list(dataset.by_unit(dataset.drives(root)).values())
+    task = partial(scores.score_unit, root, calibration=calibration, resume=arguments.resume)
+    done = _work(arguments, "asking drives", task, groups, lambda drives, reason: {d.digest: reason for d in drives})
+    silent = {digest: reason for told in done for digest, reason in told.items()}
+    fleet = scores.read_fleet(root, calibration)
+    found = findings.find(fleet, scores.Questions(calibration), calibration_hash(calibration), factors, silent)
+    findings.save(found, root)
+    _print(found)
+    return 0
+
+
+def _print(found) -> None:
+    print(
+        f"{len(found.units)} units, {found.drives} drives from {found.first_day} to {found.last_day}; "
+        f"{len(found.silent)} say nothing"
+    )
+    for title, group in (
+        ("shared", found.groups), ("drift, per 30 days", found.drifts), ("season, per 10 K", found.seasons),
+        ("unlike the others", found.outliers), ("ages unlike the others", found.ageing),
+    ):  # fmt: skip
+        print(f"{title}: {'nothing' if not group else ''}")
+        for one in group:
+            rivals = f"; or {', '.join(one.rivals)}" if one.rivals else ""
+            print(f"  {one.where}: {one.cause} {one.size_N:+.0f} ± {one.sigma_N:.0f} N (chance {one.chance:.1g}){rivals}")
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from emb_daemon.cli.outputs import check_output
+    from emb_daemon.fleet.page import fleet_page
+
+    check_output(arguments.output, ())
+    fleet_page(arguments.data.absolute()).write(arguments.output)
+    return 0
+
+
+def _learn(arguments: argparse.Namespace) -> int:
+    from functools import partial
+
+    from emb_daemon.fleet import dataset, learning
+
+    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    groups = list(dataset.by_unit(dataset.drives(root)).values())
+    task = partial(learning.learn_unit, root, calibration=calibration, resume=arguments.resume)
+    done = _work(arguments, "learning", task, groups, _fault)
+    learned = [told for told in done if not isinstance(told, str)]
+    print(f"{len(learned)} units, {sum(told['trainings'] for told in learned)} trainings accepted")
+    for text in done:
+        if isinstance(text, str):
+            print(f"  {text}", file=sys.stderr)
+    return 0
+
+
+def _prior(arguments: argparse.Namespace) -> int:
+    from emb_daemon.calibration.files import save_calibration
+    from emb_daemon.cli.outputs import check_output
+    from emb_daemon.fleet.learning import prior
+
+    check_output(arguments.output, (arguments.calibration,), (".yaml",))
+    calibration, told = prior(arguments.data.absolute(), _calibration(arguments))
+    save_calibration(calibration, arguments.output)
+    for key, (mean, sigma, spread, units) in told.items():
+        print(f"{key}: {mean:.6g} ± {sigma:.2g}, spread {spread:.2g} over {units} units")
+    return 0
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from emb_daemon.fleet.speed import stages
+
+    print(f"{'stage':<24}µs a sample   × real time")
+    for stage in stages(arguments.log, _calibration(arguments)):
+        print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
+    return 0
+
+
+_RUN = {
+    "ingest": _ingest,
+    "replay": _replay,
+    "learn": _learn,
+    "diagnose": _diagnose,
+    "prior": _prior,
+    "report": _report,
+    "bench": _bench,
+}

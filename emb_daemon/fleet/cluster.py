@@ -1,0 +1,115 @@
+"""Work on a Dask cluster: an existing one by its scheduler's address, or processes of this machine.
+
+Tasks are small and their results are files that are whole or not there, so that Dask may run one again wherever a worker dies,
+and what a killed client left is gone on with.
+"""
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from emb_daemon.errors import InputError, Unavailable
+
+#: Workers that a task may take along before it is given up: a fault of the file, not of the machine.
+_LIVES = 3
+#: Tasks that the scheduler holds per worker: enough that none waits for the client, few enough that 10⁷ logs need no memory.
+_AHEAD = 20
+#: A scheduler that does not answer for so long is not there, s.
+_PATIENCE_S = 10
+
+
+@contextlib.contextmanager
+def cluster(address: str | None = None, workers: int | None = None) -> Iterator[Any]:
+    """A `distributed.Client`.
+
+    Args:
+        address: of a scheduler (``tcp://host:8786``) whose workers see the data set; None: processes of this machine.
+        workers: of those; as many as there are cores if None.
+
+    Raises:
+        Unavailable: no scheduler answers.
+        InputError: the address is none.
+    """
+    # One thread each: a worker is a core, and BLAS must not think otherwise.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import dask
+    from distributed import Client, LocalCluster
+
+    with dask.config.set(
+        {"distributed.scheduler.allowed-failures": _LIVES, "distributed.admin.large-graph-warning-threshold": "1GB"}
+    ):
+        if address:
+            try:
+                client = Client(address, timeout=_PATIENCE_S)
+            except (OSError, TimeoutError):
+                raise Unavailable(f"{address}: no scheduler answers there") from None
+            except ValueError as error:
+                raise InputError(f"--scheduler {address}: {error}, expected tcp://HOST:PORT") from None
+            with client:
+                yield client
+            return
+        count = workers or len(os.sched_getaffinity(0))
+        with (
+            LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.ERROR,
+            ) as local,
+            Client(local) as client,
+        ):
+            yield client
+
+
+def run(
+    client: Any,
+    task: Callable,
+    items: Sequence,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    failed: Callable[[Any, str], Any] | None = None,
+) -> list:
+    """``task(item)`` of every item, in their order.
+
+    Args:
+        progress: called with how many are done of how many.
+        failed: what stands for an item whose task raises InputError or outlives no worker, by item and reason; such an error
+            ends the work if None.
+
+    Raises:
+        InputError: of a task, where ``failed`` is None.
+        Unavailable: the scheduler is gone.
+    """
+    from distributed import CancelledError, as_completed
+    from distributed.scheduler import KilledWorker
+
+    results: list = [None] * len(items)
+    waiting = iter(enumerate(items))
+    row_of: dict = {}
+
+    def submit() -> Any:
+        for row, item in waiting:
+            future = client.submit(task, item, pure=False)
+            row_of[future.key] = row
+            return future
+        return None
+
+    ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    running = as_completed([future for future in (submit() for _ in range(min(ahead, len(items)))) if future])
+    for done, future in enumerate(running, start=1):
+        row = row_of.pop(future.key)
+        try:
+            results[row] = future.result()
+        except (InputError, KilledWorker) as error:
+            if failed is None:
+                raise InputError(str(error)) from None
+            results[row] = failed(items[row], str(error))
+        except CancelledError:
+            raise Unavailable("the scheduler is gone; the same command with --resume goes on when it is back") from None
+        future.release()
+        progress(done, len(items))
+        if (following := submit()) is not None:
+            running.add(following)
+    return results

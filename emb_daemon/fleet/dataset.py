@@ -1,0 +1,165 @@
+"""A fleet's data set: a folder that every worker sees, Parquet partitioned by unit, corner and day, nothing else.
+
+::
+
+    drives/unit=…/corner=…/day=…/DIGEST.parquet     samples of one log, DIGEST the beginning of the log's SHA-256
+    ingested/DIGEST.json                            what became of each log file, damaged ones too
+    estimates/…, figures/…                          `fleet replay`, partitioned alike
+    evidence/…, learned/…                           `fleet diagnose`, `fleet learn`: one file for each unit and corner
+
+Files are whole at every moment and are never changed; who writes one twice writes the same bytes.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.logs.columns import References
+from emb_daemon.offline.log import Log
+from emb_daemon.wire.frames import FRAME
+
+#: Characters of a log's SHA-256 that name it: 64 bits, no two alike among 10⁷ logs but for one chance in 10⁵.
+DIGEST = 16
+_FORMAT, _KEY = 1, b"emb_daemon"
+_FORCE = "clamp_force_ref_N"
+
+
+@dataclass(frozen=True, order=True)
+class Drive:
+    """One log's samples of one corner. ``day`` is ISO 8601; drives of one unit and corner sort by time."""
+
+    unit: str
+    corner: str
+    day: str
+    begin_ns: int
+    digest: str
+
+    @property
+    def partition(self) -> Path:
+        return partition(self.unit, self.corner) / f"day={quote(self.day, safe='')}"
+
+
+@dataclass(frozen=True)
+class About:
+    """What a drive's file says of its log, beside the samples.
+
+    Attributes:
+        refused: frames of the corner and the car that E2E, sequence or range did not pass, by verdict.
+        notes: what the reader had to say: cut off, brought to our rate.
+    """
+
+    source: str
+    refused: dict[str, int]
+    notes: str
+
+
+def partition(unit: str, corner: str) -> Path:
+    return Path(f"unit={quote(unit, safe='')}") / f"corner={corner}"
+
+
+def folder_of(path: Path, *parts: str | Path) -> Path:
+    """A folder of the data set, made if it is not there.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = Path(path, *parts)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be a folder of the data set: {error.strerror}") from None
+    return folder
+
+
+def write_drive(root: Path, drive: Drive, about: About, samples: np.ndarray, force_N: np.ndarray) -> Path:
+    """SAMPLE rows of one drive, and the reference force where a rig has one; whole or not at all."""
+    import pyarrow
+    import pyarrow.parquet
+
+    columns = {name: np.ascontiguousarray(samples[name]) for name in SAMPLE.names}
+    if np.isfinite(force_N).any():
+        columns[_FORCE] = force_N
+    table = pyarrow.table(columns)
+    described = {"format": _FORMAT, **asdict(drive), **asdict(about)}
+    table = table.replace_schema_metadata({_KEY: json.dumps(described, sort_keys=True)})
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(table, sink, compression="zstd", compression_level=1)
+    path = folder_of(root, "drives", drive.partition) / f"{drive.digest}.parquet"
+    write_atomically(path, sink.getvalue())
+    return path
+
+
+def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
+    """A drive as it was ingested.
+
+    Raises:
+        InputError: no such drive, or not a file of ours.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    path = Path(root, "drives", drive.partition, f"{drive.digest}.parquet")
+    try:
+        # The folders' names are no columns of ours.
+        table = pyarrow.parquet.ParquetFile(path).read(use_threads=False)
+        described = json.loads(table.schema.metadata[_KEY])
+        samples = np.zeros(len(table), SAMPLE)
+        for name in SAMPLE.names:
+            samples[name] = table.column(name).to_numpy()
+        force = table.column(_FORCE).to_numpy() if _FORCE in table.column_names else np.full(len(samples), np.nan)
+    except (OSError, KeyError, TypeError, ValueError, pyarrow.ArrowException) as error:
+        raise InputError(f"{path}: not a drive of this data set: {error}") from None
+    about = About(**{name: described[name] for name in About.__dataclass_fields__})
+    log = Log(path, drive.corner, samples, samples["time_ns"], References(np.zeros(0, FRAME), drive.corner), force)
+    return log, about
+
+
+def drives(root: Path) -> list[Drive]:
+    """Everything ingested, by unit, corner and time.
+
+    Raises:
+        InputError: nothing is.
+    """
+    found = [Drive(**entry) for known in ingested(root) for entry in known["drives"]]
+    if not found:
+        raise InputError(f"{root}: holds no drives, expected a data set of emb-daemon fleet ingest")
+    return sorted(found)
+
+
+def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
+    """Drives of each unit's corners."""
+    groups: dict[tuple[str, str], list[Drive]] = {}
+    for drive in found:
+        groups.setdefault((drive.unit, drive.corner), []).append(drive)
+    return groups
+
+
+def ingested(root: Path) -> list[dict]:
+    """What became of each log file: ``source``, ``size``, ``mtime_ns``, ``sha256``, ``notes``, ``fault`` (empty if it is good)
+    and its ``drives``."""
+    return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
+
+
+def note(root: Path, known: dict) -> None:
+    """Keep what became of a log file."""
+    path = folder_of(root, "ingested") / f"{known['sha256']}.json"
+    write_atomically(path, json.dumps(known, sort_keys=True, indent=1).encode())
+
+
+def forget(root: Path, known: dict) -> None:
+    """Take an earlier state of a log file out again."""
+    for entry in known["drives"]:
+        drive = Drive(**entry)
+        Path(root, "drives", drive.partition, f"{drive.digest}.parquet").unlink(missing_ok=True)
+    Path(root, "ingested", f"{known['sha256']}.json").unlink(missing_ok=True)
+
+
+def unit_in(path: Path) -> str:
+    """Unit that a partition's folder says."""
+    return unquote(next(part for part in path.parts if part.startswith("unit=")).removeprefix("unit="))

@@ -1,0 +1,392 @@
+"""What the scores of a whole fleet say: batches, units, drift and season, each with its size in newtons and its chance."""
+
+import csv
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.effects import REGISTRY
+from emb_daemon.errors import InputError
+from emb_daemon.fleet.population import (
+    LEAST_UNITS,
+    Directions,
+    Readings,
+    Shared,
+    Unit,
+    centres,
+    outliers,
+    random_effects,
+    shared_causes,
+    unit_of,
+)
+from emb_daemon.fleet.scores import Cause, Questions, Score
+
+#: Drift is stated per so many days, season per so many kelvins.
+PER_DAYS, PER_K = 30.0, 10.0
+#: A fleet is asked for drift if its drives span so many days, and for season if their surroundings span so many kelvins.
+_LEAST_DAYS, _LEAST_K = 5, 5.0
+#: Least force that is worth saying, N: of a group two parts in a thousand of a usual stop of 5 kN, as `diagnose` has it of a
+#: log; of a single unit the same of the 18 kN that training reaches, or no workshop could confirm it.
+_LEAST_SHARED_N, _LEAST_UNIT_N = 10.0, 36.0
+#: Points of a trend.
+_WINDOWS = 8
+#: Drives of a unit below which its own scatter is not known, and from which slopes over two covariates leave as many for it.
+_LEAST_DRIVES, _SLOPE_DRIVES = 3, 6
+ALL = "all units"
+
+Fleet = Mapping[tuple[str, str], Sequence[Score]]
+
+
+class Finding(msgspec.Struct, kw_only=True):
+    """Something that is not as calibrated, or as with the others.
+
+    Attributes:
+        where: a level of a factor (``batch A``), ``all units``, or a unit and corner.
+        units: how many share it.
+        cause, key, shape, amount, sigma, unit: see `scores.Cause`; ``amount`` over the others', or per 30 days or 10 K.
+        size_N: RMS of its force in contact, with the amount's sign; ``sigma_N`` its standard deviation.
+        chance: of a false alarm among all that was asked: of a single false group, or of each unit named (q-value).
+        rivals: causes that explain nearly as much of the same.
+        action: what to do next.
+    """
+
+    where: str
+    units: int
+    cause: str
+    key: str
+    shape: float | None
+    amount: float
+    sigma: float
+    unit: str
+    size_N: float
+    sigma_N: float
+    chance: float
+    rivals: tuple[str, ...]
+    action: str
+
+
+class Placed(msgspec.Struct, kw_only=True):
+    """One unit on the fleet's map: how far it is from its group in its worst cause, in standard deviations and N, and what of
+    that is left when the unit's own noise is taken into account (``shrunk_N``)."""
+
+    unit: str
+    corner: str
+    levels: dict[str, str]
+    drives: int
+    cause: str
+    deviation: float
+    size_N: float
+    shrunk_N: float
+    outlying: bool
+
+
+class Spread(msgspec.Struct, kw_only=True):
+    """A cause over the population: mean and standard deviation between units, in the cause's unit and in N, and the median
+    unit's noise in N."""
+
+    cause: str
+    key: str
+    unit: str
+    mean: float
+    mean_sigma: float
+    spread: float
+    mean_N: float
+    spread_N: float
+    noise_N: float
+
+
+class Trend(msgspec.Struct, kw_only=True):
+    """A cause over time in one group: days since the first drive, N, and standard deviations."""
+
+    where: str
+    cause: str
+    days: list[float]
+    size_N: list[float]
+    sigma_N: list[float]
+
+
+class Findings(msgspec.Struct, kw_only=True):
+    """All of it. ``silent``: why drives say nothing, by digest; ``left_out``: units that cannot be placed, and why."""
+
+    calibration: str
+    first_day: str
+    last_day: str
+    drives: int
+    silent: dict[str, str]
+    left_out: dict[str, str]
+    directions: int
+    causes: int
+    groups: list[Finding]
+    drifts: list[Finding]
+    seasons: list[Finding]
+    outliers: list[Finding]
+    ageing: list[Finding]
+    units: list[Placed]
+    population: list[Spread]
+    trends: list[Trend]
+
+
+def save(findings: Findings, root: Path) -> None:
+    write_atomically(Path(root, "findings.json"), msgspec.json.format(msgspec.json.encode(findings), indent=1))
+
+
+def load(root: Path) -> Findings:
+    """Raises InputError: none are there, or not ours."""
+    path = Path(root, "findings.json")
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Findings)
+    except OSError:
+        raise InputError(f"{path}: not there, expected emb-daemon fleet diagnose to have been run") from None
+    except msgspec.DecodeError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def read_units(path: Path) -> dict[str, dict[str, str]]:
+    """Factors by unit: a CSV file with a column ``unit``, and one for each factor (batch, supplier, plant, ...).
+
+    Raises:
+        InputError: not such a file, or a unit twice.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: {error}") from None
+    if not rows or "unit" not in rows[0] or len(rows[0]) < 2:
+        raise InputError(f"{path}: expected a header 'unit,FACTOR,...' and rows under it")
+    result: dict[str, dict[str, str]] = {}
+    for line, row in enumerate(rows, start=2):
+        unit = row.pop("unit")
+        if unit in result:
+            raise InputError(f"{path}:{line}: unit {unit} stands there already")
+        if None in row or None in row.values():
+            raise InputError(f"{path}:{line}: expected {len(rows[0]) + 1} columns")
+        result[unit] = {name: value for name, value in row.items() if value}
+    return result
+
+
+def find(
+    fleet: Fleet, questions: Questions, calibration: str, factors: Mapping[str, Mapping[str, str]], silent: Mapping[str, str]
+) -> Findings:
+    """Everything that a fleet's scores say.
+
+    Args:
+        factors: by unit and name, what units have in common: batch, supplier.
+
+    Raises:
+        InputError: too few units to tell one from the others.
+    """
+    slopes = np.median([len(scores) for scores in fleet.values()] or [0]) >= _SLOPE_DRIVES
+    least = _SLOPE_DRIVES if slopes else _LEAST_DRIVES
+    placed = {key: scores for key, scores in fleet.items() if len(scores) >= least}
+    left_out = {
+        f"{unit} {corner}": f"{len(scores)} drives that say something, expected {least}"
+        for (unit, corner), scores in fleet.items()
+        if (unit, corner) not in placed
+    }
+    if len(placed) < 2 * LEAST_UNITS:
+        raise InputError(f"{len(placed)} units with {least} drives or more, expected at least {2 * LEAST_UNITS}")
+    return _Study(placed, questions, factors, bool(slopes)).findings(calibration, dict(silent), left_out)
+
+
+class _Study:
+    """The population's vectors, and findings made of them."""
+
+    def __init__(self, fleet: Fleet, questions: Questions, factors: Mapping[str, Mapping[str, str]], slopes: bool):
+        self.keys, self.scores, self.causes = list(fleet), list(fleet.values()), questions.causes
+        self.every = [score for scores in self.scores for score in scores]
+        self.directions = Directions.of(self.every)
+        self.start = min(score.drive.begin_ns for score in self.every)
+        self.days = [np.array([1e-9 * (s.drive.begin_ns - self.start) / 86400.0 for s in scores]) for scores in self.scores]
+        self.span = max(float(days.max()) for days in self.days)
+        warmth = np.array([score.ambient_C for score in self.every])
+        self.warmth_C = float(np.nanmean(warmth)) if np.isfinite(warmth).any() else 0.0
+        self.covariates = ["level"]
+        if slopes and self.span >= _LEAST_DAYS - 1:
+            self.covariates.append("day")
+        if slopes and np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
+            self.covariates.append("warmth")
+        self.units = [self._unit(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
+        named = sorted({name for levels in factors.values() for name in levels})
+        # Corners differ by design: a front brake is no rear brake.
+        self.levels = {"corner": np.array([corner for _, corner in self.keys])}
+        self.levels |= {name: np.array([factors.get(unit, {}).get(name, "") for unit, _ in self.keys]) for name in named}
+        self.levels = {name: levels for name, levels in self.levels.items() if len(set(levels.tolist())) > 1}
+        # Of all factors but the corner, whose difference is no finding.
+        self.groups = {
+            f"{name} {level}": levels == level
+            for name, levels in self.levels.items() if name != "corner"
+            for level in np.unique(levels).tolist() if level
+        }  # fmt: skip
+        self.masks = {ALL: np.ones(len(self.keys), bool), **self.groups}
+
+    def _unit(self, scores: Sequence[Score], days: np.ndarray) -> Unit:
+        columns = {
+            "level": np.ones(len(scores)),
+            "day": (days - 0.5 * self.span) / PER_DAYS,
+            "warmth": (np.array([s.ambient_C for s in scores]) - self.warmth_C) / PER_K,
+        }
+        return unit_of(scores, self.directions, np.column_stack([columns[name] for name in self.covariates]))
+
+    def read(self, covariate: str) -> tuple[np.ndarray, np.ndarray, Readings]:
+        """The units' vectors, the same about their groups' centres, and readings of them."""
+        row = self.covariates.index(covariate)
+        vectors = np.array([unit.values[row] for unit in self.units])
+        centre = centres(vectors, self.levels)
+        noise = np.array([unit.noise[row] for unit in self.units])
+        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints, noise)
+
+    def findings(self, calibration: str, silent: dict[str, str], left_out: dict[str, str]) -> Findings:
+        prints = self.directions.prints
+        level, apart, readings = self.read("level")
+        groups = shared_causes(level, self.groups, prints, readings, beside=True)
+        over: dict[str, list[Finding]] = {"day": [], "warmth": []}
+        ageing: list[Finding] = []
+        for name in self.covariates[1:]:
+            slopes, uneven, own = self.read(name)
+            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, prints, own, beside=False)
+            shared += shared_causes(slopes, self.groups, prints, own, beside=True)
+            over[name] = self._shared(shared, _ACTIONS[name])
+            if name == "day":
+                ageing = self._outliers(uneven, own, _ACTIONS["ageing"])
+        unlike = self._outliers(apart, readings, _ACTIONS["unit"])
+        return Findings(
+            calibration=calibration,
+            first_day=_date(self.start),
+            last_day=_date(max(score.drive.begin_ns for score in self.every)),
+            drives=len(self.every),
+            silent=silent,
+            left_out=left_out,
+            directions=prints.shape[1],
+            causes=len(self.causes),
+            groups=self._shared(groups, _ACTIONS["level"]),
+            drifts=over["day"],
+            seasons=over["warmth"],
+            outliers=unlike,
+            ageing=ageing,
+            units=self._placed(apart, readings, {finding.where for finding in (*unlike, *ageing)}),
+            population=self._population(level, readings),
+            trends=self._trends([*groups][:3], over["day"], readings),
+        )
+
+    def _finding(
+        self,
+        where: str,
+        units: int,
+        cause: int,
+        amount: float,
+        sigma: float,
+        chance: float,
+        rivals: Sequence[int],
+        action: Callable[[Cause], str],
+    ) -> Finding:
+        own, size = self.causes[cause], float(self.directions.size_N[cause])
+        return Finding(
+            where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=amount, sigma=sigma, unit=own.unit,
+            size_N=amount * size, sigma_N=sigma * size, chance=chance, action=action(own),
+            rivals=tuple(dict.fromkeys(self.causes[r].name for r in rivals if self.causes[r].name != own.name)),
+        )  # fmt: skip
+
+    def _shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
+        found = [
+            self._finding(s.group, int(self.masks[s.group].sum()), s.cause, s.amount, s.sigma, s.chance, s.rivals, action)
+            for s in shared
+        ]
+        return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
+
+    def _outliers(self, deviations: np.ndarray, readings: Readings, action: Callable[[Cause], str]) -> list[Finding]:
+        found = [
+            self._finding(
+                " ".join(self.keys[o.row]), 1, o.cause, o.amount, abs(o.amount / o.deviation), o.q_value, o.rivals, action
+            )
+            for o in outliers(deviations, readings)
+        ]
+        return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
+
+    def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
+        amounts, rows = readings.of(deviations), readings.ordinary
+        spread = np.sqrt((amounts[rows] ** 2).mean(axis=0))
+        noise = readings.noise()
+        worst = np.argmax(np.abs(amounts) / spread, axis=1)
+        result = []
+        for row, (unit, corner) in enumerate(self.keys):
+            cause = int(worst[row])
+            amount, size = amounts[row, cause], self.directions.size_N[cause]
+            kept = spread[cause] ** 2 / (spread[cause] ** 2 + noise[row, cause] ** 2)
+            result.append(
+                Placed(
+                    unit=unit, corner=corner, levels={name: str(levels[row]) for name, levels in self.levels.items()},
+                    drives=len(self.scores[row]), cause=str(self.causes[cause]), deviation=float(amount / spread[cause]),
+                    size_N=float(amount * size), shrunk_N=float(kept * amount * size), outlying=f"{unit} {corner}" in named,
+                )
+            )  # fmt: skip
+        return result
+
+    def _population(self, level: np.ndarray, readings: Readings) -> list[Spread]:
+        amounts, noise = readings.of(level), readings.noise()
+        result = []
+        for row, cause in enumerate(self.causes):
+            own, size = (
+                random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row]),
+                self.directions.size_N[row],
+            )
+            result.append(
+                Spread(
+                    cause=str(cause), key=cause.key, unit=cause.unit, mean=own.mean, mean_sigma=own.sigma, spread=own.spread,
+                    mean_N=float(own.mean * size), spread_N=float(own.spread * size),
+                    noise_N=float(np.median(noise[:, row]) * size),
+                )
+            )  # fmt: skip
+        return result
+
+    def _trends(self, shared: Sequence[Shared], drifts: Sequence[Finding], readings: Readings) -> list[Trend]:
+        """What batches share and what drifts, window by window, over all drives of the group together."""
+        names = [str(cause) for cause in self.causes]
+        wanted = [(s.group, s.cause) for s in shared]
+        wanted += [
+            (f.where, next(row for row, c in enumerate(self.causes) if (c.key, c.shape) == (f.key, f.shape))) for f in drifts
+        ]
+        edges = np.linspace(0.0, self.span + 1e-9, min(_WINDOWS, int(self.span) + 1) + 1)
+        result = []
+        for group, cause in dict.fromkeys(wanted):
+            days, sizes, sigmas = [], [], []
+            reading, size = readings.filters[:, cause].mean(axis=0), self.directions.size_N[cause]
+            members = np.flatnonzero(self.masks[group] & readings.ordinary)
+            for low, high in pairwise(edges.tolist()):
+                window = [
+                    s for row in members for s, day in zip(self.scores[row], self.days[row], strict=True) if low <= day < high
+                ]
+                if len(window) < _LEAST_DRIVES:
+                    continue
+                pooled = unit_of(window, self.directions, np.ones((len(window), 1)))
+                days.append(float(0.5 * (low + high)))
+                sizes.append(float(reading @ pooled.values[0] * size))
+                sigmas.append(float(np.sqrt(reading @ pooled.noise[0] @ reading) * size))
+            result.append(Trend(where=group, cause=names[cause], days=days, size_N=sizes, sigma_N=sigmas))
+        return result
+
+
+def _date(time_ns: int) -> str:
+    return datetime.datetime.fromtimestamp(1e-9 * time_ns, datetime.UTC).date().isoformat()
+
+
+def _manoeuvre(cause: Cause) -> str:
+    """What makes a cause visible."""
+    effect = next((e for e in REGISTRY if e.name == cause.name), None)
+    return (
+        f"to see it: {effect.manoeuvre}" if effect and effect.manoeuvre else "to see it: slow and fast strokes over all forces"
+    )
+
+
+_ACTIONS: dict[str, Callable[[Cause], str]] = {
+    "level": lambda cause: f"Take two units to a rig with a force sensor, and emb-daemon diagnose; {_manoeuvre(cause)}.",
+    "day": lambda _: "Have the daemons train more often, or let the calibration follow.",
+    "warmth": lambda _: "The calibration lacks an effect over temperature: emb-daemon diagnose on cold and warm drives.",
+    "unit": lambda cause: f"Train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}.",
+    "ageing": lambda cause: f"It ages unlike the others: train it, and look at it again in a month; {_manoeuvre(cause)}.",
+}

@@ -1,0 +1,163 @@
+"""Log files into the data set: each once, whatever its format; a damaged one is listed, and never ends the work."""
+
+import contextlib
+import datetime
+import hashlib
+import io
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.fleet.dataset import DIGEST, About, Drive, forget, ingested, note, write_drive
+from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_file, read_frames
+from emb_daemon.offline import corner_index
+from emb_daemon.offline.log import CAPACITY, collect, make_log
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.replay import corners_in
+from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, WHEEL_SPEED
+from emb_daemon.wire.receive import BAD_LENGTH, VERDICTS
+
+#: Where a path says whose log it is: the folder that it lies in.
+UNIT_OF_PATH = r"(?P<unit>[^/]+)/[^/]+$"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A log file to ingest. ``mapping``: file that maps another rig's signals to ours, or None; ``earlier``: what is known of
+    the same path with other content."""
+
+    path: Path
+    unit: str
+    day: str
+    mapping: Path | None = None
+    earlier: dict | None = None
+
+
+def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping: Path | None = None) -> list[Job]:
+    """What is not in the data set yet, by path, size and time of change.
+
+    Args:
+        pattern: regular expression that finds ``unit``, and ``day`` if it has such a group, in a log's absolute path.
+
+    Raises:
+        InputError: the pattern is none, has no group ``unit``, or does not fit a path.
+    """
+    try:
+        compiled = re.compile(pattern)
+    except re.error as error:
+        raise InputError(f"--unit {pattern}: not a regular expression: {error}") from None
+    if "unit" not in compiled.groupindex:
+        raise InputError(f"--unit {pattern}: expected a group (?P<unit>…)")
+    known = {entry["source"]: entry for entry in ingested(root)}
+    result = []
+    for path in paths:
+        path = Path(path).absolute()
+        found = compiled.search(str(path))
+        if not found:
+            raise InputError(f"{path}: --unit {pattern} does not fit")
+        earlier = known.get(str(path))
+        if earlier and (earlier["size"], earlier["mtime_ns"]) == _stamp(path):
+            continue
+        result.append(Job(path, found["unit"], found.groupdict().get("day") or "", mapping, earlier))
+    return result
+
+
+def log_files(paths: Iterable[Path]) -> list[Path]:
+    """Files as given, and all logs in folders, in order.
+
+    Raises:
+        InputError: no such file, or a folder without logs.
+    """
+    found: list[Path] = []
+    for path in paths:
+        inside = sorted(file for file in path.rglob("*") if log_ending(file) in LOG_ENDINGS) if path.is_dir() else [path]
+        if not inside or not inside[0].exists():
+            raise InputError(f"{path}: {'holds no logs' if path.is_dir() else 'no such file'}")
+        found += inside
+    return found
+
+
+def give_up(root: Path, job: Job, reason: str) -> dict:
+    """Note a file that took its workers along."""
+    size, mtime_ns = _stamp(job.path)
+    digest = hashlib.sha256(str(job.path).encode()).hexdigest()
+    known = {"source": str(job.path), "size": size, "mtime_ns": mtime_ns, "sha256": digest, "notes": "", "drives": []}
+    note(root, known | {"fault": f"{job.path}: {reason}"})
+    return known | {"fault": f"{job.path}: {reason}"}
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return -1, -1
+    return stat.st_size, stat.st_mtime_ns
+
+
+def ingest(root: Path, job: Job) -> dict:
+    """One log file; returns what became of it, see `dataset.ingested`."""
+    size, mtime_ns = _stamp(job.path)
+    known = {"source": str(job.path), "size": size, "mtime_ns": mtime_ns, "sha256": "", "notes": "", "fault": "", "drives": []}
+    words = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(words):
+            known["sha256"] = hashlib.sha256(read_file(job.path)).hexdigest()
+            frames = _reader(job.mapping)(job.path)
+        notes = words.getvalue().strip()
+        found = ingest_frames(root, frames, job.unit, known["sha256"][:DIGEST], str(job.path), notes, job.day)
+        known |= {"notes": notes, "drives": [asdict(drive) for drive in found]}
+    except (InputError, MemoryError) as error:
+        # A file that cannot even be read has no content to be named by.
+        digest = known["sha256"] or hashlib.sha256(str(job.path).encode()).hexdigest()
+        known |= {"sha256": digest, "fault": str(error) or "more than this machine's memory"}
+    if job.earlier and job.earlier["sha256"] != known["sha256"]:
+        forget(root, job.earlier)
+    note(root, known)
+    return known
+
+
+def ingest_frames(
+    root: Path, frames: np.ndarray, unit: str, digest: str, source: str, notes: str = "", day: str = ""
+) -> list[Drive]:
+    """A FRAME array as drives of the data set, one for each corner in it.
+
+    Raises:
+        InputError: no resolver sample of any corner.
+    """
+    corners = corners_in(frames, Path(source))
+    pipeline = Pipeline(np.zeros(4, PARAMETERS), corners, capacity=CAPACITY)
+    begin_ns = int(frames["time_ns"][0])
+    pipeline.begin(begin_ns)
+    samples = collect(frames, pipeline)
+    day = day or datetime.datetime.fromtimestamp(1e-9 * begin_ns, datetime.UTC).date().isoformat()
+    result = []
+    for corner in corners:
+        index = corner_index(corner)
+        log = make_log(samples[samples["corner"] == index], frames, corner, Path(source))
+        drive = Drive(unit, corner, day, begin_ns, digest)
+        write_drive(root, drive, About(source, _refused(pipeline, index), notes), log.samples, log.force_N)
+        result.append(drive)
+    return result
+
+
+def _refused(pipeline: Pipeline, index: int) -> dict[str, int]:
+    """Frames that were not taken, by verdict: the corner's own and the car's."""
+    own = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
+    counts = own + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)
+    return {VERDICTS[verdict]: int(counts[verdict]) for verdict in range(BAD_LENGTH, len(VERDICTS)) if counts[verdict]}
+
+
+def _reader(mapping: Path | None) -> Callable:
+    if mapping is None:
+        return read_frames
+    from emb_daemon.logs.mapping import Mapping
+
+    return Mapping(mapping).read
+
+
+assert CORNER_MESSAGES * len(CORNERS) == WHEEL_SPEED

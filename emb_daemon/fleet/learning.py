@@ -1,0 +1,113 @@
+"""What park brake adaptation learns of each unit over its drives, and what all units together say of the next one."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, moved, value_of
+from emb_daemon.calibration.types import Calibration, Provenance, to_parameters
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
+from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
+from emb_daemon.offline import estimate
+from emb_daemon.pipeline import Pipeline
+
+#: Standard deviations between units that bounds of adaptation leave room for: one unit in 16 000 of a normal population.
+_WIDTH = 4.0
+
+
+def learned_path(root: Path, unit: str, corner: str) -> Path:
+    return Path(root, "learned", partition(unit, corner)).with_suffix(".json")
+
+
+def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict:
+    """One unit's drives in order, each a power-on with what was learned before: every training and its outcome.
+
+    ``resume``: what is there of the same drives and calibration is kept.
+
+    Raises:
+        InputError: a drive's file is missing or damaged.
+    """
+    corner, path = drives[0].corner, learned_path(root, drives[0].unit, drives[0].corner)
+    told = {"calibration": calibration_hash(calibration), "drives": [drive.digest for drive in drives]}
+    if resume and path.exists():
+        known = json.loads(path.read_bytes())
+        if told.items() <= known.items():
+            return known
+    trainings = []
+    with tempfile.TemporaryDirectory() as state:
+        memory = Memory(Path(state))
+        for drive in drives:
+            log, _ = read_drive(root, drive)
+            adaptation = Adaptation({corner: calibration}, memory, int)
+            pipeline = Pipeline(
+                np.full(4, to_parameters(calibration), PARAMETERS), (corner,), capacity=1, adaptation=adaptation
+            )
+            before = memory.read(corner)
+            estimate(log.samples, pipeline.parameters, pipeline.states, adaptation)
+            after = memory.read(corner)
+            if after and after != before:
+                # A file that is full drops its oldest entry for a new one.
+                new = after.history[len(before.history) if before else 0 :] or after.history[-1:]
+                trainings += [{"day": drive.day, **msgspec.to_builtins(entry)} for entry in new]
+    told |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
+    told["trainings"] = sum(bool(entry["values"]) for entry in trainings)
+    folder_of(path.parent)
+    write_atomically(path, json.dumps(told, sort_keys=True, indent=1).encode())
+    return told
+
+
+def population(root: Path, calibration: Calibration) -> dict[str, tuple[RandomEffects, int]]:
+    """By key of the calibration what the last accepted trainings of all units say together, and of how many units."""
+    values: dict[str, list[tuple[float, float]]] = {}
+    for path in sorted(Path(root, "learned").glob("unit=*/corner=*.json")):
+        told = json.loads(path.read_bytes())
+        accepted = [entry for entry in told["entries"] if entry["values"]]
+        if told["calibration"] != calibration_hash(calibration) or not accepted:
+            continue
+        for key, value in accepted[-1]["values"].items():
+            # A value without a standard deviation comes with others, as the curves of pads beside those mounted.
+            values.setdefault(key, []).append((value, accepted[-1]["sigmas"].get(key, 0.0)))
+    return {key: (random_effects(*map(np.array, zip(*pairs, strict=True))), len(pairs)) for key, pairs in values.items()}
+
+
+def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, tuple[float, float, float, int]]]:
+    """The calibration that the next unit of this kind starts from: the population's means, with the standard deviation between
+    units as each key's sigma, clearance as uncertain as units differ, and bounds of adaptation as wide as they spread.
+
+    Returns:
+        (calibration, {key: (mean, its standard deviation, spread between units, units)}).
+
+    Raises:
+        InputError: too few units have learned anything.
+    """
+    learned = population(root, calibration)
+    least = 2 * LEAST_UNITS
+    learned = {key: (own, units) for key, (own, units) in learned.items() if units >= least and not key.startswith("noise.")}
+    if not learned:
+        raise InputError(
+            f"{root}: fewer than {least} units with an accepted training; run emb-daemon fleet learn on drives with one"
+        )
+    result = moved(calibration, {key: own.mean for key, (own, _) in learned.items()}, checked=True)
+    widths = {key: float(np.hypot(own.spread, own.sigma)) for key, (own, _) in learned.items()}
+    limits, contact = result.adaptation, result.contact
+    high = result.training_force_N
+    friction = value_of(result, OFFSET_FRICTION) + value_of(result, LOAD_FRICTION) * high
+    share = float(np.hypot(widths[OFFSET_FRICTION], widths[LOAD_FRICTION] * high)) / friction
+    limits = msgspec.structs.replace(limits, friction_change=_WIDTH * share)
+    if CLEARANCE in widths:
+        limits = msgspec.structs.replace(limits, clearance_change_rad=_WIDTH * widths[CLEARANCE])
+        contact = msgspec.structs.replace(contact, clearance_sigma_rad=widths[CLEARANCE])
+    old = result.provenance or Provenance(date="", tool="")
+    provenance = msgspec.structs.replace(old, tool="emb-daemon fleet prior", sigmas=dict(old.sigmas) | widths)
+    result = msgspec.structs.replace(result, adaptation=limits, contact=contact, provenance=provenance)
+    return result, {key: (own.mean, own.sigma, own.spread, units) for key, (own, units) in learned.items()}

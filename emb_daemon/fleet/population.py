@@ -1,0 +1,372 @@
+"""Units as a population: what each says with its uncertainty, what is common, what a batch shares, who is unlike the others.
+
+A unit's drives add up to normal equations of all causes together (`scores`). Most causes are nearly collinear, so a unit is
+described in the few directions that its drives really tell apart (`Directions`), without naming anything. A cause is a known
+vector there. How much of it a unit shows is read along the direction that units' own scatter disturbs least: a friction that
+scatters by a tenth between healthy units says little, and what scatters less says more. That scatter is estimated from the
+fleet itself with single outliers left aside, and always from other units than the one that is read.
+
+Statistics count units, not drives and not samples: p-values come from how units of one batch differ among themselves.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_daemon.fleet.scores import Score
+
+#: Directions whose information is below this share of the strongest one's say nothing that rounding and curvature do not.
+_TOLD_APART = 1e-5
+#: Share of units that describe the population's scatter at first, and passes after which it does not change any more.
+_CORE, _PASSES = 0.75, 20
+#: A unit whose distance is above this quantile of its chi-square is left out of the population's mean and scatter.
+_OUTLYING = 0.999
+#: Parts into which units are divided, each read with the scatter of the others.
+_FOLDS = 10
+
+
+@dataclass(frozen=True)
+class Directions:
+    """What drives tell apart.
+
+    Attributes:
+        basis: shape (causes, directions): scores times this are the coordinates of scores.
+        prints: shape (causes, directions): what one unit of each cause is there.
+        size_N: RMS (N) of one unit of each cause over samples in contact, the contact angle taken out.
+    """
+
+    basis: np.ndarray
+    prints: np.ndarray
+    size_N: np.ndarray
+
+    @classmethod
+    def of(cls, scores: Sequence[Score]) -> "Directions":
+        total = np.sum([score.products[:-1, :-1] for score in scores], axis=0) / len(scores)
+        samples = np.mean([score.loaded for score in scores])
+        scale = np.sqrt(np.maximum(np.diag(total), 1e-300))
+        strength, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+        kept = strength > _TOLD_APART * strength[-1]
+        strength, vectors = strength[kept], vectors[:, kept]
+        return cls(
+            basis=vectors / np.sqrt(strength) / scale[:, None],
+            prints=vectors * np.sqrt(strength) * scale[:, None],
+            size_N=scale / np.sqrt(samples),
+        )
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What one unit's drives say together.
+
+    Attributes:
+        values: coordinates as linear functions of the covariates, shape (m, q).
+        noise: covariance of each row from drive to drive, shape (m, q, q).
+    """
+
+    values: np.ndarray
+    noise: np.ndarray
+
+
+def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndarray) -> Unit:
+    """One unit by least squares; ``covariates`` have shape (drives, m), the first of them 1.
+
+    What its drives do not tell is held at nothing, by as much as a hundredth of what an average drive tells. The covariance
+    counts drives: it is made of what each adds to the equations at the solution (the sandwich of White, Econometrica 48,
+    1980).
+    """
+    basis, (drives, count) = directions.basis, covariates.shape
+    size = basis.shape[1]
+    projected = np.array([basis.T @ score.products[:-1] for score in scores])
+    information, right = projected[:, :, :-1] @ basis, projected[:, :, -1]
+    normal = np.einsum("di,dj,dab->iajb", covariates, covariates, information).reshape(count * size, count * size)
+    held = 0.01 * np.maximum(np.diag(covariates.T @ covariates), 1e-12)
+    inverse = np.linalg.inv(normal + np.kron(np.diag(held), np.eye(size)))
+    values = (inverse @ (covariates.T @ right).ravel()).reshape(count, size)
+    left = right - np.einsum("dab,db->da", information, covariates @ values)
+    moves = (np.einsum("di,da->dia", covariates, left).reshape(drives, -1) @ inverse.T).reshape(drives, count, size)
+    return Unit(values, np.einsum("dia,dib->iab", moves, moves) * drives / max(drives - count, 1))
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """How units differ that nothing sets apart.
+
+    Attributes:
+        mean: shape (q,).
+        covariance: shape (q, q), of one unit.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def scatter_of(units: np.ndarray, noise: np.ndarray) -> Scatter:
+    """Mean and covariance of most of the rows, shape (N, q), whatever the others are.
+
+    Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
+    then once more with all that are not outlying. The covariance is drawn towards ``noise``, that of one row by its own
+    drives, with the weight of as many rows as it has columns: few units say little of all directions."""
+    count = len(units)
+    mean = np.median(units, axis=0)
+    spread = 1.4826 * np.median(np.abs(units - mean), axis=0)
+    covariance = np.diag(np.maximum(spread, 1e-9 * max(float(spread.max()), 1e-300)) ** 2)
+    core = np.zeros(count, bool)
+    for _ in range(_PASSES):
+        distance = _distances(units - mean, covariance)
+        chosen = np.zeros(count, bool)
+        chosen[np.argsort(distance, kind="stable")[: max(int(np.ceil(_CORE * count)), min(count, 3))]] = True
+        if np.array_equal(chosen, core):
+            break
+        core = chosen
+        mean, covariance = _moments(units[core], noise)
+    ordinary = _ordinary(_distances(units - mean, covariance), units) | core
+    mean, covariance = _moments(units[ordinary], noise)
+    return Scatter(mean, covariance)
+
+
+def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    (count, size), mean = rows.shape, rows.mean(axis=0)
+    return mean, ((rows - mean).T @ (rows - mean) + size * noise) / (max(count - 1, 1) + size)
+
+
+def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Which squared distances are those of a normal population whose median they have."""
+    from scipy.stats import chi2
+
+    size = units.shape[1]
+    return distance / max(float(np.median(distance)), 1e-300) <= chi2.ppf(_OUTLYING, size) / chi2.median(size)
+
+
+def _distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", deviations @ np.linalg.inv(covariance), deviations)
+
+
+class Readings:
+    """How much of each cause each unit shows, read along the direction that the other units' scatter disturbs least.
+
+    Args:
+        units: shape (N, q).
+        centre: what the units' groups have in common, shape (N, q); scatter is about it.
+        prints: of the causes, shape (K, q).
+        noise: covariance of each unit by its own drives, shape (N, q, q).
+
+    Attributes:
+        ordinary: units that are like the others, shape (N,).
+    """
+
+    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray):
+        # Of few drives not even the noise is known in all directions: half of it is taken as independent.
+        typical = noise.mean(axis=0)
+        typical = 0.5 * (typical + np.diag(np.diag(typical)))
+        fold = np.arange(len(units)) % min(_FOLDS, len(units))
+        apart = units - centre
+        others = [scatter_of(apart[fold != part], typical) for part in range(fold.max() + 1)]
+        self._inverse = np.array([np.linalg.inv(scatter.covariance) for scatter in others])
+        means = np.array([scatter.mean for scatter in others])
+        self.ordinary = _ordinary(
+            np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
+        )
+        along = np.einsum("fab,kb->fka", self._inverse, prints)
+        self.filters = (along / np.einsum("fka,ka->fk", along, prints)[:, :, None])[fold]
+        self._prints, self._noise = prints, noise
+        self.inverse = self._inverse.mean(axis=0)
+
+    def of(self, units: np.ndarray) -> np.ndarray:
+        """Amount of each cause, shape (N, K)."""
+        return np.einsum("uka,ua->uk", self.filters, units)
+
+    def noise(self) -> np.ndarray:
+        """Standard deviation of the amounts from drive to drive, shape (N, K)."""
+        return np.sqrt(np.einsum("uka,uab,ukb->uk", self.filters, self._noise, self.filters))
+
+    def gain(self, total: np.ndarray) -> np.ndarray:
+        """Fall of the squared distance that each cause explains of a vector, shape (K,)."""
+        inverse = self.inverse
+        return (self._prints @ inverse @ total) ** 2 / np.einsum("ka,ab,kb->k", self._prints, inverse, self._prints)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A cause that a group of units shares.
+
+    Attributes:
+        group, cause: which; ``cause`` is a row of the prints.
+        amount, sigma: of the cause.
+        p_value: that there is nothing, over units.
+        chance: the same over all groups and causes that were asked (Holm, Scandinavian J. of Statistics 6, 1979): a batch is
+            called back on one accusation, so that none may be false.
+        rivals: causes that would explain nearly as much.
+    """
+
+    group: str
+    cause: int
+    amount: float
+    sigma: float
+    p_value: float
+    chance: float
+    rivals: tuple[int, ...]
+
+
+#: Chance of one false accusation of a group, share of false ones among the units accused, and the share of the winner's gain
+#: from which another cause is not told apart.
+SURE, FALSE_UNITS, _RIVAL = 0.01, 0.01, 0.8
+#: Causes of equal gain within this: the first, which is the simpler, is taken.
+_EQUAL = 0.97
+#: Groups of fewer units than this are not accused, nor do they describe their own centre.
+LEAST_UNITS = 3
+
+
+def shared_causes(
+    units: np.ndarray, groups: Mapping[str, np.ndarray], prints: np.ndarray, readings: Readings, beside: bool
+) -> list[Shared]:
+    """What groups of units share, one after the other, the strongest first, until nothing is sure.
+
+    Args:
+        groups: masks of the units, shape (N,).
+        beside: groups are compared with all other units; otherwise with nothing.
+    """
+    from scipy.stats import t as student
+
+    rows = readings.ordinary
+    chosen: list[tuple[str, int]] = []
+    found: list[Shared] = []
+    amounts = np.zeros(0)
+    while len(chosen) < len(groups) * len(prints):
+        left = units - sum(
+            (np.outer(groups[g], prints[c]) * a for (g, c), a in zip(chosen, amounts, strict=True)), np.zeros_like(units)
+        )
+        best: tuple[float, str, int] | None = None
+        gains: dict[str, np.ndarray] = {}
+        for group, members in groups.items():
+            inside, outside = left[members & rows], left[~members & rows]
+            if len(inside) < LEAST_UNITS or (beside and len(outside) < LEAST_UNITS):
+                continue
+            contrast = inside.mean(axis=0) - (outside.mean(axis=0) if beside else 0.0)
+            weight = 1.0 / (1.0 / len(inside) + (1.0 / len(outside) if beside else 0.0))
+            gains[group] = weight * readings.gain(contrast)
+            for cause in np.flatnonzero(gains[group] >= _EQUAL * gains[group].max())[:1]:
+                if best is None or gains[group][cause] > best[0]:
+                    best = float(gains[group][cause]), group, int(cause)
+        if best is None:
+            break
+        _, group, cause = best
+        amount = readings.of(left)[:, cause]
+        inside, outside = amount[groups[group] & rows], amount[~groups[group] & rows]
+        p_value, value, sigma = _compared(inside, outside if beside else None, student)
+        chance = min(1.0, p_value * (len(gains) * len(prints) - len(chosen)))
+        if chance > SURE:
+            break
+        rivals = tuple(int(c) for c in np.flatnonzero(gains[group] >= _RIVAL * gains[group].max()) if c != cause)
+        chosen.append((group, cause))
+        found.append(Shared(group, cause, value, sigma, p_value, chance, rivals))
+        amounts = _together(units[rows], [(groups[g][rows], prints[c]) for g, c in chosen], readings, beside)
+    return [
+        Shared(f.group, f.cause, float(a), f.sigma, f.p_value, f.chance, f.rivals) for f, a in zip(found, amounts, strict=True)
+    ]
+
+
+def _compared(inside: np.ndarray, outside: np.ndarray | None, student) -> tuple[float, float, float]:
+    """(p-value, difference, its standard deviation) of two sets of units by Welch's test, or of one against nothing."""
+    variances = [inside.var(ddof=1) / len(inside)] + ([outside.var(ddof=1) / len(outside)] if outside is not None else [])
+    counts = [len(inside)] + ([len(outside)] if outside is not None else [])
+    total = max(sum(variances), 1e-300)
+    freedom = total**2 / max(sum(v**2 / (n - 1) for v, n in zip(variances, counts, strict=True)), 1e-300)
+    value = inside.mean() - (outside.mean() if outside is not None else 0.0)
+    return float(2.0 * student.sf(abs(value) / np.sqrt(total), freedom)), float(value), float(np.sqrt(total))
+
+
+def _together(
+    units: np.ndarray, chosen: Sequence[tuple[np.ndarray, np.ndarray]], readings: Readings, beside: bool
+) -> np.ndarray:
+    """Amounts of all chosen causes by generalised least squares, the population's mean free if groups are compared."""
+    masks = np.array([members for members, _ in chosen], float)
+    prints = np.array([own for _, own in chosen])
+    if beside:
+        masks, units = masks - masks.mean(axis=1, keepdims=True), units - units.mean(axis=0)
+    inverse = readings.inverse
+    normal = (masks @ masks.T) * (prints @ inverse @ prints.T)
+    right = np.einsum("gu,ga,ab,ub->g", masks, prints, inverse, units)
+    return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A unit that is unlike its group: ``deviation`` in standard deviations, ``q_value`` over all units (Benjamini and
+    Hochberg): a unit is looked at in a workshop, and a known share of visits may be in vain."""
+
+    row: int
+    cause: int
+    amount: float
+    deviation: float
+    q_value: float
+    rivals: tuple[int, ...]
+
+
+def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
+    """Units unlike their group, shape (N, q) about its centre, the most unlike first; each by more than units differ, and by
+    more than its own drives do."""
+    from scipy.stats import t as student
+
+    from emb_daemon.diagnose.evidence import false_discovery
+
+    amounts, rows = readings.of(deviations), readings.ordinary
+    freedom = max(int(rows.sum()) - 1, 1)
+    spread = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom)
+    size = amounts / np.maximum(np.maximum(spread, readings.noise()), 1e-300)
+    # As many questions as causes were asked of each unit.
+    chances = np.minimum(1.0, 2.0 * student.sf(np.abs(size), freedom).min(axis=1) * size.shape[1])
+    q_values = false_discovery(chances)
+    found = []
+    for row in np.flatnonzero(q_values <= FALSE_UNITS):
+        gains = readings.gain(deviations[row])
+        cause = int(np.flatnonzero(gains >= _EQUAL * gains.max())[0])
+        rivals = tuple(int(c) for c in np.flatnonzero(gains >= _RIVAL * gains.max()) if c != cause)
+        found.append(
+            Outlier(int(row), cause, float(amounts[row, cause]), float(size[row, cause]), float(q_values[row]), rivals)
+        )
+    return sorted(found, key=lambda o: (o.q_value, -abs(o.deviation)))
+
+
+def centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.ndarray:
+    """What each unit's groups have in common, shape (N, q): medians by level, one factor after the other."""
+    left = units - np.median(units, axis=0)
+    for levels in factors.values():
+        for level in np.unique(levels):
+            mine = levels == level
+            if mine.sum() >= LEAST_UNITS:
+                left[mine] -= np.median(left[mine], axis=0)
+    return units - left
+
+
+@dataclass(frozen=True)
+class RandomEffects:
+    """A quantity over units.
+
+    Attributes:
+        mean, sigma: of the population, and the mean's standard deviation.
+        spread: standard deviation between units, noise taken out.
+        shrunk: each unit's value drawn towards the mean by its noise (best linear unbiased prediction).
+    """
+
+    mean: float
+    sigma: float
+    spread: float
+    shrunk: np.ndarray
+
+
+def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
+    """Of units' values with their own standard deviations, shape (N,), by Paule and Mandel (J. Research NBS 87, 1982)."""
+    from scipy.optimize import brentq
+
+    def excess(share: float) -> float:
+        weight = variance / np.maximum(sigmas**2 + share * variance, 1e-300)
+        return float(weight @ (values - weight @ values / weight.sum()) ** 2) / variance - (len(values) - 1)
+
+    # As a share of the values' own variance: the root finder's tolerance knows no units.
+    variance = max(float(np.var(values, ddof=1)) if len(values) > 1 else 0.0, 1e-300)
+    spread_2 = brentq(excess, 1e-9, 10.0) * variance if len(values) > 1 and excess(1e-9) > 0.0 > excess(10.0) else 0.0
+    weight = 1.0 / np.maximum(sigmas**2 + spread_2, 1e-300)
+    mean = float(weight @ values / weight.sum())
+    share = spread_2 / np.maximum(spread_2 + sigmas**2, 1e-300)
+    return RandomEffects(mean, float(weight.sum() ** -0.5), float(np.sqrt(spread_2)), mean + share * (values - mean))

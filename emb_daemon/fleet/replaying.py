@@ -1,0 +1,43 @@
+"""Estimates of every drive by the daemon's own step, to the last bit those of `emb-daemon replay` on the same log."""
+
+import json
+from pathlib import Path
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.fleet.dataset import Drive, folder_of, read_drive
+from emb_daemon.logs.write import table_columns, write_table
+from emb_daemon.offline import estimate
+from emb_daemon.replay import Result
+
+
+def figures_path(root: Path, drive: Drive) -> Path:
+    return Path(root, "figures", drive.partition, f"{drive.digest}.json")
+
+
+def is_replayed(root: Path, drive: Drive, calibration: str) -> bool:
+    """Whether a drive's estimates are there, of the calibration with this hash."""
+    try:
+        return json.loads(figures_path(root, drive).read_bytes())["calibration"] == calibration
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict:
+    """Write a drive's estimates (columns of the command-line contract) and figures; returns these.
+
+    Raises:
+        InputError: the drive's file is missing or damaged.
+    """
+    log, about = read_drive(root, drive)
+    estimates = estimate(log.samples, to_parameters(calibration))
+    result = Result(log.path, log.time_ns, estimates, log.samples, log.reference, log.force_N)
+    folder = folder_of(root, "estimates", drive.partition)
+    write_table(folder / f"{drive.digest}.parquet", table_columns(estimates, 1e-9 * log.time_ns))
+    figures = result.figures() | {"log": about.source, "refused": about.refused, "notes": about.notes}
+    figures["calibration"] = calibration_hash(calibration)
+    folder_of(root, "figures", drive.partition)
+    # After the estimates: who finds the figures finds those too.
+    write_atomically(figures_path(root, drive), json.dumps(figures, sort_keys=True).encode())
+    return figures

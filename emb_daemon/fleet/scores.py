@@ -1,0 +1,220 @@
+"""What one drive without force sensor says: how the disagreement of its force paths answers to everything that might cause it.
+
+The causes are the calibration's own parameters and every effect of the registry in each of its starting shapes: whatever
+`diagnose` would free or try on one log, here for thousands, so that nothing is fitted in a single drive. Each drive leaves the
+second moments of the regressors and the residual, from which any later question (a unit, a batch, a month) is answered by
+adding. The contact angle is each drive's own and is taken out at once.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.parameters import CLEARANCE
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.diagnose.coordinates import base_coordinates, effect_coordinates
+from emb_daemon.diagnose.residuals import Bench, Probe
+from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect
+from emb_daemon.errors import InputError
+from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
+from emb_daemon.offline import Log
+
+#: Force (N) above which the pads touch: what a cause does is stated as RMS over such samples.
+LOADED_N = 300.0
+#: Motor travel (rad) in contact below which a drive has no brake application to tell anything: one of 3 kN.
+_LEAST_TRAVEL_RAD = 10.0
+#: The contact angle is found before anything else, by Newton's steps: until one moves it by less than over what the curve's
+#: slope changes by a fiftieth (rad), and at most so many. A drive that begins clamped does not get there.
+_SETTLED_RAD, _STEPS = 0.1, 6
+#: Residual of a log without reference.
+_CHANNEL = "innovation"
+_FORCE_CHANNELS = ("stiffness", "torque")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A number in which units may differ.
+
+    Attributes:
+        key: of the calibration.
+        name: the effect's, or the key of a base parameter.
+        shape: value of the effect's shape parameter with which it is tried, or None.
+        unit: of one; base parameters count in multiples of their size.
+    """
+
+    key: str
+    name: str
+    shape: float | None
+    unit: str
+
+    def __str__(self) -> str:
+        return self.name if self.shape is None else f"{self.name} ({self.shape:g})"
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a drive says.
+
+    Attributes:
+        products: second moments of the causes' regressors and, last, the residual, the contact angle taken out, shape
+            (causes + 1, causes + 1), in the causes' units and N.
+        loaded: samples with the pads in contact.
+        ambient_C: of the surroundings, NaN if nobody said.
+    """
+
+    drive: Drive
+    products: np.ndarray
+    loaded: int
+    ambient_C: float
+
+
+def is_periodic(effect: Effect) -> bool:
+    """Whether an effect has a phase. It counts from where wheel and motor stood at power-on: it is another in each drive."""
+    return effect.harmonic is not None or any(p.group for p in effect.parameters)
+
+
+class Questions:
+    """The causes, and how drives are asked for them, under one calibration.
+
+    Attributes:
+        causes: in the order of a score's columns.
+    """
+
+    def __init__(self, calibration: Calibration):
+        self.calibration = calibration
+        base = [
+            replace(c, channel=_CHANNEL)
+            for c in base_coordinates(calibration, [calibration.contact.clearance_rad])
+            if c.channel in _FORCE_CHANNELS
+        ]
+        self._contact = next(c for c in base if c.name == CLEARANCE)
+        probes: list[Probe] = [Probe(c) for c in base if c is not self._contact]
+        for effect in REGISTRY:
+            if effect.channel not in _FORCE_CHANNELS or is_periodic(effect):
+                continue
+            own = effect_coordinates(calibration, effect, _CHANNEL)
+            if effect.name in calibration.effects:
+                probes += [Probe(c) for c in own.values()]
+                continue
+            shapes = [((own[s.name], start),) for s in effect.shapes[:1] for start in s.starts] or [()]
+            probes += [Probe(own[p.name], shape) for shape in shapes for p in effect.amplitudes]
+        self._probes = probes
+        self.causes = tuple(
+            Cause(
+                p.coordinate.name,
+                p.coordinate.effect or p.coordinate.name,
+                p.shape[0][1] if p.shape else None,
+                p.coordinate.unit,
+            )
+            for p in probes
+        )
+
+    def ask(self, log: Log, drive: Drive) -> Score:
+        """One drive.
+
+        Raises:
+            InputError: it cannot tell anything; says why.
+        """
+        # What a fleet is asked must be the same of every unit, a rig's force sensor or not.
+        bench = Bench([replace(log, force_N=np.full(len(log.samples), np.nan))], self.calibration, workers=1)
+        values = {self._contact: self._contact.start}
+        for _ in range(_STEPS):
+            residual = bench.residuals(values)
+            column, *others = bench.regressors(values, [Probe(self._contact), *self._probes], residual)
+            if not (size := float(column @ column)):
+                raise InputError("the pads never touch")
+            move = float(column @ residual[_CHANNEL]) / size
+            if abs(move) < _SETTLED_RAD:
+                break
+            values[self._contact] += move
+        else:
+            raise InputError("the contact angle is not found; does the drive begin with the brake applied?")
+        table = np.column_stack([*others, residual[_CHANNEL]])
+        # The curve's coefficients, each by its own size: together, the force.
+        curve = [row for row, cause in enumerate(self.causes) if cause.key.startswith("stiffness.curves")]
+        loaded = np.abs(table[:, curve].sum(axis=1)) > LOADED_N
+        samples = log.samples
+        if np.abs(samples["speed"] * samples["dt"])[loaded].sum() < _LEAST_TRAVEL_RAD:
+            raise InputError("no brake application")
+        table -= np.outer(column, column @ table / size)
+        heard = samples["ambient"][samples["has_status"]]
+        return Score(drive, table.T @ table, int(loaded.sum()), float(np.median(heard)) if len(heard) else np.nan)
+
+
+# -- one file for each unit and corner --------------------------------------------------------------------------------
+
+
+def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
+    """Ask every drive of one unit's corner and keep what they say; returns why some say nothing, by digest.
+
+    ``resume``: what is there of the same calibration is kept.
+    """
+    questions, path = Questions(calibration), scores_path(root, drives[0].unit, drives[0].corner)
+    known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
+    scores = {score.drive: score for score in known if score.drive in drives}
+    for drive in drives:
+        if drive in scores or drive.digest in silent:
+            continue
+        try:
+            scores[drive] = questions.ask(read_drive(root, drive)[0], drive)
+        except InputError as error:
+            silent[drive.digest] = str(error)
+    folder_of(path.parent)
+    _write(path, calibration, questions.causes, [scores[drive] for drive in sorted(scores)], silent)
+    return silent
+
+
+def scores_path(root: Path, unit: str, corner: str) -> Path:
+    return Path(root, "evidence", partition(unit, corner)).with_suffix(".npz")
+
+
+def _write(path: Path, calibration: Calibration, causes: Sequence[Cause], scores: list[Score], silent: dict[str, str]) -> None:
+    said = {
+        "calibration": calibration_hash(calibration), "causes": [asdict(cause) for cause in causes],
+        "drives": [asdict(score.drive) for score in scores], "silent": silent,
+    }  # fmt: skip
+    upper = np.triu_indices(len(causes) + 1)
+    sink = BytesIO()
+    np.savez(
+        sink,
+        said=np.frombuffer(json.dumps(said, sort_keys=True).encode(), np.uint8),
+        products=np.array([score.products[upper] for score in scores]).reshape(len(scores), -1),
+        loaded=np.array([score.loaded for score in scores], np.int64),
+        ambient_C=np.array([score.ambient_C for score in scores], float),
+    )
+    write_atomically(path, sink.getvalue())
+
+
+def read_scores(path: Path, calibration: Calibration) -> tuple[list[Score], dict[str, str]]:
+    """What was kept of one unit's corner; nothing if it was asked under another calibration."""
+    with np.load(path) as file:
+        said = json.loads(file["said"].tobytes())
+        if said["calibration"] != calibration_hash(calibration):
+            return [], {}
+        products, loaded, ambient = file["products"], file["loaded"], file["ambient_C"]
+    count = len(said["causes"]) + 1
+    upper = np.triu_indices(count)
+    scores = []
+    for row, entry in enumerate(said["drives"]):
+        square = np.zeros((count, count))
+        square[upper] = products[row]
+        square.T[upper] = products[row]
+        scores.append(Score(Drive(**entry), square, int(loaded[row]), float(ambient[row])))
+    return scores, said["silent"]
+
+
+def read_fleet(root: Path, calibration: Calibration) -> dict[tuple[str, str], list[Score]]:
+    """What was kept of every unit and corner under this calibration, units without a telling drive left out."""
+    result = {}
+    for path in sorted(Path(root, "evidence").glob("unit=*/corner=*.npz")):
+        scores, _ = read_scores(path, calibration)
+        if scores:
+            result[scores[0].drive.unit, scores[0].drive.corner] = scores
+    return result

@@ -1,0 +1,79 @@
+"""How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns."""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.fleet.dataset import Drive, read_drive
+from emb_daemon.fleet.ingest import Job, ingest
+from emb_daemon.fleet.scores import Questions
+from emb_daemon.logs.candump import parse_candump
+from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
+from emb_daemon.offline import estimate
+from emb_daemon.offline.log import CAPACITY, collect
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.replay import Replay, corners_in
+
+#: Each stage is run so often; the fastest counts, what else the machine does is none of the stage's.
+_TIMES = 3
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: processor time of one core over the log's samples, and the log's duration over that time."""
+
+    name: str
+    microseconds_a_sample: float
+    times_real_time: float
+
+
+def stages(path: Path, calibration: Calibration) -> list[Stage]:
+    """Every stage of a log's way to estimates, wholes at the end.
+
+    Raises:
+        InputError: not readable, or without samples.
+    """
+    raw, frames = read_file(path), read_frames(path)
+    corner = corners_in(frames, path)[0]
+    parameters = to_parameters(calibration)
+
+    def samples_of() -> np.ndarray:
+        pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
+        pipeline.begin(int(frames["time_ns"][0]))
+        return collect(frames, pipeline)
+
+    samples = samples_of()
+    seconds = 1e-9 * float(frames["time_ns"][-1] - frames["time_ns"][0])
+    with tempfile.TemporaryDirectory() as folder:
+        root, questions = Path(folder), Questions(calibration)
+        drive = next(Drive(**entry) for entry in ingest(root, Job(path, "unit", ""))["drives"] if entry["corner"] == corner)
+        work: dict[str, Callable] = {"unpack": lambda: unpack_gzip(path, raw)}
+        if log_ending(path) == ".log":
+            text = unpack_gzip(path, raw)
+            work["parse"] = lambda: parse_candump(text)
+        work |= {
+            "check and decode": samples_of,
+            "estimate": lambda: estimate(samples, parameters),
+            "read columns": lambda: read_drive(root, drive),
+            "ask for all causes": lambda: questions.ask(read_drive(root, drive)[0], drive),
+            "replay from the file": lambda: Replay(calibration, corner).run(path),
+            "replay from columns": lambda: estimate(read_drive(root, drive)[0].samples, parameters),
+        }
+        return [Stage(name, 1e6 * (spent := _time(task)) / len(samples), seconds / spent) for name, task in work.items()]
+
+
+def _time(task: Callable) -> float:
+    """Processor time of the fastest run, s."""
+    task()
+    spent = []
+    for _ in range(_TIMES):
+        begin = time.thread_time()
+        task()
+        spent.append(time.thread_time() - begin)
+    return max(min(spent), 1e-9)

@@ -1,0 +1,327 @@
+"""The fleet's promises: the daemon's own estimates, each file once, faults listed, work that survives, honest statistics."""
+
+import gzip
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError
+from emb_daemon.fleet import dataset, findings, learning, population, scores
+from emb_daemon.fleet.cluster import cluster, run
+from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
+from emb_daemon.fleet.replaying import replay_drive
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.plant import scenarios as sc
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import simulate_log
+from emb_daemon.resources import resource
+from studies import fleet as study
+
+pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory, calibration) -> Path:
+    """Two units with a stop on each of two days, 1 and 3 October 2026."""
+    folder = tmp_path_factory.mktemp("logs")
+    for unit in range(2):
+        (folder / f"car{unit}").mkdir()
+        for day in range(2):
+            start = 1_790_841_600_000_000_000 + 2 * day * 86_400_000_000_000
+            schedule = sc.rest(0.5) + sc.stop(7000.0, 2.0) + sc.rest(0.5)
+            frames, _ = simulate_log(
+                plant_from_calibration(calibration, unit), schedule, seed=day, reference=False, start_ns=start
+            )
+            path = folder / f"car{unit}" / f"drive.{day}.log.gz"
+            path.write_bytes(gzip.compress(format_candump(frames).encode()))
+    return folder
+
+
+def _ingested(root: Path, logs: Path) -> list[dict]:
+    return [ingest(root, job) for job in jobs(root, log_files([logs]))]
+
+
+def _content(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, logs, calibration):
+    _ingested(tmp_path / "fleet", logs)
+    drives = dataset.drives(tmp_path / "fleet")
+    assert [(drive.unit, drive.corner, drive.day) for drive in drives] == [
+        (unit, "FL", day) for unit in ("car0", "car1") for day in ("2026-10-01", "2026-10-03")
+    ]
+    figures = replay_drive(tmp_path / "fleet", drives[1], calibration)
+    assert main(["replay", str(logs / "car0/drive.1.log.gz"), "--output", str(tmp_path / "single.parquet")]) == 0
+    [written] = (tmp_path / "fleet/estimates").rglob(f"{drives[1].digest}.parquet")
+    assert written.read_bytes() == (tmp_path / "single.parquet").read_bytes()
+    assert figures["samples"] == 750 and figures["refused"] == {}
+
+
+def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs):
+    source = tmp_path / "logs/car"
+    source.mkdir(parents=True)
+    log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
+    # Half written: the last line is cut off.
+    log.write_bytes(text[: text.rindex(b"\n", 0, len(text) // 2) + 10])
+    [known] = _ingested(tmp_path / "fleet", source)
+    assert not known["fault"] and "cut off" in known["notes"]
+    assert jobs(tmp_path / "fleet", [log]) == []
+    log.write_bytes(text)
+    _ingested(tmp_path / "fleet", source)
+    [drive] = dataset.drives(tmp_path / "fleet")
+    samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
+    assert len(samples) == 750
+    assert len(list((tmp_path / "fleet/drives").rglob("*.parquet"))) == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"\x1f\x8b\x08\x00rubbish", b"no candump\n", b"(1.0) can0 7FF#00\n"])
+def test_a_damaged_file_is_listed_with_its_reason_and_ends_nothing(tmp_path, logs, content):
+    broken = tmp_path / "car0" / "broken.log.gz"
+    broken.parent.mkdir()
+    broken.write_bytes(content)
+    told = [ingest(tmp_path / "fleet", job) for job in jobs(tmp_path / "fleet", [broken, *log_files([logs / "car0"])])]
+    assert [bool(known["fault"]) for known in told] == [True, False, False]
+    assert str(broken) in told[0]["fault"]
+    assert len(dataset.drives(tmp_path / "fleet")) == 2
+    assert not jobs(tmp_path / "fleet", [broken])
+
+
+def test_a_damaged_drive_of_the_data_set_is_an_error_with_its_name(tmp_path, logs):
+    _ingested(tmp_path, logs / "car0")
+    drive = dataset.drives(tmp_path)[0]
+    [path] = (tmp_path / "drives").rglob(f"{drive.digest}.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=str(path)):
+        dataset.read_drive(tmp_path, drive)
+
+
+@pytest.mark.parametrize("pattern", ["(", "(?P<car>.)", "(?P<unit>nowhere)"])
+def test_a_pattern_that_finds_no_unit_is_refused(tmp_path, logs, pattern):
+    with pytest.raises(InputError, match="--unit"):
+        jobs(tmp_path, log_files([logs]), pattern)
+
+
+def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
+    [path, _] = log_files([logs / "car0"])
+    ingest(tmp_path, Job(path, "VIN 1/2 = ä", "2026-01-01"))
+    [drive] = dataset.drives(tmp_path)
+    assert drive.unit == "VIN 1/2 = ä"
+    assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
+
+
+def test_workers_may_die(tmp_path):
+    def square(number: int) -> int:
+        """Its worker is killed the first time it squares 3, and always at 5."""
+        mark = tmp_path / f"{number}"
+        if number == 5 or (number == 3 and not mark.exists()):
+            mark.touch()
+            os.kill(os.getpid(), 9)
+        return number * number
+
+    with cluster(workers=2) as client:
+        done = run(client, square, list(range(8)), failed=lambda item, reason: f"{item}: {reason}")
+    assert done[:5] + done[6:] == [0, 1, 4, 9, 16, 36, 49]
+    assert done[5].startswith("5: ")
+
+
+def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, calibration):
+    for name in ("at_once", "resumed"):
+        _ingested(tmp_path / name, logs)
+    drives = dataset.drives(tmp_path / "at_once")
+    for drive in drives:
+        replay_drive(tmp_path / "at_once", drive, calibration)
+    replay_drive(tmp_path / "resumed", drives[0], calibration)
+    # Killed between the estimates and the figures of the second drive.
+    replay_drive(tmp_path / "resumed", drives[1], calibration)
+    [figures] = (tmp_path / "resumed/figures").rglob(f"{drives[1].digest}.json")
+    figures.unlink()
+    assert main(["fleet", "replay", str(tmp_path / "resumed"), "--resume", "--workers", "1"]) == 0
+    assert _content(tmp_path / "resumed") == _content(tmp_path / "at_once")
+
+
+# -- statistics -------------------------------------------------------------------------------------------------------
+
+
+def _fleet(rng, units=60, size=6, causes=12):
+    """Units of three batches with scatter that is large in some directions, and prints of causes."""
+    spread = np.diag(10.0 ** rng.uniform(-1.0, 0.5, size))
+    turn = np.linalg.qr(rng.standard_normal((size, size)))[0]
+    values = rng.standard_normal((units, size)) @ spread @ turn
+    prints = rng.standard_normal((causes, size))
+    batch = np.arange(units) % 3
+    return values, prints, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
+
+
+def _read(values, prints, factors, noise=0.1):
+    centre = population.centres(values, factors)
+    covariance = np.broadcast_to(noise**2 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
+    return centre, population.Readings(values, centre, prints, covariance)
+
+
+def test_what_a_batch_shares_is_found_with_its_cause_and_size():
+    for seed in range(5):
+        values, prints, groups, factors = _fleet(np.random.default_rng(seed))
+        values[groups["batch 1"]] += 3.0 * prints[4]
+        values[groups["batch 2"]] -= 2.0 * prints[7]
+        found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+        assert {(one.group, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
+        for one in found:
+            truth = 3.0 if one.cause == 4 else -2.0
+            assert abs(one.amount - truth) < 5.0 * one.sigma
+
+
+def test_where_nothing_is_shared_nobody_is_accused():
+    """60 fleets of healthy units: of all accusations one in a hundred fleets may be false, and of units one in a hundred."""
+    batches = units = 0
+    for seed in range(60):
+        values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
+        centre, readings = _read(values, prints, factors)
+        batches += bool(population.shared_causes(values, groups, prints, readings, beside=True))
+        units += bool(population.outliers(values - centre, readings))
+    # Binomial, 0.1 %.
+    assert batches <= 5 and units <= 5
+
+
+def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
+    values, prints, _, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * prints[2]
+    values[20] -= 12.0 * prints[5]
+    centre, readings = _read(values, prints, factors)
+    found = population.outliers(values - centre, readings)
+    assert {(one.row, one.cause) for one in found} == {(10, 2), (20, 5)}
+    # Were its own drives as far apart, it would be none.
+    centre, readings = _read(values, prints, factors, noise=20.0)
+    assert population.outliers(values - centre, readings) == []
+
+
+def test_random_effects_take_each_units_own_noise_out():
+    rng = np.random.default_rng(0)
+    sigmas = rng.uniform(0.5, 3.0, 4000)
+    truth = rng.normal(10.0, 1.5, len(sigmas))
+    found = population.random_effects(truth + sigmas * rng.standard_normal(len(sigmas)), sigmas)
+    assert found.mean == pytest.approx(10.0, abs=5.0 * found.sigma)
+    assert found.spread == pytest.approx(1.5, rel=0.1)
+    values = truth + sigmas * rng.standard_normal(len(sigmas))
+    shrunk = population.random_effects(values, sigmas).shrunk
+    assert np.mean((shrunk - truth) ** 2) < 0.6 * np.mean((values - truth) ** 2)
+
+
+def test_units_that_differ_by_their_noise_alone_have_no_spread():
+    found = population.random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
+    assert found.spread == 0.0 and np.allclose(found.shrunk, 1.0)
+
+
+# -- end to end -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory, calibration):
+    """Twelve units on three days, the half of which have 130 N of viscous friction; what was found of them."""
+    root = tmp_path_factory.mktemp("fleet")
+    secret = study.Secret("viscous_friction", 130.0, {"viscous_Nms_per_rad": 1e-4})
+    units = {f"unit-{number:02d}": "AB"[number % 2] for number in range(12)}
+    drawn = study.Fleet(5, 3, units, {"A": secret}, {}, study.Secret("viscous_friction", 0.0, {"viscous_Nms_per_rad": 0.0}))
+    for unit in units:
+        study.drive_unit(root, drawn, unit)
+    for drives in dataset.by_unit(dataset.drives(root)).values():
+        assert scores.score_unit(root, drives, calibration) == {}
+    factors = {unit: {"batch": batch} for unit, batch in units.items()}
+    found = findings.find(scores.read_fleet(root, calibration), scores.Questions(calibration), "", factors, {})
+    findings.save(found, root)
+    return root, found
+
+
+def test_what_a_batch_shares_is_named_without_a_force_sensor(fleet):
+    _, found = fleet
+    [one] = found.groups
+    # Of the two halves either may be called the one that is apart.
+    assert one.cause == "viscous_friction" and one.where in ("batch A", "batch B")
+    assert 65.0 < one.size_N * (1.0 if one.where == "batch A" else -1.0) < 195.0
+    assert not found.outliers and not found.ageing
+    assert len(found.units) == 12 and found.drives == 36
+
+
+def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
+    root, found = fleet
+    assert main(["fleet", "report", str(root), "--output", str(tmp_path / "fleet.html")]) == 0
+    page = (tmp_path / "fleet.html").read_text()
+    assert "1 batch shares something" in page and "viscous friction" in page and found.groups[0].action in page
+    assert findings.load(root) == found
+
+
+def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monkeypatch):
+    root, _ = fleet
+    drives = next(iter(dataset.by_unit(dataset.drives(root)).values()))
+    path = scores.scores_path(root, drives[0].unit, drives[0].corner)
+    before, asked = path.read_bytes(), []
+    ask = scores.Questions.ask
+    monkeypatch.setattr(scores.Questions, "ask", lambda self, log, drive: asked.append(drive) or ask(self, log, drive))
+    scores.score_unit(root, drives, calibration)
+    assert not asked
+    scores.score_unit(root, drives[:2], calibration)
+    scores.score_unit(root, drives, calibration)
+    assert asked == drives[2:] and path.read_bytes() == before
+
+
+def test_a_drive_that_says_nothing_says_why(fleet, calibration):
+    root, _ = fleet
+    drive = dataset.drives(root)[0]
+    log, _ = dataset.read_drive(root, drive)
+    still = replace(log, samples=log.samples[:100], time_ns=log.time_ns[:100])
+    with pytest.raises(InputError, match=r"the pads never touch|no brake application"):
+        scores.Questions(calibration).ask(still, drive)
+
+
+def test_a_training_is_learned_once(tmp_path, calibration):
+    plant = plant_from_calibration(calibration, 3)
+    frames, _ = simulate_log(plant, sc.rest(1.0) + sc.training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
+    drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
+    told = learning.learn_unit(tmp_path, drives, calibration)
+    [entry] = told["entries"]
+    assert told["trainings"] == 1 and entry["outcome"] == "accepted"
+    assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
+    assert learning.learn_unit(tmp_path, drives, calibration) == told
+
+
+def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
+    rng = np.random.default_rng(0)
+    friction = calibration.friction.load_m_per_rad
+    values = {"friction.offset_Nm": 0.03, "friction.presliding_angle_rad": 0.03, "contact.clearance_rad": 7.5}
+    for unit in range(40):
+        own = values | {"friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal())}
+        entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
+        path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps({"calibration": calibration_hash(calibration), "entries": [entry]}))
+    save_calibration(calibration, tmp_path / "old.yaml")
+    command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
+    assert main([*command, str(tmp_path / "new.yaml")]) == 0
+    made = load_calibration(tmp_path / "new.yaml")
+    assert made.friction.load_m_per_rad == pytest.approx(1.1 * friction, rel=0.03)
+    assert made.provenance.sigmas["friction.load_m_per_rad"] == pytest.approx(0.05 * friction, rel=0.4)
+    # Four such widths of the friction at full force, a fifth of which is the offset's.
+    assert 0.1 < made.adaptation.friction_change < 0.3
+
+
+def test_without_trainings_there_is_no_prior(tmp_path, calibration):
+    with pytest.raises(InputError, match="fleet learn"):
+        learning.prior(tmp_path, calibration)
+
+
+@pytest.mark.parametrize("text", ["", "unit\na\n", "car,batch\na,b\n", "unit,batch\na,b\na,c\n", "unit,batch\na\n"])
+def test_a_table_of_units_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "units.csv").write_text(text)
+    with pytest.raises(InputError, match=r"units\.csv"):
+        findings.read_units(tmp_path / "units.csv")
