@@ -16,8 +16,10 @@ from emb_daemon.effects.terms import PORTS, SIGNALS
 
 #: Temperature (degC) at which a term that follows one is nothing.
 _COLD_C = 20.0
-_TEMPERATURES = ("pad_temperature", "disc_temperature", "caliper_temperature")
-_SLOW = (*_TEMPERATURES, "disc_speed", "brake_torque", "energy", "time_clamped", "time_since_last_clamp")
+_TEMPERATURES = ("surface_temperature", "pad_temperature", "disc_temperature", "caliper_temperature")
+_SLOW = (
+    *_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "energy", "time_clamped", "time_since_last_clamp"
+)  # fmt: skip
 #: Signals by port: states at elastic ports, speeds where something slides.
 _TYPED: dict[str, tuple[str, ...]] = {
     "thickness": (*_SLOW, "clamp_force"),
@@ -144,7 +146,8 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if port == "torque_constant" and signal == "current":
         # The residual of the torque path is itself current: without its noise, or it would be its own shadow.
         for exponent in _EXPONENTS:
-            yield "lag", "even_power", reach, 0.0, exponent, _SMOOTHED_S
+            for time in (_SMOOTHED_S, *_TIMES_S):
+                yield "lag", "even_power", reach, 0.0, exponent, time
         return
     if port == "force":
         for time in _CREEP_S:
@@ -168,7 +171,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         return
     for place in _PLACES:
         yield "none", "onset", width, low + place * width, 1.0, 1.0
-    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "clamp_force"):
+    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", max(abs(low - centre), abs(high - centre)), centre, 1.0, time
 

@@ -37,6 +37,8 @@ SIGNALS = {
     "time_since_last_clamp": "s",
     "winding_heat": "1",
     "housing_heat": "1",
+    "surface_temperature": "°C",
+    "friction_power": "W",
 }
 #: What a term remembers of its signal x: nothing; z of τ dz/dt + z = x; z − x, what is still to come; a Maxwell slip element
 #: of stretch ``memory_scale``, z in [-1, 1].
@@ -47,7 +49,7 @@ SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset",
 GATES = ("always", "load", "closing", "opening", "turning", "standing")
 
 (_ANGLE, _TRAVEL, _SPEED, _FORCE, _RATE, _CURRENT, _PADS, _DISC, _CALIPER, _WHEEL, _BRAKE, _ENERGY, _CLAMPED, _RELEASED,
- _WINDING, _HOUSING) = range(len(SIGNALS))  # fmt: skip
+ _WINDING, _HOUSING, _SURFACE, _POWER) = range(len(SIGNALS))  # fmt: skip
 _NONE, _LAG, _DEFICIT, _SLIP = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
@@ -109,6 +111,8 @@ def _follow(signal, s, m):
     signal[_CLAMPED] = signal[_CLAMPED] + m.dt if clamped else 0.0
     signal[_RELEASED] = 0.0 if clamped else signal[_RELEASED] + m.dt
     signal[_WINDING], signal[_HOUSING] = s.winding, s.housing
+    signal[_SURFACE] = 0.5 * (s.pads[0, 0] + s.pads[1, 0]) if s.temperature_known else np.nan
+    signal[_POWER] = s.power
 
 
 @njit

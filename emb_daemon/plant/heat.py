@@ -113,7 +113,8 @@ def heat_cycle(p, s, wheel_speed, ambient):
     copper = p.magnet_heating * s.current * s.current * (1.0 + p.copper_per_K * s.winding_rise)
     s.winding_rise += dt / (p.winding_time + dt) * (copper - s.winding_rise)
     s.magnet_rise += dt / p.magnet_time * (s.winding_rise - s.magnet_rise)
-    rise = 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1)) - p.curve_temperature
+    s.wheel_speed, s.pad_mean = wheel_speed, 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1))
+    rise = s.pad_mean - p.curve_temperature
     s.softening_memory += dt / p.history_time * (rise - s.softening_memory)
     factor = 1.0 - p.softening * rise - p.softening_history * s.softening_memory
     factor *= 1.0 - e.caliper_softening.per_K * (s.caliper - 22.0)
