@@ -41,11 +41,13 @@ _FOREIGN = {
     "clamp_creep": {"share": 0.06, "time_constant_s": 30.0},
     "brake_torque_coupling": {"per_Nm": 6e-5},
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
+    "drawn_pad_friction": {"size": -0.35, "signal": 9.0, "shape": SATURATION, "other": -1.0},
 }
 _SAME = {
     "clamp_creep": {"term:force:clamp_force"},
     "brake_torque_coupling": {"term:stiffness:brake_torque"},
     "spindle_lead_error": {"term:motor_angle:motor_angle"},
+    "drawn_pad_friction": {"term:pad_friction:friction_power"},
 }
 #: Signals of the family from which a seed draws effects, by port; the exponent is between these, every third has a second
 #: signal that multiplies, every third a lag (s) between these.
@@ -97,7 +99,7 @@ class Trial:
     @property
     def _drawn_terms(self) -> set[str]:
         """Terms that say what a drawn effect is: its port over either of its signals."""
-        drawn = {name: values for name, values in self.hidden.items() if name.startswith("drawn_")}
+        drawn = self.hidden if self.kind == "drawn" else {}
         return {
             f"term:{name.removeprefix('drawn_')}:{SIGNALS[int(values[key])]}"
             for name, values in drawn.items()

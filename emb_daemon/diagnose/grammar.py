@@ -21,7 +21,7 @@ from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, m
 from emb_daemon.diagnose.held_heat import follow_signals, record_heat
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.residuals import UNITS, Bench, Probe
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, Selection, one_round
 from emb_daemon.diagnose.signals import MANOEUVRES
@@ -101,7 +101,7 @@ class Screen:
 
 def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
     """Terms made for what the catalogue leaves, one after the other until none is proven."""
-    for channel in (channel for channel in selection.model.bench.channels if channel in FORCE_CHANNELS):
+    for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
         if _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)

@@ -29,7 +29,7 @@ _UNSURE, _LARGE = 0.05, 0.25
 #: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
 #: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
 #: noise states (`noise.presliding`); on simulated brakes with nothing hidden it alone brought false terms of 70 to 120 N.
-LASTING = {"stiffness": 4, "torque": 32, "innovation": 32}
+LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32}
 
 Progress = Callable[[str, float], None]
 

@@ -10,7 +10,8 @@ from emb_daemon.diagnose.signals import MANOEUVRES
 _PORTS = {
     "thickness": "the contact", "motor_angle": "the motor angle", "stiffness": "the stiffness", "force": "the clamp force",
     "torque_constant": "the torque constant", "torque": "the motor torque", "gear_gain": "the gear's transmission",
-    "gear_friction": "the gear's friction", "pad_friction": "the pads' friction",
+    "gear_friction": "the gear's friction", "pad_friction": "the pads' friction", "current": "the motor current",
+    "relaxation_time": "the relaxation time",
 }  # fmt: skip
 #: Base parameters that the verdict names.
 _TOLD = 3

@@ -16,7 +16,8 @@ MOST = 4
 
 #: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
 PORTS = (
-    "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction", "pad_friction"
+    "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction",
+    "pad_friction", "current", "relaxation_time",
 )  # fmt: skip
 #: Signals and their units. Forces are those of the stiffness path, temperatures and brake torque the models' own; heat of the
 #: motor is that of the estimator's winding and housing, as a share of what the largest force's current leaves for ever.

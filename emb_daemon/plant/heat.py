@@ -7,6 +7,7 @@ are states of their own.
 from math import ceil
 
 from emb_daemon.jit import njit
+from emb_daemon.plant.brake import drawn
 from emb_daemon.plant.records import CELLS, CYCLE_NS
 
 _STEFAN_BOLTZMANN = 5.670374419e-8
@@ -56,6 +57,7 @@ def friction_of_pads(p, s, wheel_speed):
     fade = p.effects.friction_coefficient_fade
     if fade.fade_per_K != 0.0:
         value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
+    value *= 1.0 + drawn(p.effects.drawn_pad_friction, s, 5)
     return max(value, 0.2 * p.friction_coefficient)
 
 

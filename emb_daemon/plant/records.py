@@ -118,6 +118,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
             ("torque_constant", "1", "the torque constant's factor"),
             ("gear_friction", "1", "the gear friction's factor"),
             ("gear_gain", "1", "the load's factor"),
+            ("pad_friction", "1", "the pads' friction's factor; without lag"),
         )
     },
     "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
@@ -208,7 +209,7 @@ PLANT_STATE = np.dtype(
         ("creep", "f8"),
         ("motor_heat", "f8"),
         # What drawn effects add, in the order of their table.
-        ("drawn", "f8", (5,)),
+        ("drawn", "f8", (6,)),
         ("excitation", "f8"),
         ("force", "f8"),
         ("force_rate", "f8"),
