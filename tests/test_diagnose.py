@@ -7,6 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 from browserkit import assert_is_drawn
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from emb_daemon.calibration.files import load_calibration, save_calibration
@@ -18,7 +20,7 @@ from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.episodes import episodes
-from emb_daemon.diagnose.evidence import Moments, false_discovery, judge, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Moments, false_discovery, judge, leave_out
 from emb_daemon.diagnose.held_heat import record_heat, run_held
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
@@ -26,9 +28,11 @@ from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.search import select
+from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.diagnose.unexplained import Left
 from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
@@ -88,6 +92,21 @@ def test_a_true_effect_is_seen_with_its_size_and_sigma():
     assert seen >= 55
     assert np.mean(values) == pytest.approx(1.0, abs=0.06)
     assert np.mean(sigmas) == pytest.approx(np.std(values), rel=0.35)
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(1, 16))
+def test_means_lose_nothing_that_lasts_and_cross_no_episode(lengths, samples):
+    episode = np.repeat(np.arange(len(lengths)), lengths)
+    means = Averaging(episode, samples)
+    level = np.arange(1.0, len(lengths) + 1.0)
+    averaged = means.of(level[episode][:, None])[:, 0]
+    # A level that lasts an episode keeps its sum of squares there, and its plain mean.
+    np.testing.assert_allclose(np.bincount(means.episode, averaged**2), lengths * level**2)
+    np.testing.assert_allclose(averaged * means.per_mean, level[means.episode])
+
+
+def test_there_is_a_manoeuvre_for_every_signal():
+    assert set(MANOEUVRES) >= {*SIGNALS, "motor_acceleration", "disc_angle"}
 
 
 def test_one_episode_proves_nothing():
@@ -575,7 +594,7 @@ def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
     """What the torque path leaves is current: a function of the current explains it whatever its cause."""
     gains = {"current": 900.0, "motor_acceleration": 800.0, "motor_speed": 700.0}
     shadows = {name: (np.array([1000.0]), np.array([1000.0 - gain])) for name, gain in gains.items()}
-    monkeypatch.setattr(Screening, "dependence", lambda self, model, channel: shadows)
+    monkeypatch.setattr(Screening, "dependence", lambda self, model, channel, samples: shadows)
     screening = Screening.__new__(Screening)
     assert screening.rival(None, "torque", {}) == (700.0, "motor_speed")
     assert screening.rival(None, "innovation", {}) == (800.0, "motor_acceleration")

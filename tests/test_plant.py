@@ -61,7 +61,8 @@ VISIBLE = {
     "drawn_thickness": {"size": 10.0, "signal": 1, "exponent": 1.5, "other": -1},
     "drawn_torque_constant": {"size": -0.05, "signal": 5, "exponent": 2.0, "other": -1},
     "drawn_gear_friction": {"size": 0.3, "signal": 4, "exponent": 0.5, "other": 3},
-    "drawn_gear_gain": {"size": 0.05, "signal": 3, "exponent": 1.0, "other": -1},
+    "drawn_gear_gain": {"size": 0.05, "signal": 3, "shape": 2, "other": -1},
+    "drawn_pad_friction": {"size": -0.3, "signal": 9, "shape": 1, "other": -1},
 }
 
 

@@ -63,6 +63,7 @@ def traced(calibration, *more):
         ("thickness", 2e-6, lambda p: p.__setitem__("clearance", p["clearance"] - 2e-6 / p["gear_gain"])),
         ("motor_angle", 0.1, lambda p: p.__setitem__("clearance", p["clearance"] - 0.1)),
         ("torque_constant", 0.05, lambda p: p.__setitem__("torque_constant", 1.05 * p["torque_constant"])),
+        ("relaxation_time", 0.5, lambda p: p.__setitem__("relaxation_time", 1.5 * p["relaxation_time"])),
         ("gear_gain", 0.05, None),
         ("gear_friction", 0.1, lambda p: (p.__setitem__("load_friction", 1.1 * p["load_friction"]),
                                           p.__setitem__("offset_friction", 1.1 * p["offset_friction"]))),
@@ -85,6 +86,9 @@ def test_torque_and_force_add_in_their_units(calibration):
     plain = traced(calibration)
     more = traced(calibration, constant("torque", 0.01))
     np.testing.assert_allclose((more["torque"] - plain["torque"])[1:], 0.01, atol=1e-12)
+    ampere = traced(calibration, constant("current", 0.5))
+    constant_Nm_per_A = calibration.motor.torque_constant_Nm_per_A
+    np.testing.assert_allclose((ampere["torque"] - plain["torque"])[1:], 0.5 * constant_Nm_per_A, rtol=1e-9)
     late = slice(1500, None)
     np.testing.assert_allclose((traced(calibration, constant("force", 50.0))["force"] - plain["force"])[late], 50.0, atol=1e-3)
 

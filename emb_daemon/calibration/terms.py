@@ -13,8 +13,9 @@ from emb_daemon.errors import InvalidValue
 Positive = Annotated[float, Meta(gt=0.0)]
 
 #: Most that a term may do at a port: what would leave nothing of the quantity that it changes. Angles and thickness: a
-#: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Force: as `Calibration` says of the largest.
-_MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf}
+#: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Current: what no sensor is off by. Force: as
+#: `Calibration` says of the largest.
+_MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0}
 _FACTOR = 0.9
 
 

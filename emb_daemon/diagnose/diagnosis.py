@@ -23,7 +23,7 @@ from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.search import select
-from emb_daemon.diagnose.selection import Progress, Selection
+from emb_daemon.diagnose.selection import LASTING, Progress, Selection
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
@@ -305,7 +305,8 @@ def _left(
             continue
         found: list[Dependence] = []
         if channel in FORCE_CHANNELS:
-            gains = screening.dependence(model, channel)
+            # What a calibration's own data left is in its noise already, sample by sample.
+            gains = screening.dependence(model, channel, 1 if model.bench.own_data else LASTING[channel])
             found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
         first, last = _rms(before[channel]), _rms(after[channel])
         share = (last / first) ** 2 if first > 0.0 else 0.0

@@ -12,6 +12,30 @@ from dataclasses import dataclass
 import numpy as np
 
 
+class Averaging:
+    """Means over runs of neighbouring samples, none across episodes, weighted so that a sum of squares stays one of samples.
+
+    Attributes:
+        episode: of each mean.
+        per_mean: what makes a plain mean of a weighted one, shape (means,).
+    """
+
+    def __init__(self, episode: np.ndarray, samples: int):
+        """``episode`` (N,) ascending; ``samples`` in a run."""
+        index = np.arange(len(episode))
+        begins = np.flatnonzero(np.diff(episode, prepend=-1))
+        within = index - begins[np.searchsorted(begins, index, side="right") - 1]
+        self._starts = np.flatnonzero(within % samples == 0)
+        counts = np.diff(np.append(self._starts, len(episode)))
+        self._weight = 1.0 / np.sqrt(counts)
+        self.per_mean = self._weight
+        self.episode = episode[self._starts]
+
+    def of(self, columns: np.ndarray) -> np.ndarray:
+        """Weighted means of columns (N, k)."""
+        return np.add.reduceat(columns, self._starts, axis=0) * self._weight[:, None]
+
+
 @dataclass(frozen=True)
 class Moments:
     """Second moments of regressors and residual, one matrix for each episode: all that the statistics below need.
@@ -95,22 +119,18 @@ class Evidence:
     Attributes:
         p_value: of "all its parameters are zero".
         gain: fall of the squared error summed over left-out episodes.
-        gains: the same, episode by episode.
         clusters: effective number of episodes that carry it.
         values, sigmas: of its parameters.
-        alignment: cosine between the candidate's regressors and what the nuisances span, largest of its directions.
     """
 
     p_value: float
     gain: float
-    gains: np.ndarray
     clusters: float
     values: np.ndarray
     sigmas: np.ndarray
-    alignment: float
 
 
-NOT_EXCITED = Evidence(1.0, 0.0, np.zeros(0), 0.0, np.zeros(0), np.zeros(0), 1.0)
+NOT_EXCITED = Evidence(1.0, 0.0, 0.0, np.zeros(0), np.zeros(0))
 
 
 def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray) -> Evidence:
@@ -126,7 +146,7 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
         return NOT_EXCITED
     fitted = leave_out(both, penalty[nuisances + candidate])
     plain = leave_out(base, penalty[nuisances])
-    gains = plain.left_out - fitted.left_out
+    gain = float((plain.left_out - fitted.left_out).sum())
     # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
     normal = total[:first, :first] + np.diag(penalty[nuisances])
     shadow = np.linalg.lstsq(normal, total[:first, first:-1], rcond=1e-12)[0] if first else np.zeros((0, count))
@@ -137,7 +157,6 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     rest = carried.sum(axis=0)
     size = np.sqrt(own)
     kept = np.linalg.eigvalsh(rest / np.outer(size, size))
-    alignment = float(np.sqrt(np.clip(1.0 - kept.max() / count if count > 1 else 1.0 - kept[0], 0.0, 1.0)))
     if kept[-1] <= 1e-8:
         return NOT_EXCITED
     inverse = np.linalg.pinv(rest, rcond=1e-10)
@@ -146,10 +165,10 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     values, covariance = fitted.values[first:], fitted.covariance[first:, first:]
     freedom = clusters - count
     if freedom < 2.0:
-        return Evidence(1.0, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+        return Evidence(1.0, gain, clusters, values, np.sqrt(np.diag(covariance)))
     statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
     p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
-    return Evidence(p_value, float(gains.sum()), gains, clusters, values, np.sqrt(np.diag(covariance)), alignment)
+    return Evidence(p_value, gain, clusters, values, np.sqrt(np.diag(covariance)))
 
 
 def false_discovery(p_values: np.ndarray) -> np.ndarray:

@@ -16,8 +16,10 @@ from emb_daemon.effects.terms import PORTS, SIGNALS
 
 #: Temperature (degC) at which a term that follows one is nothing.
 _COLD_C = 20.0
-_TEMPERATURES = ("pad_temperature", "disc_temperature", "caliper_temperature")
-_SLOW = (*_TEMPERATURES, "disc_speed", "brake_torque", "energy", "time_clamped", "time_since_last_clamp")
+_TEMPERATURES = ("surface_temperature", "pad_temperature", "disc_temperature", "caliper_temperature")
+_SLOW = (
+    *_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "energy", "time_clamped", "time_since_last_clamp"
+)  # fmt: skip
 #: Signals by port: states at elastic ports, speeds where something slides.
 _TYPED: dict[str, tuple[str, ...]] = {
     "thickness": (*_SLOW, "clamp_force"),
@@ -26,6 +28,17 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "force": ("clamp_force",),
     "torque_constant": ("current", "winding_heat", "housing_heat", *_TEMPERATURES),
     "torque": ("motor_speed", "motor_angle"),
+    "current": ("energy", "winding_heat", "housing_heat", *_TEMPERATURES),
+    "relaxation_time": (*_TEMPERATURES, "clamp_force", "disc_speed", "brake_torque"),
+    "pad_friction": (
+        "surface_temperature",
+        "pad_temperature",
+        "disc_temperature",
+        "disc_speed",
+        "clamp_force",
+        "friction_power",
+        "energy",
+    ),
     "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
     "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", "winding_heat", "housing_heat", *_SLOW),
 }
@@ -44,7 +57,7 @@ _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
 #: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
 _WIDER, _SHAPE = 8.0, 0.5
 #: A small coefficient by port, in its unit; of a factor a thousandth.
-_STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4}
+_STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4, "current": 1e-2}
 
 
 @dataclass(frozen=True)
@@ -144,7 +157,8 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if port == "torque_constant" and signal == "current":
         # The residual of the torque path is itself current: without its noise, or it would be its own shadow.
         for exponent in _EXPONENTS:
-            yield "lag", "even_power", reach, 0.0, exponent, _SMOOTHED_S
+            for time in (_SMOOTHED_S, *_TIMES_S):
+                yield "lag", "even_power", reach, 0.0, exponent, time
         return
     if port == "force":
         for time in _CREEP_S:
@@ -168,7 +182,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         return
     for place in _PLACES:
         yield "none", "onset", width, low + place * width, 1.0, 1.0
-    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "clamp_force"):
+    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", max(abs(low - centre), abs(high - centre)), centre, 1.0, time
 
@@ -197,6 +211,7 @@ def made_effect(form: Form, name: str) -> Effect:
 _QUANTITY = {
     "thickness": "pads and disc, m", "motor_angle": "θ", "stiffness": "stiffness", "force": "F", "torque_constant": "K_m",
     "torque": "T_m", "gear_gain": "γ", "gear_friction": "T_f", "pad_friction": "μ",
+    "current": "I", "relaxation_time": "τ",
 }  # fmt: skip
 
 

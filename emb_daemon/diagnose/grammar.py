@@ -16,33 +16,34 @@ import numpy as np
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Move
-from emb_daemon.diagnose.evidence import Evidence, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Evidence, leave_out
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, made_effect, rippling
 from emb_daemon.diagnose.held_heat import follow_signals, record_heat
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.residuals import UNITS, Bench, Probe
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import UNSURE, Selection
+from emb_daemon.diagnose.selection import LASTING, Selection, one_round
+from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond, sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
 from emb_daemon.offline.run import held
+from emb_daemon.offline.score import rmse
 
-#: A term is made if a smooth function of some signal explains this share of the rest, less what of it differs from sample to
-#: sample; or if that much of the rest does not: what memories do is no function of any signal now. Of the torque path of
-#: brakes with nothing hidden 0.11 to 0.15 does not, because the noise of the current is coloured.
-_CEILING, _STRUCTURED = 0.2, 0.2
-#: Samples that are averaged for the screening: what a term does lasts longer than 16 ms, its noise does not. For chance, which
-#: asks all forms a hundred times, an eighth of a second.
-_AVERAGED, _COARSE = 4, 32
+#: Samples that are averaged for chance, which asks all forms a hundred times, and for whether anything slow is left.
+_COARSE = 32
 #: Forms that are run through the estimator.
 _SHORTLIST = 10
+#: Forms whose sizes are fitted before that, and tries for each size: exponents and times as enumerated are a factor of two and
+#: more apart, and between two signals that resemble each other the better guess of an exponent would decide.
+_SHARPENED, _TRIES = 24, 8
 #: Shifts of all signals in time, and of the chosen one's; bootstraps.
 _CHANCES, _SHIFTS, _BOOTSTRAPS = 99, 5, 100
-#: Share of bootstraps that must choose the same port and signal; share of the gain with which another is as good.
-_STABLE, _AS_GOOD = 0.8, 0.95
+#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: then
+#: the one that is named comes out of less than four fifths.
+_AS_GOOD, _RIVAL = 0.95, 0.2
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 #: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
@@ -68,73 +69,79 @@ class Scores:
 class Screen:
     """One channel's residual, averaged, with its nuisances, against which forms are held."""
 
-    def __init__(self, model: Model, channel: str, averaged: int = _AVERAGED):
+    def __init__(self, model: Model, channel: str, samples: int):
         self.model, self.channel, bench = model, channel, model.bench
-        episode = bench.episode[channel]
-        index = np.arange(len(episode))
-        begins = np.flatnonzero(np.diff(episode, prepend=-1))
-        within = index - begins[np.searchsorted(begins, index, side="right") - 1]
-        self._starts = np.flatnonzero(within % averaged == 0)
-        self._counts = np.diff(np.append(self._starts, len(episode)))
-        weight = np.sqrt(self._counts)
-        self._weight = weight / self._counts
-        #: What makes a plain mean of an averaged column.
-        self.per_mean = 1.0 / weight
-        at = episode[self._starts]
-        self._bounds = np.searchsorted(at, np.arange(bench.episodes + 1))
+        self.means = Averaging(bench.episode[channel], samples)
+        self._of_episode = (self.means.episode == np.arange(bench.episodes)[:, None]).astype(float)
         own = model.own(channel)
-        table = np.column_stack([model.columns[c] for c in own]) if own else np.zeros((len(episode), 0))
-        self.nuisances = self.averaged(table)
-        penalty = model.penalty(own, channel) if own else np.zeros(0)
-        self._normal = self.nuisances.T @ self.nuisances + np.diag(penalty + 1e-12)
-        residual = self.averaged(model.residual[channel][:, None])
-        self.residual = residual - self.nuisances @ self._solve(self.nuisances.T @ residual)
+        penalty = model.penalty(own, channel) + 1e-12
+        table = np.column_stack([*(model.columns[c] for c in own), model.residual[channel]])
+        averaged = self.means.of(table)
+        self.nuisances = averaged[:, :-1]
+        self._inverse = np.linalg.pinv(self.nuisances.T @ self.nuisances + np.diag(penalty), rcond=1e-12, hermitian=True)
+        self.residual = self.beside_nuisances(averaged[:, -1:])
+        self._residual_of_episode = self._of_episode * self.residual[:, 0]
         self.keep = model.residual[channel] != 0.0
 
-    def averaged(self, columns: np.ndarray) -> np.ndarray:
-        """Means over a few samples, weighted as so many; columns (N, k)."""
-        return np.add.reduceat(columns, self._starts, axis=0) * self._weight[:, None]
-
-    def _solve(self, right: np.ndarray) -> np.ndarray:
-        return np.linalg.lstsq(self._normal, right, rcond=1e-12)[0] if len(self._normal) else right
+    def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
+        """What of averaged columns the nuisances cannot take."""
+        return averaged - self.nuisances @ (self._inverse @ (self.nuisances.T @ averaged))
 
     def scores(self, columns: np.ndarray) -> Scores:
         """Of regressors (N, k)."""
-        return self.scores_of(self.averaged(columns * self.keep[:, None]))
+        return self.scores_of(self.means.of(columns * self.keep[:, None]))
 
     def scores_of(self, averaged: np.ndarray) -> Scores:
         """Of regressors that are averaged already."""
-        averaged = averaged - self.nuisances @ self._solve(self.nuisances.T @ averaged)
-        episodes = len(self._bounds) - 1
-        u, a = np.zeros((averaged.shape[1], episodes)), np.zeros((averaged.shape[1], episodes))
-        for number in range(episodes):
-            part = slice(self._bounds[number], self._bounds[number + 1])
-            u[:, number] = averaged[part].T @ self.residual[part, 0]
-            a[:, number] = np.einsum("nk,nk->k", averaged[part], averaged[part])
-        return Scores(u, a)
+        averaged = self.beside_nuisances(averaged)
+        u = self._residual_of_episode @ averaged
+        np.square(averaged, out=averaged)
+        return Scores(u.T, (self._of_episode @ averaged).T)
 
 
 def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
     """Terms made for what the catalogue leaves, one after the other until none is proven."""
-    for channel in (channel for channel in selection.model.bench.channels if channel in FORCE_CHANNELS):
-        while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
+    for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
+        if _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
-            before, selection = selection, _one_more(selection, channel)
-            if selection.accepted == before.accepted:
-                break
+            selection = _without_shadows(_with_terms(selection, channel), selection, channel)
     return selection
 
 
+def _with_terms(selection: Selection, channel: str) -> Selection:
+    while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
+        before, selection = selection, _one_more(selection, channel)
+        if selection.accepted == before.accepted:
+            break
+    return selection
+
+
+def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
+    """The same, or terms alone if these leave less by what matters: an effect of the ``catalogue`` beside which a term had to
+    be made may be the shadow of what no catalogue holds. It is then asked again beside the terms."""
+    doubted = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
+    known = any(catalogue.candidates[name].in_calibration for name in doubted)
+    if not doubted or known or found.accepted == catalogue.accepted:
+        return found
+    bare = catalogue
+    for name in doubted:
+        bare = bare.without(name, "explains less than terms without it, and nothing beside them")
+    terms = _with_terms(bare, channel)
+    if terms.accepted == bare.accepted:
+        return found
+    both = one_round(replace(terms, dropped=catalogue.dropped))
+    gain = found.model.noise(channel) - both.model.noise(channel)
+    return both if gain > found.screening.floor(found.model, channel) ** 2 else found
+
+
 def _wanted(selection: Selection, channel: str) -> bool:
-    """Whether enough is left, and enough of it looks explicable, for a term to be made up."""
+    """Whether enough is left, of what lasts longer than noise, for a term to be made up."""
     model, screening = selection.model, selection.screening
-    residual, square = model.residual[channel], model.noise(channel)
     known = screening.achieved(model, channel, screening.signals["clamp_force"], np.zeros(0))
-    noise = sample_noise(residual) ** 2
-    if is_beyond(np.sqrt(square), known) or square - noise > _STRUCTURED * square:
+    if is_beyond(np.sqrt(model.noise(channel)), known):
         return True
-    ceiling = model.rms(screening.rival(model, channel, {})[0], channel)
-    return ceiling >= screening.floor(model, channel) and ceiling**2 > _CEILING * (square - noise)
+    screen = Screen(model, channel, _COARSE)
+    return rmse(screen.residual[:, 0] * screen.means.per_mean) >= screening.floor(model, channel)
 
 
 @dataclass(frozen=True)
@@ -145,9 +152,10 @@ class Prospect:
     columns: list[np.ndarray]
     evidence: Evidence
 
-    def is_of(self, other: "Prospect") -> bool:
-        """Whether it says the same of port and signal."""
-        return (self.form.port, self.form.signal) == (other.form.port, other.form.signal)
+    @property
+    def means(self) -> tuple[str, str]:
+        """What it says: port and signal."""
+        return self.form.port, self.form.signal
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
@@ -161,25 +169,29 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if not prospects or model.rms(prospects[0].evidence.gain, channel) < screening.floor(model, channel):
         return selection
     best, *others = prospects
-    alike, stable = _as_good(best, others), _stability(search.screen, prospects)
+    shares = _chosen(search.screen, prospects)
+    rivals = _as_good(best, others, shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
-    made_of = f"same port and signal in {100 * stable:.0f} % of bootstraps"
-    if alike:
-        made_of += f"; as good on these logs: {', '.join(alike)}"
-    ceiling, rival = screening.rival(model, channel, {})
+    made_of = f"same port and signal in {100 * shares[best.means]:.0f} % of bootstraps"
+    manoeuvre = None
+    if rivals:
+        manoeuvre = _manoeuvre(best.form, rivals[0].form)
+        alike = ", ".join(_words(p.form) for p in rivals)
+        made_of += f"; these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
+    ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
         < _OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
-        made_of: stable < _STABLE and not alike,
     }
     against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
         made_effect(best.form, _name(best.form, selection)), channel, evidence=best.evidence, p_value=best.evidence.p_value,
         q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
-        confounded_with=alike[0] if alike else None, over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
+        confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
+        over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
     )  # fmt: skip
     return selection.noted([candidate]) if against else _entered(selection, candidate, best.form)
 
@@ -207,23 +219,23 @@ class _Search:
             port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
         )  # fmt: skip
         self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
-        self.screen = Screen(model, channel)
+        self.screen = Screen(model, channel, LASTING[channel])
         self.forms = enumerate_forms(self.covered, self.ports)
         self.scores = _screened(self.screen, self.forms, self.sensitivities, signals)
 
     def prospects(self) -> list[Prospect]:
-        """The best forms, through the estimator, that shorten the description, the choice among all forms included; best
-        first."""
+        """The best forms, through the estimator, with their sizes fitted; shortest description first."""
         model, own = self.model, self.model.own(self.channel)
-        best = [*_shortlisted(self.forms, self.scores), *_ripples(self)]
+        best = [*_sharpened(self), *_ripples(self)]
         exact = [_probed(model, self.channel, form) for form in best]
-        found = [Prospect(form, own, model.evidence(self.channel, own)) for form, own in zip(best, exact, strict=True)]
-        moments = model.moments(self.channel, [model.columns[c] for c in own])
+        samples = LASTING[self.channel]
+        pairs = zip(best, exact, strict=True)
+        found = [Prospect(form, own, model.evidence(self.channel, own, samples=samples)) for form, own in pairs]
+        moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
-        alone -= model.counted(self.channel) * sample_noise(model.residual[self.channel]) ** 2
-        kept = [p for p in found if p.evidence.p_value < UNSURE and p.evidence.gain > 0.0 and _stays_in_bounds(p)]
-        length = {id(p): _length(p, alone, model.bench.episodes) + np.log(len(self.forms)) for p in kept}
-        return sorted((p for p in kept if length[id(p)] < 0.0), key=lambda p: length[id(p)])
+        alone -= model.counted(self.channel) * sample_noise(model.residual[self.channel]) ** 2 / samples
+        kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
 
     def chance(self, best: Prospect) -> float:
         """That of the best among all forms; a ripple's is that of its order among as many."""
@@ -325,32 +337,60 @@ def _chance(search: _Search) -> float:
     screen = Screen(search.model, search.channel, _COARSE)
     shapes = list(dict.fromkeys(replace(form, port="") for form in search.forms))
     row = {shape: index for index, shape in enumerate(shapes)}
-    every = [screen.averaged(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
-    values = np.column_stack(every) * screen.per_mean[:, None]
+    every = [screen.means.of(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
+    values = np.column_stack(every) * screen.means.per_mean[:, None]
     by_port = []
     for port, column in search.sensitivities.items():
         rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
         if rows:
-            by_port.append((screen.averaged((column * screen.keep)[:, None]), rows))
-    best, gain = [], search.scores.gain.max()
-    for _ in range(_CHANCES):
+            by_port.append((screen.means.of((column * screen.keep)[:, None]), rows))
+    gain = search.scores.gain.max()
+    for number in range(_CHANCES):
         moved = np.roll(values, int(len(values) * search.random.uniform(0.1, 0.9)), axis=0)
-        best.append(max(float(screen.scores_of(own * moved[:, rows]).gain.max()) for own, rows in by_port))
-    return (1.0 + np.count_nonzero(np.array(best) >= gain)) / (1.0 + _CHANCES)
+        if any(float(screen.scores_of(own * moved[:, rows]).gain.max()) >= gain for own, rows in by_port):
+            # One that is as good is one too many, and settles it.
+            return 2.0 / (2.0 + number)
+    return 1.0 / (1.0 + _CHANCES)
 
 
-def _shortlisted(forms: Sequence[Form], scores: Scores) -> list[Form]:
+def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
     """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
-    gains = scores.gain
     chosen: list[Form] = []
     for index in np.argsort(-gains):
         form = forms[index]
         relatives = [f for f in chosen if (f.port, f.signal, f.memory) == (form.port, form.signal, form.memory)]
         if gains[index] > 0.0 and len(relatives) < 2:
             chosen.append(form)
-        if len(chosen) == _SHORTLIST:
+        if len(chosen) == most:
             break
     return chosen
+
+
+def _sharpened(search: _Search) -> list[Form]:
+    """The best forms with their sizes where left-out episodes gain most."""
+    found = [_fitted(search, form) for form in _best_of(search.forms, search.scores.gain, _SHARPENED)]
+    gains = np.array([gain for _, gain in found])
+    return _best_of([form for form, _ in found], gains, _SHORTLIST)
+
+
+def _fitted(search: _Search, form: Form) -> tuple[Form, float]:
+    """A form with its sizes fitted one after the other on the screen, and its gain there."""
+
+    def gain(tried: Form) -> float:
+        values = _values(search.model.bench, tried, search.signals)
+        return float(search.screen.scores((search.sensitivities[form.port] * values)[:, None]).gain[0])
+
+    best = gain(form)
+    for size in form.fitted:
+        low, high, _ = form.bounds(size)
+        now = getattr(form, size)
+        for tried in np.linspace(low, high, _TRIES + 2)[1:-1] if size == "centre" else np.geomspace(low, high, _TRIES):
+            other = replace(form, **{size: float(tried)})
+            reached = gain(other)
+            if reached > best:
+                best, now = reached, float(tried)
+        form = replace(form, **{size: now})
+    return form, best
 
 
 def _ripples(search: _Search) -> list[Form]:
@@ -387,20 +427,36 @@ def _length(prospect: Prospect, alone: float, episodes: int) -> float:
     return 0.5 * episodes * np.log(left) + 0.5 * prospect.form.numbers * np.log(episodes)
 
 
-def _as_good(best: Prospect, others: Sequence[Prospect]) -> list[str]:
-    """Other ports and signals whose best form gains nearly as much."""
-    alike = [p.form for p in others if not p.is_of(best) and p.evidence.gain >= _AS_GOOD * best.evidence.gain]
-    return list(dict.fromkeys(f"{form.port} over {form.signal}".replace("_", " ") for form in alike))
+def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """The best forms of other ports and signals that gain nearly as much, or that resampled episodes would often choose."""
+    found: dict[tuple[str, str], Prospect] = {}
+    for other in sorted(others, key=lambda p: -p.evidence.gain):
+        close = other.evidence.gain >= _AS_GOOD * best.evidence.gain or shares[other.means] >= _RIVAL
+        if other.means != best.means and close:
+            found.setdefault(other.means, other)
+    return list(found.values())
 
 
-def _stability(screen: Screen, prospects: Sequence[Prospect]) -> float:
-    """Share of resampled episodes in which the same port and signal would be chosen; equal ones count as the same."""
+def _words(form: Form) -> str:
+    return f"{form.port} over {form.signal}".replace("_", " ")
+
+
+def _manoeuvre(form: Form, other: Form) -> str:
+    """What would tell two forms apart: of one signal only the port, which shows over the force."""
+    return MANOEUVRES[form.signal if form.signal != other.signal else "clamp_force"]
+
+
+def _chosen(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
+    """Share of resampled episodes in which each port and signal would be chosen."""
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     episodes = scores[0].u.shape[1]
     weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
-    own = gains[[prospect.is_of(prospects[0]) for prospect in prospects]].max(axis=0)
-    return float(np.mean(own >= _AS_GOOD * gains.max(axis=0)))
+    chosen = np.argmax(gains, axis=0)
+    shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)
+    for index, count in zip(*np.unique(chosen, return_counts=True), strict=True):
+        shares[prospects[index].means] += count / _BOOTSTRAPS
+    return shares
 
 
 # -- accepting --------------------------------------------------------------------------------------------------------
@@ -422,10 +478,10 @@ def _entered(selection: Selection, candidate: Candidate, form: Form) -> Selectio
     sizes = {_coordinate(index, channel, form, field, name): getattr(form, field) for field in form.fitted}
     values = dict(zip(amplitudes, map(float, candidate.evidence.values), strict=True)) | sizes
     model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
-    evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0))
+    evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0), LASTING[channel])
     gain = model.rms(evidence.gain, channel)
     worse = model.noise(channel) >= before.noise(channel)
-    if worse or evidence.p_value > UNSURE or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
+    if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
         return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"

@@ -16,12 +16,14 @@ from emb_daemon.jit import njit
 from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline.run import TRACE
 
-#: What the force paths take from the rest of the step, at each sample: the pads' ``mean`` temperatures (degC) and the
-#: ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known, and the heat of the
-#: motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost, which a held run cannot follow.
+#: What the force paths take from the rest of the step, at each sample: temperatures (degC) of the pads, ``mean`` and at the
+#: ``surface``, and the ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known,
+#: and the heat of the motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost, which a held run
+#: cannot follow.
 HELD = np.dtype(
     [
         ("mean", "f8", (2,)),
+        ("surface", "f8", (2,)),
         ("history", "f8"),
         ("power", "f8"),
         ("disc", "f8"),
@@ -42,6 +44,7 @@ def _record(samples, parameters, states, estimate, out):
         o.winding, o.housing = s.winding, s.housing
         step(s, p, samples[row], e)
         o.mean[:] = s.mean
+        o.surface[0], o.surface[1] = s.pads[0, 0], s.pads[1, 0]
         o.history = s.history
         o.power, o.disc, o.contact_angle, o.temperature_known = s.power, s.disc, s.contact_angle, s.temperature_known
 
@@ -58,6 +61,7 @@ def _run(samples, parameters, states, held, out, signals):
         m, h, o = samples[row], held[row], out[row]
         s.disc, s.power, s.temperature_known = h.disc, h.power, h.temperature_known
         s.mean[:] = h.mean
+        s.pads[0, 0], s.pads[1, 0] = h.surface[0], h.surface[1]
         s.winding, s.housing = h.winding, h.housing
         rise = 0.5 * (h.mean[0] + h.mean[1]) - p.thermal.reference
         stiffness_path(s, p, m, stiffness_factor(p.thermal, rise, h.history) if h.temperature_known else 1.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Evidence, Moments, judge
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -144,22 +144,30 @@ class Model:
         prior = np.array([c.prior for c in coordinates])
         return self.inflation(channel) * max(self.noise(channel), 1e-12) / prior**2
 
-    def moments(self, channel: str, columns: Sequence[np.ndarray], residual: np.ndarray | None = None) -> Moments:
-        """Of regressors, (N,) or (N, k) each, and the channel's residual or another."""
+    def moments(
+        self, channel: str, columns: Sequence[np.ndarray], residual: np.ndarray | None = None, samples: int = 1
+    ) -> Moments:
+        """Of regressors, (N,) or (N, k) each, and the channel's residual or another, as means over so many ``samples``."""
         residual = self.residual[channel] if residual is None else residual
-        table = np.column_stack(columns) if len(columns) else np.zeros((len(residual), 0))
-        return Moments.of(table, residual, self.bench.episode[channel], self.bench.episodes)
+        table, episode = np.column_stack([*columns, residual]), self.bench.episode[channel]
+        if samples > 1:
+            means = Averaging(episode, samples)
+            table, episode = means.of(table), means.episode
+        return Moments.of(table[:, :-1], table[:, -1], episode, self.bench.episodes)
 
-    def evidence(self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = ()) -> Evidence:
-        """Of regressors that are not in the model, everything in it and ``given`` ones free."""
+    def evidence(
+        self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
+    ) -> Evidence:
+        """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``."""
         free = self.own(channel)
-        moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own])
+        moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own], samples=samples)
         penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
         first = len(free) + len(given)
         return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
-    def evidence_against(self, values: Values) -> Evidence:
-        """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free.
+    def evidence_against(self, values: Values, samples: int = 1) -> Evidence:
+        """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over
+        ``samples``.
 
         An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
         tested = list(values)
@@ -168,7 +176,7 @@ class Model:
         from_ = {c: values.get(c, self.centre.get(c, c.start)) for c in free}
         moved = np.array([self.values[c] - from_[c] for c in free])
         restored = self.residual[channel] + np.column_stack([self.columns[c] for c in free]) @ moved
-        moments = self.moments(channel, [self.columns[c] for c in free], restored)
+        moments = self.moments(channel, [self.columns[c] for c in free], restored, samples)
         rest = [index for index, c in enumerate(free) if c not in values]
         return judge(moments, rest, [free.index(c) for c in tested], self.penalty(free, channel))
 

@@ -5,6 +5,7 @@ import numpy as np
 from emb_daemon.diagnose.diagnosis import Diagnosis, Recalibrated
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import Left
 
 #: Dependences listed for each channel.
@@ -50,6 +51,7 @@ def _unexplained(diagnosis: Diagnosis) -> dict:
         "present": left is not None,
         "share": strongest.share if strongest else max(every, default=0.0),
         "strongest_dependence": strongest.signal if strongest else None,
+        "manoeuvre": MANOEUVRES[strongest.signal] if strongest else None,
         "path": left.channel if left else None,
         "rms_N": left.rms if left and UNITS[left.channel] == "N" else 0.0,
         "paths": {channel: _left(part) for channel, part in diagnosis.left.items()},

@@ -19,6 +19,7 @@ from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.held_heat import record_heat, run_held
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
+from emb_daemon.logs.columns import nearest
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_step
 
@@ -74,11 +75,9 @@ def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
     reference, time, force = log.reference, log.time_ns, log.force_N
     if not len(reference.time_ns) or not np.isfinite(force).any():
         return force, np.full(len(time), np.nan)
-    nearest = np.clip(np.searchsorted(reference.time_ns, time), 1, len(reference.time_ns) - 1)
-    before = reference.time_ns[nearest] - time > time - reference.time_ns[nearest - 1]
-    nearest = nearest - before
-    near = np.abs(reference.time_ns[nearest] - time) < 2_000_000
-    offset = np.median((reference.time_ns[nearest] - time)[near]) if near.any() else 0.0
+    later = reference.time_ns[nearest(reference.time_ns, time)] - time
+    near = np.abs(later) < 2_000_000
+    offset = np.median(later[near]) if near.any() else 0.0
     share = float(np.clip(offset / np.median(np.diff(reference.time_ns)), -0.5, 0.5))
     shifted = force.copy()
     if share > 0.0:

@@ -131,7 +131,7 @@ class Screening:
             for shape in shapes[effect.name][0]
             for p in effect.amplitudes
         ]
-        columns = dict(zip(probes, self.bench.regressors(model.values, probes, model.residual), strict=True))
+        columns = dict(zip(probes, model.bench.regressors(model.values, probes, model.residual), strict=True))
         found = [self._best(model, effect, *shapes[effect.name], columns) for effect in effects]
         chances = np.array([c.p_value for c in found] + [1.0] * (len(REGISTRY) - len(found)))
         return [replace(c, q_value=float(q)) for c, q in zip(found, false_discovery(chances), strict=False)]
@@ -219,32 +219,33 @@ class Screening:
                 return replace(candidate, reason=f"its placebo ({text}) explains {100 * share:.0f} % of the same")
         return replace(candidate, reason="")
 
-    def rival(self, model: Model, channel: str, rivals: dict) -> tuple[float, str]:
+    def rival(self, model: Model, channel: str, rivals: dict, samples: int = 1) -> tuple[float, str]:
         """Largest gain on left-out episodes of a smooth function of one signal, and that signal; kept in ``rivals``."""
         if channel not in rivals:
             gains = {
                 name: float((without - with_).sum())
-                for name, (without, with_) in self.dependence(model, channel).items()
+                for name, (without, with_) in self.dependence(model, channel, samples).items()
                 if name not in _NO_RIVALS.get(channel, ())
             }
             name = max(gains, key=gains.__getitem__, default="")
             rivals[channel] = (max(gains.get(name, 0.0), 0.0), name)
         return rivals[channel]
 
-    def dependence(self, model: Model, channel: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Squared error of each left-out episode, without and with a smooth function of each signal."""
+    def dependence(self, model: Model, channel: str, samples: int = 1) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Squared error of each left-out episode, without and with a smooth function of each signal; of means over
+        ``samples``."""
         if channel not in FORCE_CHANNELS:
             return {}
         own = model.own(channel)
         base, prior = [model.columns[c] for c in own], model.penalty(own, channel)
         keep = model.residual[channel] != 0.0
-        plain = leave_out(model.moments(channel, base), prior).left_out
+        plain = leave_out(model.moments(channel, base, samples=samples), prior).left_out
         result = {}
         for name, signal in self.signals.items():
             basis = smooth_basis(name, signal, self.signals["clamp_force"]) * keep[:, None]
             if not basis.shape[1]:
                 continue
-            moments = model.moments(channel, [*base, basis])
+            moments = model.moments(channel, [*base, basis], samples=samples)
             size = np.einsum("gii->i", moments.products)[len(own) : -1]
             penalty = np.concatenate([prior, 1e-3 * np.maximum(size, 1e-300) + 1e-12])
             result[name] = (plain, leave_out(moments, penalty).left_out)
@@ -268,19 +269,19 @@ class Screening:
         """Regressors of a candidate under a placebo, drawn a few times."""
         if placebo.order:
             [(order, found)] = candidate.shape
-            return [self._columns(model, self.bench, candidate, ((order, other),)) for other in placebo.order(found)]
+            return [self._columns(model, model.bench, candidate, ((order, other),)) for other in placebo.order(found)]
         if placebo.samples:
-            benches = [self.bench.disturbed(placebo.samples, random) for _ in range(_DRAWS)]
+            benches = [model.bench.disturbed(placebo.samples, random) for _ in range(_DRAWS)]
             return [self._columns(model, bench, candidate, candidate.shape) for bench in benches]
         like = [model.columns[c] for c in model.own(candidate.channel) if c.name == HOOKS[candidate.effect.hook].like]
         if not like:
             return []
-        signal, episode = self.signals[candidate.effect.signal], self.bench.sample_episode
+        signal, episode = self.signals[candidate.effect.signal], model.bench.sample_episode
         shuffled = [placebo.signal(signal - signal[0], episode, random) for _ in range(_SHUFFLES)]
         return [[np.sum(like, axis=0) * follows] for follows in shuffled]
 
     def _columns(self, model: Model, bench: Bench, candidate: Candidate, shape: tuple) -> list[np.ndarray]:
-        at = model.residual if bench is self.bench else bench.residuals(model.values)
+        at = model.residual if bench is model.bench else bench.residuals(model.values)
         return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at)
 
 

@@ -14,6 +14,31 @@ _KNOTS = 7
 _APPLIED_N = 150.0
 
 
+#: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not.
+MANOEUVRES = {
+    "motor_angle": "slow strokes on pads of another thickness: the same angles at other forces",
+    "travel": "slow strokes to several forces, on pads of another thickness too",
+    "motor_speed": "strokes at several constant speeds",
+    "motor_acceleration": "free strokes in the clearance at several accelerations",
+    "clamp_force": "holds at several forces, each reached from below and from above",
+    "force_rate": "strokes to one force at several speeds",
+    "current": "holds at several forces with a cold motor, each reached from below and from above",
+    "winding_heat": "a minute's hold at a large force at standstill, then small strokes",
+    "housing_heat": "ten minutes of holds at a large force at standstill, then small strokes",
+    "surface_temperature": "short hard stops with long pauses: only the surface is hot",
+    "pad_temperature": "clamps at intervals at standstill while warm pads cool",
+    "disc_temperature": "a long drag, then clamps at intervals while the disc cools",
+    "caliper_temperature": "clamps after an hour in a warm and in a cold place",
+    "disc_speed": "short stops of one force from several disc speeds, cold",
+    "disc_angle": "drags at several constant disc speeds",
+    "brake_torque": "the same forces on a turning and on a standing disc, cold",
+    "friction_power": "stops of one brake torque from several disc speeds, cold",
+    "energy": "the same strokes before and after many stops, cold both times",
+    "time_clamped": "holds of several lengths at one force, at standstill",
+    "time_since_last_clamp": "equal clamps after pauses of several lengths, at standstill",
+}
+
+
 def signals(bench: Bench) -> dict[str, np.ndarray]:
     """Measured and estimated signals at every sample of all logs, under the names of the report."""
     columns: dict[str, list[np.ndarray]] = {}
@@ -38,6 +63,8 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
             "current": _around(np.nan_to_num(samples["current_q"]), np.full(6, 0.5)),
             "clamp_force": force,
             "pad_temperature": np.nan_to_num(estimates["mean"].mean(axis=1), nan=20.0),
+            "surface_temperature": np.nan_to_num(estimates["surface"].mean(axis=1), nan=20.0),
+            "friction_power": power,
             "disc_temperature": np.nan_to_num(estimates["disc"], nan=20.0),
             "caliper_temperature": np.where(samples["has_thermocouple"], np.nan_to_num(samples["caliper"]), 20.0),
             "time_clamped": _time_since(time, applied),

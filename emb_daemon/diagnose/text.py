@@ -4,12 +4,14 @@ from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.signals import MANOEUVRES
 
 #: Where a term acts, for people.
 _PORTS = {
     "thickness": "the contact", "motor_angle": "the motor angle", "stiffness": "the stiffness", "force": "the clamp force",
     "torque_constant": "the torque constant", "torque": "the motor torque", "gear_gain": "the gear's transmission",
-    "gear_friction": "the gear's friction", "pad_friction": "the pads' friction",
+    "gear_friction": "the gear's friction", "pad_friction": "the pads' friction", "current": "the motor current",
+    "relaxation_time": "the relaxation time",
 }  # fmt: skip
 #: Base parameters that the verdict names.
 _TOLD = 3
@@ -119,7 +121,10 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
         text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
-    return [f"{text}, which depend most on {strongest.signal.replace('_', ' ')}." if strongest else f"{text}."]
+    if strongest is None:
+        return [f"{text}."]
+    told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
+    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}."]
 
 
 def table(diagnosis: Diagnosis) -> str:

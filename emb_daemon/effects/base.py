@@ -46,6 +46,8 @@ HOOKS = {
     "stiffness": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
     # Static clamp force.
     "force": Hook("N", None, ("travel", "dt"), "stiffness", "stiffness"),
+    # Factor on the relaxation time of the clamp force.
+    "relaxation_time": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
     # Factor on the torque constant. Its terms are also asked with dt 0, and must then leave their state as it is.
     "torque_constant": Hook(
         "1", 1.0, ("m", "disc", "disc_known", "dt"), "torque", "torque", "motor.torque_constant_Nm_per_A"

@@ -16,7 +16,8 @@ MOST = 4
 
 #: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
 PORTS = (
-    "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction", "pad_friction"
+    "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction",
+    "pad_friction", "current", "relaxation_time",
 )  # fmt: skip
 #: Signals and their units. Forces are those of the stiffness path, temperatures and brake torque the models' own; heat of the
 #: motor is that of the estimator's winding and housing, as a share of what the largest force's current leaves for ever.
@@ -37,6 +38,8 @@ SIGNALS = {
     "time_since_last_clamp": "s",
     "winding_heat": "1",
     "housing_heat": "1",
+    "surface_temperature": "°C",
+    "friction_power": "W",
 }
 #: What a term remembers of its signal x: nothing; z of τ dz/dt + z = x; z − x, what is still to come; a Maxwell slip element
 #: of stretch ``memory_scale``, z in [-1, 1].
@@ -47,7 +50,7 @@ SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset",
 GATES = ("always", "load", "closing", "opening", "turning", "standing")
 
 (_ANGLE, _TRAVEL, _SPEED, _FORCE, _RATE, _CURRENT, _PADS, _DISC, _CALIPER, _WHEEL, _BRAKE, _ENERGY, _CLAMPED, _RELEASED,
- _WINDING, _HOUSING) = range(len(SIGNALS))  # fmt: skip
+ _WINDING, _HOUSING, _SURFACE, _POWER) = range(len(SIGNALS))  # fmt: skip
 _NONE, _LAG, _DEFICIT, _SLIP = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
@@ -109,6 +112,8 @@ def _follow(signal, s, m):
     signal[_CLAMPED] = signal[_CLAMPED] + m.dt if clamped else 0.0
     signal[_RELEASED] = 0.0 if clamped else signal[_RELEASED] + m.dt
     signal[_WINDING], signal[_HOUSING] = s.winding, s.housing
+    signal[_SURFACE] = 0.5 * (s.pads[0, 0] + s.pads[1, 0]) if s.temperature_known else np.nan
+    signal[_POWER] = s.power
 
 
 @njit

@@ -56,8 +56,9 @@ def _deform(s, p, x, dt, factor):
     if doubt > _DOUBTFUL_RAD * _DOUBTFUL_RAD:
         slope = mean_slope(x, sqrt(doubt), p.curve)
     drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
-    s.force = first_order_lag(s.force, s.drive, drive, dt, p.relaxation_time)
-    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, p.relaxation_time)
+    relaxation_time = p.relaxation_time * effects.relaxation_time(p.effects, s.effects, travel, dt)
+    s.force = first_order_lag(s.force, s.drive, drive, dt, relaxation_time)
+    s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, relaxation_time)
     s.drive = drive
     s.drive_slope = factor * slope
 

@@ -7,8 +7,14 @@ from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS
 
 _COLD_C = 22.0
 #: Signals that drawn effects may follow, and their usual sizes.
-SIGNALS = ("brake_torque", "disc_temperature", "pad_temperature", "clamp_force", "motor_speed", "current", "force_rate")
+SIGNALS = (
+    "brake_torque", "disc_temperature", "surface_temperature", "clamp_force", "motor_speed", "current", "force_rate",
+    "disc_speed", "pad_temperature", "friction_power",
+)  # fmt: skip
 _BRAKE_NM, _RISE_K, _FORCE_N, _SPEED, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
+_DISC_SPEED, _POWER_W = 40.0, 30000.0
+#: Shapes of drawn effects: a power, what saturates, what begins at the signal's usual size.
+POWER, SATURATION, ONSET = range(3)
 _MAGNETS_C = 25.0
 
 
@@ -56,15 +62,30 @@ def _signal(s, which):
         return abs(s.speed) / _SPEED
     if which == 5:
         return abs(s.current) / _CURRENT_A
-    return abs(s.force_rate) / _RATE_N_PER_S
+    if which == 6:
+        return abs(s.force_rate) / _RATE_N_PER_S
+    if which == 7:
+        return abs(s.wheel_speed) / _DISC_SPEED
+    if which == 8:
+        return max(s.pad_mean - _COLD_C, 0.0) / _RISE_K
+    return abs(s.brake_torque * s.wheel_speed) / _POWER_W
 
 
 @njit
-def _drawn(e, s, place):
+def _shaped(e, x):
+    if e.shape == SATURATION:
+        return 1.0 - exp(-x)
+    if e.shape == ONSET:
+        return max(x - 1.0, 0.0)
+    return x**e.exponent
+
+
+@njit
+def drawn(e, s, place):
     """What one drawn effect adds."""
     if e.size == 0.0:
         return 0.0
-    value = e.size * _signal(s, int(e.signal)) ** e.exponent
+    value = e.size * _shaped(e, _signal(s, int(e.signal)))
     if e.other >= 0.0:
         value *= _signal(s, int(e.other))
     if e.lag_s > 0.0:
@@ -102,7 +123,7 @@ def _friction_level(p, s):
     if e.stribeck_friction.rise != 0.0:
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
-    level *= max(1.0 + _drawn(e.drawn_gear_friction, s, 3), 0.1)
+    level *= max(1.0 + drawn(e.drawn_gear_friction, s, 3), 0.1)
     return level * max(1.0 - e.cold_grease.per_K * (s.caliper - _COLD_C), 0.1)
 
 
@@ -131,13 +152,13 @@ def move_motor(p, s, demand):
     s.current += (demand - s.current) * h / (p.current_time + h)
     fade = e.torque_constant_fade
     warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
-    factor = 1.0 - fade.fade_per_K * warm + _drawn(e.drawn_torque_constant, s, 2)
+    factor = 1.0 - fade.fade_per_K * warm + drawn(e.drawn_torque_constant, s, 2)
     factor -= e.torque_saturation.loss_per_A2 * s.current * s.current
     if e.motor_heat_fade.fade_per_A2 != 0.0:
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat
     torque = p.torque_constant * factor * s.current
-    load = p.gear_gain * s.force * (1.0 + _drawn(e.drawn_gear_gain, s, 4))
+    load = p.gear_gain * s.force * (1.0 + drawn(e.drawn_gear_gain, s, 4))
     mesh = e.gear_mesh_ripple
     if mesh.cosine != 0.0 or mesh.sine != 0.0:
         phase = mesh.order_per_turn * (p.released_angle + s.angle)
@@ -186,7 +207,7 @@ def clamp(p, s):
     half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
     # The clearance is what the motor turns until contact when closing.
-    x = s.driven_angle + half + grown(p, s) + 1e-6 * _drawn(e.drawn_thickness, s, 1) / p.gear_gain - p.contact_angle
+    x = s.driven_angle + half + grown(p, s) + 1e-6 * drawn(e.drawn_thickness, s, 1) / p.gear_gain - p.contact_angle
     s.static_force = static_curve(p, x)
     hysteresis, further = e.stiffness_hysteresis, e.second_hysteresis
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
@@ -196,7 +217,7 @@ def clamp(p, s):
         s.further_slip = min(max(s.further_slip + travel / further.slip_angle_rad, -1.0), 1.0)
     s.past_contact = x
     drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip + further.share * s.further_slip)
-    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + _drawn(e.drawn_stiffness, s, 0)
+    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + drawn(e.drawn_stiffness, s, 0)
     excitation = drive
     if e.second_relaxation.share != 0.0:
         s.slow = _settle(s.slow, s.drive, drive, e.second_relaxation.time_constant_s)

@@ -7,6 +7,7 @@ are states of their own.
 from math import ceil
 
 from emb_daemon.jit import njit
+from emb_daemon.plant.brake import drawn
 from emb_daemon.plant.records import CELLS, CYCLE_NS
 
 _STEFAN_BOLTZMANN = 5.670374419e-8
@@ -56,6 +57,7 @@ def friction_of_pads(p, s, wheel_speed):
     fade = p.effects.friction_coefficient_fade
     if fade.fade_per_K != 0.0:
         value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
+    value *= 1.0 + drawn(p.effects.drawn_pad_friction, s, 5)
     return max(value, 0.2 * p.friction_coefficient)
 
 
@@ -113,7 +115,8 @@ def heat_cycle(p, s, wheel_speed, ambient):
     copper = p.magnet_heating * s.current * s.current * (1.0 + p.copper_per_K * s.winding_rise)
     s.winding_rise += dt / (p.winding_time + dt) * (copper - s.winding_rise)
     s.magnet_rise += dt / p.magnet_time * (s.winding_rise - s.magnet_rise)
-    rise = 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1)) - p.curve_temperature
+    s.wheel_speed, s.pad_mean = wheel_speed, 0.5 * (pad_mean(p, s, 0) + pad_mean(p, s, 1))
+    rise = s.pad_mean - p.curve_temperature
     s.softening_memory += dt / p.history_time * (rise - s.softening_memory)
     factor = 1.0 - p.softening * rise - p.softening_history * s.softening_memory
     factor *= 1.0 - e.caliper_softening.per_K * (s.caliper - 22.0)

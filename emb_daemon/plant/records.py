@@ -103,12 +103,13 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),
         Field("viscous_Nms_per_rad", "N m s/rad", "viscous friction at 12 degC, doubling every further 10 K down"),
     ),
-    # Whatever a seed draws: size × signal^exponent × other signal, through a lag. Signals as `brake.SIGNALS` counts them.
+    # Whatever a seed draws: size × shape(signal) × other signal, through a lag. Signals as `brake.SIGNALS` counts them.
     **{
         f"drawn_{port}": (
             Field("size", unit, f"of what is added to {what} where the signals are at their usual sizes"),
             Field("signal", "1", "index of the signal"),
-            Field("exponent", "1", "of the signal"),
+            Field("shape", "1", "0: a power of the signal; 1: it saturates; 2: it begins at the signal's usual size"),
+            Field("exponent", "1", "of the signal, for a power"),
             Field("other", "1", "index of a second signal that multiplies, negative for none"),
             Field("lag_s", "s", "time constant, 0 for none"),
         )
@@ -118,6 +119,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
             ("torque_constant", "1", "the torque constant's factor"),
             ("gear_friction", "1", "the gear friction's factor"),
             ("gear_gain", "1", "the load's factor"),
+            ("pad_friction", "1", "the pads' friction's factor; without lag"),
         )
     },
     "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
@@ -208,7 +210,7 @@ PLANT_STATE = np.dtype(
         ("creep", "f8"),
         ("motor_heat", "f8"),
         # What drawn effects add, in the order of their table.
-        ("drawn", "f8", (5,)),
+        ("drawn", "f8", (6,)),
         ("excitation", "f8"),
         ("force", "f8"),
         ("force_rate", "f8"),
@@ -225,6 +227,9 @@ PLANT_STATE = np.dtype(
         ("surface", "f8", (2,)),
         ("plate", "f8", (2,)),
         ("plate_reading", "f8", (2,)),
+        # For drawn effects: wheel speed, rad/s, and the mean temperature of both pads.
+        ("wheel_speed", "f8"),
+        ("pad_mean", "f8"),
         *fields("f8", "caliper disc winding_rise magnet_rise softening_memory wear"),
         # Sensors.
         *fields("f8", "current_error mean_current mean_current_error"),
