@@ -45,6 +45,8 @@ _SECOC = [
         "test_a_receiver_that_starts_late_is_in_step_with_the_next_freshness_frame",
         "test_what_was_heard_before_a_restart_is_not_believed_after_it",
         "test_a_set_counts_whole_or_not_at_all",
+        "test_a_rival_is_refused_with_the_genuine_frame_and_the_next_sample_waits",
+        "test_who_is_not_in_step_or_has_no_key_believes_nothing",
         "test_a_flood_of_authentication_frames_costs_a_bounded_number_of_tries",
         "test_frames_of_other_kinds_pass_to_be_refused_for_that",
         "TestFreshnessFile",

@@ -307,6 +307,36 @@ def test_a_set_counts_whole_or_not_at_all():
     )
 
 
+def test_a_rival_is_refused_with_the_genuine_frame_and_the_next_sample_waits():
+    """Authentication of one sample that comes after the frames of the next: a bus that was held up may turn them round."""
+    frames = signed()
+    first, second = of(frames, AUTH)[100:102]
+    while wirekit.decode(frames[first])[1]["Set"] or wirekit.decode(frames[second])[1]["Set"] or second - first != 3:
+        first, second = second, of(frames, AUTH)[np.searchsorted(of(frames, AUTH), second) + 1]
+    rival = frames[first - 2 : first - 1].copy()
+    rival["data"] ^= np.uint64(1 << 40)
+    order = [*range(first - 2, first), first + 1, first + 2, first, second]
+    judge = verifier()
+    judge.verify(frames[: first - 2])
+    heard = judge.verify(np.concatenate([rival, frames[order]]))
+    heard = heard[np.isin(heard["can_id"], [0x100, 0x110])]
+    assert heard["flags"].tolist() == [0, 0, UNAUTHENTIC, 0, 0]
+    assert (
+        heard["data"].tolist()
+        == frames["data"][[first - 2, first - 1]].tolist()
+        + rival["data"].tolist()
+        + frames["data"][[first + 1, first + 2]].tolist()
+    )
+
+
+def test_who_is_not_in_step_or_has_no_key_believes_nothing():
+    """Not even what would follow the last reset that was kept: that may have been heard before the restart."""
+    late = signed()[of(signed(), FRESHNESS)[1] + 2 : of(signed(), FRESHNESS)[2]]
+    corner = late[np.isin(late["can_id"], [0x100, 0x110, 0x120, AUTH])]
+    assert fresh(verifier({"EMB_FL_Auth": (1, 1)}).verify(corner))[0] == 0
+    assert fresh(Verifier(RECEIVED, {}, {}).verify(signed()))[0] == 0
+
+
 def test_a_flood_of_authentication_frames_costs_a_bounded_number_of_tries():
     """And more than eight frames that wait are refused, the oldest first."""
     tries = 0
