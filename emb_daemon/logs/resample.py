@@ -349,7 +349,7 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
 
     A resolver's speed has noise, and one that repeats itself to the bit hangs. An encoder at rest repeats itself for minutes,
     as does a speed that is the change of an angle."""
-    return np.where(np.abs(speed) < _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
+    return np.where(np.abs(speed) < 0.5 * _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 
 def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:
