@@ -9,6 +9,7 @@ from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     DRIFT,
+    contact_sigma,
     drift_odds,
     fold,
     learn,
@@ -238,7 +239,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
-    out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
+    out.contact_sigma = contact_sigma(s)
     return torque_sigma
 
 

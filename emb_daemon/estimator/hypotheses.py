@@ -319,6 +319,18 @@ def fold(s, warmth, linear):
 
 
 @njit
+def contact_sigma(s):
+    """Standard deviation (rad) of the first hypothesis's contact angle, an unproven change included; shares as `mix` left
+    them."""
+    rest, square = 1.0, 0.0
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        rest -= a.share
+        square += a.share * (a.error[CONTACT] * a.error[CONTACT] + a.covariance[CONTACT, CONTACT])
+    return sqrt(square + rest * s.covariance[CONTACT, CONTACT])
+
+
+@njit
 def mix(s, h, spread, warmth):
     """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
     how far a drift would be from that counts in the latter. ``h``: scratch."""
