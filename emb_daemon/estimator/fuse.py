@@ -83,6 +83,9 @@ _LEAST_GAIN, _OLD_S = 0.3, 0.05
 _NOTED = 0.003
 #: Part of a sample by which current and angle may be apart in time.
 _LATE = 0.3
+#: Log odds that a change has only after more samples than a sensor's sudden fault takes to be told (at most 12.5 a sample, and
+#: five samples): from then on it may explain what the motor's sliding contradicts.
+_LONG_LIKELY = 62.5
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
 _TELLING = 0.1
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
@@ -278,7 +281,7 @@ def take_sides(s, p, m, torque_sigma, out):
         beyond = _beyond_friction(s, p, m, x, s.force, spread)
         for kind in range(DRIFT):
             a = s.alternatives[kind]
-            if a.log_odds > 0.0:
+            if a.log_odds > _LONG_LIKELY:
                 beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     swings = hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb) if m.has_current else 0
