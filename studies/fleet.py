@@ -1,7 +1,8 @@
 """A simulated fleet whose secrets are drawn: does `emb-daemon fleet` find them, and nothing else?
 
 Units scatter as well calibrated ones do. Three of five batches share one effect each, of 40 to 80 N RMS in contact, below what
-one car's diagnosis calls significant; ten single units have a fault of 120 to 250 N; everybody's grease ages. A day is a drive
+one car's diagnosis calls significant; ten single units have a fault of 120 to 250 N, or of six times what healthy units differ
+by; everybody's grease ages. A day is a drive
 of a quarter of a minute, three stops and a slow clamp, because 6 000 drives have to fit into minutes: a real day would say
 more. Nothing but the drives' samples and a table of unit and batch reaches the fleet's commands.
 """
@@ -36,6 +37,8 @@ _BATCHES, _HIDDEN = "ABCDE", 3
 #: RMS in contact (N) of what a batch shares, of a single unit's fault, and of what a month does to everybody's grease.
 _BATCH_N, _FAULT_N, _AGEING_N = (40.0, 80.0), (120.0, 250.0), 40.0
 _FAULTY = 10
+#: What healthy units differ in by 45 N is no fault before it is six times as much.
+_SCATTERING, _SCATTERING_FAULT_N = {"friction.load_m_per_rad", "friction.offset_Nm"}, (270.0, 400.0)
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ def _sizes() -> dict[str, float]:
 def draw_secret(rng: np.random.Generator, range_N: tuple[float, float], but: set[str] = frozenset()) -> Secret:
     cause = str(rng.choice([name for name in _KINDS if name not in but]))
     amplitude, signed, shapes = _KINDS[cause]
+    range_N = _SCATTERING_FAULT_N if cause in _SCATTERING and range_N is _FAULT_N else range_N
     size = float(rng.uniform(*range_N)) * (float(rng.choice((-1.0, 1.0))) if signed else 1.0)
     parameters = {amplitude: size / _sizes()[cause]} | {name: float(rng.uniform(*limits)) for name, limits in shapes.items()}
     return Secret(cause, size, parameters)

@@ -13,7 +13,7 @@ Files are whole at every moment and are never changed; who writes one twice writ
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from urllib.parse import quote, unquote
+from urllib.parse import quote
 
 import numpy as np
 
@@ -158,8 +158,3 @@ def forget(root: Path, known: dict) -> None:
         drive = Drive(**entry)
         Path(root, "drives", drive.partition, f"{drive.digest}.parquet").unlink(missing_ok=True)
     Path(root, "ingested", f"{known['sha256']}.json").unlink(missing_ok=True)
-
-
-def unit_in(path: Path) -> str:
-    """Unit that a partition's folder says."""
-    return unquote(next(part for part in path.parts if part.startswith("unit=")).removeprefix("unit="))
