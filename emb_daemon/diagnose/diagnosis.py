@@ -21,7 +21,7 @@ from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
-from emb_daemon.diagnose.screening import Candidate
+from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import LASTING, Progress, Selection
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences
@@ -307,6 +307,7 @@ def _left(
         if channel in FORCE_CHANNELS:
             # What a calibration's own data left is in its noise already, sample by sample.
             gains = screening.dependence(model, channel, 1 if model.bench.own_data else LASTING[channel])
+            gains = {name: pair for name, pair in gains.items() if name not in NO_RIVALS.get(channel, ())}
             found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
         first, last = _rms(before[channel]), _rms(after[channel])
         share = (last / first) ** 2 if first > 0.0 else 0.0

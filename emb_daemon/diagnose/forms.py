@@ -52,7 +52,6 @@ _GATES: dict[str, tuple[str, ...]] = {
 }
 #: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
 _EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
-_SMOOTHED_S = 0.05
 _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
 #: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
 _WIDER, _SHAPE = 8.0, 0.5
@@ -155,10 +154,14 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
                 yield "none", "bump", share * width, float(place), 1.0, 1.0
         return
     if port == "torque_constant" and signal == "current":
-        # The residual of the torque path is itself current: without its noise, or it would be its own shadow.
+        # As it is: through a lag it would not saturate when the motor accelerates, and a gear gain over the force would seem
+        # as good. The residual of the torque path is current itself, but the constant's own column takes that shadow.
         for exponent in _EXPONENTS:
-            for time in (_SMOOTHED_S, *_TIMES_S):
+            yield "none", "even_power", reach, 0.0, exponent, 1.0
+            for time in _TIMES_S:
                 yield "lag", "even_power", reach, 0.0, exponent, time
+        for share in _SCALES:
+            yield "none", "decay", share * reach, 0.0, 1.0, 1.0
         return
     if port == "force":
         for time in _CREEP_S:

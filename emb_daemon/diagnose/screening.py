@@ -41,7 +41,7 @@ _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 _DRAWS, _SHUFFLES = 2, 5
 #: Signals that are no rivals in a channel: what a base parameter answers for (smoothed, the acceleration shows inertia better
 #: than the estimator's own difference of noisy speeds can), and the current of which the residual itself is made.
-_NO_RIVALS = {"torque": ("motor_acceleration", "current"), "innovation": ("current",)}
+NO_RIVALS = {"torque": ("motor_acceleration", "current"), "innovation": ("current",)}
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class Screening:
             gains = {
                 name: float((without - with_).sum())
                 for name, (without, with_) in self.dependence(model, channel, samples).items()
-                if name not in _NO_RIVALS.get(channel, ())
+                if name not in NO_RIVALS.get(channel, ())
             }
             name = max(gains, key=gains.__getitem__, default="")
             rivals[channel] = (max(gains.get(name, 0.0), 0.0), name)

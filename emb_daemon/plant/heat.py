@@ -65,9 +65,8 @@ def friction_of_pads(p, s, wheel_speed):
 def heat_cycle(p, s, wheel_speed, ambient):
     """One 4 ms cycle of all temperatures, and of what depends on them: friction torque, wear, softening."""
     e, dt = p.effects, _STEP_S
-    s.brake_torque = 0.0
-    if wheel_speed > 0.0:
-        s.brake_torque = 2.0 * friction_of_pads(p, s, wheel_speed) * p.effective_radius * s.force
+    # What the friction follows of brake torque is that of the cycle before.
+    s.brake_torque = 2.0 * friction_of_pads(p, s, wheel_speed) * p.effective_radius * s.force if wheel_speed > 0.0 else 0.0
     power = s.brake_torque * wheel_speed
     s.friction_heat += power * dt
     s.wear += 1e-12 * e.pad_wear.wear_um_per_MJ * power * dt
