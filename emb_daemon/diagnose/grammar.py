@@ -42,8 +42,8 @@ _SHARPENED, _TRIES = 24, 8
 #: Shifts of all signals in time, and of the chosen one's; bootstraps.
 _CHANCES, _SHIFTS, _BOOTSTRAPS = 99, 5, 100
 #: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: then
-#: the one that is named comes out of less than four fifths.
-_AS_GOOD, _RIVAL = 0.95, 0.2
+#: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all.
+_AS_GOOD, _RIVAL, _MOST = 0.95, 0.2, 0.5
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 #: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
@@ -184,6 +184,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
         < _OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
+        made_of: shares[best.means] < _MOST,
     }
     against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
