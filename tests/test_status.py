@@ -122,7 +122,7 @@ def test_a_hundredth_of_the_largest_force(seen):
     assert seen.facts() == {"force_uncertain"}
     seen.out["sigma"] = 0.0099 * seen.p["maximum_force"]
     assert seen.facts() == set()
-    seen.out["contact_sigma"] = 0.51
+    seen.state["covariance"][..., 1, 1] = 0.51**2
     assert seen.facts() == {"force_uncertain"}
 
 

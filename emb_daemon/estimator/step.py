@@ -153,7 +153,7 @@ def _look(s, p, m, facts, out):
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force
     out.sigma = min(out.sigma, p.maximum_force)
-    if out.sigma > _UNCERTAIN * p.maximum_force or out.contact_sigma > _UNCERTAIN_RAD:
+    if out.sigma > _UNCERTAIN * p.maximum_force or s.covariance[1, 1] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
         facts |= FORCE_UNCERTAIN
     return facts
 
