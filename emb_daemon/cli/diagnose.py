@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from emb_daemon.cli.logoptions import add_mapping_argument, log_reader
+from emb_daemon.cli.progress import progress
 
 EXAMPLE = "emb-daemon diagnose fit.log.gz --calibration config/calibration.yaml --validate val.log.gz --output found"
 
@@ -23,7 +24,6 @@ def run(arguments: argparse.Namespace) -> int:
     import json
 
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from emb_daemon.atomic import write_atomically
     from emb_daemon.calibration.files import load_calibration, save_calibration
@@ -43,18 +43,10 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise InputError(f"{arguments.output}: cannot be a folder for results: {error.strerror}") from None
     console = Console()
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
-    )
-    with bar:
-        task = bar.add_task("reading logs", total=1.0)
+    with progress("reading logs") as show:
         logs = [load_log(path, arguments.corner, read) for path in paths]
         fit_logs, judges = logs[: len(arguments.logs)], logs[len(arguments.logs) :]
-
-        def progress(text: str, share: float) -> None:
-            bar.update(task, description=text, completed=share)
-
-        diagnosis = diagnose(fit_logs, calibration, judges, progress)
+        diagnosis = diagnose(fit_logs, calibration, judges, lambda text, share: show(share, text))
     save_calibration(diagnosis.calibration, arguments.output / "calibration.yaml")
     text = json.dumps(report(diagnosis), indent=1, ensure_ascii=False)
     write_atomically(arguments.output / "report.json", text.encode())

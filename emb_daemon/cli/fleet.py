@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from emb_daemon.cli.progress import progress
+
 EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
   emb-daemon fleet diagnose fleet --units units.csv
   emb-daemon fleet report fleet --output fleet.html"""
@@ -69,19 +71,13 @@ def _calibration(arguments: argparse.Namespace):
 
 def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable | None = None) -> list:
     """``task`` of every item on the cluster, with a bar on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from emb_daemon.fleet.cluster import cluster
     from emb_daemon.fleet.cluster import run as run_on
 
     if not items:
         return []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task(text, total=len(items))
-        with cluster(arguments.scheduler, arguments.workers) as client:
-            return run_on(client, task, items, lambda done, total: bar.update(row, completed=done), failed)
+    with progress(text) as show, cluster(arguments.scheduler, arguments.workers) as client:
+        return run_on(client, task, items, lambda done, total: show(done / total), failed)
 
 
 def _ingest(arguments: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.progress import progress
 
 #: Exit status of a calibration that is written although a log that it rests on is missing or could not serve. Thermocouples in
 #: the pads are another rig's, which many have not.
@@ -39,7 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     _check_outputs(arguments)
     read = open_mapping(arguments.mapping).read_with_digest if arguments.mapping else read_with_digest
     campaign = load_campaign(arguments.campaign, read)
-    result = _with_progress(lambda progress: identify(campaign, progress))
+    with progress() as show:
+        result = identify(campaign, show)
     for fault in campaign.faults:
         print(fault, file=sys.stderr)
     try:
@@ -88,17 +90,3 @@ def _print(judged: list, temperatures: dict[str, float]) -> None:
         print("  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in zip(cells, widths[1:], strict=True))]))
     for name, value in temperatures.items():
         print(f"{name}: {value:.3g}")
-
-
-def _with_progress(work):
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        return work(lambda share, text: None)
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        return work(lambda share, text: bar.update(task, completed=share, description=text))

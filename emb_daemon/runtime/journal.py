@@ -15,10 +15,10 @@ log = logging.getLogger("emb_daemon")
 class JournalHandler(logging.Handler):
     """The journal's native protocol: one datagram of FIELD=value lines. ``extra={"fields": {...}}`` adds EMB_* fields."""
 
-    def __init__(self, path: str = _JOURNAL):
+    def __init__(self):
         super().__init__()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._socket.connect(path)
+        self._socket.connect(_JOURNAL)
         # The loop logs too: a journal that does not keep up loses lines rather than periods.
         self._socket.setblocking(False)
 

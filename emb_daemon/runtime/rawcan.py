@@ -42,6 +42,8 @@ _MMSGHDR = np.dtype(
     }
 )
 _CONTROL_BYTES = 64
+#: Frames that are taken or sent at once.
+_CAPACITY = 1024
 #: Errors of a socket whose interface was deleted, and those after which the next call may go well.
 _INTERFACE_GONE = (errno.ENODEV, errno.ENXIO)
 _PASSING = (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ECONNRESET, errno.EPIPE, errno.ENOBUFS)
@@ -142,14 +144,13 @@ class RawCanSocket:
         full: the last drain took as much as it can; more may be waiting.
     """
 
-    def __init__(self, sock: socket.socket, stamped: bool = False, capacity: int = 1024, reopen=None):
+    def __init__(self, sock: socket.socket, stamped: bool = False, reopen=None):
         self._socket, self._reopen = sock, reopen
         frame_bytes = _CAN_FRAME.itemsize if stamped else _CAN_FRAME_BYTES
-        self._received = _Batch(capacity, frame_bytes, control=True)
-        self._sent = _Batch(capacity, frame_bytes, control=False)
+        self._received = _Batch(_CAPACITY, frame_bytes, control=True)
+        self._sent = _Batch(_CAPACITY, frame_bytes, control=False)
         self._stamped = stamped
-        self._frames = np.zeros(capacity, FRAME)
-        self._capacity = capacity
+        self._frames = np.zeros(_CAPACITY, FRAME)
         #: When the queue was last looked into, the last frame's time, and when to try for another socket, if this one is gone.
         self._looked_ns = self._latest_ns = time.monotonic_ns()
         self._reopen_ns: int | None = None
@@ -171,8 +172,8 @@ class RawCanSocket:
         looked = time.monotonic_ns()
         if self._reopen_ns is not None and looked >= self._reopen_ns:
             self._rebind(looked)
-        count = _libc.recvmmsg(self._socket.fileno(), self._received.address, self._capacity, _MSG_DONTWAIT, None)
-        self.full = count == self._capacity
+        count = _libc.recvmmsg(self._socket.fileno(), self._received.address, _CAPACITY, _MSG_DONTWAIT, None)
+        self.full = count == _CAPACITY
         if count < 0:
             self._failed(ctypes.get_errno())
             return self._frames[:0]
@@ -201,8 +202,8 @@ class RawCanSocket:
     def send(self, frames: np.ndarray) -> None:
         """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
         estimate that waits in a queue is worse than the next one."""
-        for first in range(0, len(frames), self._capacity):
-            batch = frames[first : first + self._capacity]
+        for first in range(0, len(frames), _CAPACITY):
+            batch = frames[first : first + _CAPACITY]
             _to_kernel(batch, time.monotonic_ns(), self._sent.raw)
             taken = _libc.sendmmsg(self._socket.fileno(), self._sent.address, len(batch), _MSG_DONTWAIT)
             if taken < 0:

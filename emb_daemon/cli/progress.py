@@ -1,0 +1,17 @@
+"""A bar for work that takes minutes."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def progress(text: str = "") -> Iterator[Callable[[float, str], None]]:
+    """Yields what is told the share that is done (0 to 1) and what is being done; only a terminal sees it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("{task.description}"))
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(text, total=1.0)
+        yield lambda share, text=text: bar.update(task, completed=share, description=text)
