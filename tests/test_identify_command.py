@@ -52,7 +52,7 @@ frequency_response:
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), counted_reads() as reads:
         status = main(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "report")])
     outputs = {"out": out.getvalue(), "err": err.getvalue(), "reads": reads}
-    assert status == 0, outputs["err"]
+    assert status == 3, "what two logs should have shown is missing: " + outputs["err"]
     return folder, outputs
 
 

@@ -17,6 +17,7 @@ from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
 from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.base import Effect
 
 #: Two candidates are confounded if the loser would have gained this share of the winner's gain in its place.
 _CONFOUNDED = 0.8
@@ -153,7 +154,7 @@ def one_round(selection: Selection) -> Selection:
     model, screening = selection.model, selection.screening
     gone = {*selection.accepted, *selection.dropped}
     left = [e for e in REGISTRY if e.name not in gone and not model.of_effect(e.name)]
-    apart = [e for e in left if e.beside and not model.of_effect(e.beside)]
+    apart = {e: why for e in left if (why := _why_not_asked(e, model))}
     left = [e for e in left if e not in apart]
     rivals: dict = {}
     found = screening.tested(model, left)
@@ -170,9 +171,16 @@ def one_round(selection: Selection) -> Selection:
         tested = [screening.with_placebos(model, c) for c in tested]
     confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
     selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
-    alone = (Candidate(e, None, reason=f"one more element beside {e.beside}, which is not there") for e in apart)
-    selection = selection.noted(alone)
+    selection = selection.noted(Candidate(effect, None, reason=why) for effect, why in apart.items())
     return selection._entered(winners) if winners else _tried(selection, tested, rivals)
+
+
+def _why_not_asked(effect: Effect, model: Model) -> str:
+    if effect.beside and not model.of_effect(effect.beside):
+        return f"one more element beside {effect.beside}, which is not there"
+    if effect.bare and model.bench.clamps:
+        return "looked for where nothing is clamped: elsewhere friction and curve look the same"
+    return ""
 
 
 def _settled(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:

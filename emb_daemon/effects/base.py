@@ -148,6 +148,7 @@ class Effect:
         placebos: what must destroy the finding.
         harmonic: how its shape is looked for, if it is a harmonic of the motor angle.
         beside: effect of which it is one more element, and without which it is not looked for.
+        bare: whether it is looked for only on an actuator that clamps nothing.
     """
 
     name: str
@@ -162,6 +163,7 @@ class Effect:
     placebos: tuple[Placebo, ...] = ()
     harmonic: Harmonic | None = None
     beside: str = ""
+    bare: bool = False
 
     def __post_init__(self):
         if self.hook not in HOOKS:

@@ -1,7 +1,8 @@
 """Torque constant falling with the current of the moment: iron that saturates carries less of the flux that makes torque.
 
 Flux linkage is odd in the current, so that its first departure from proportion is cubic and the torque constant's is
-quadratic.
+quadratic. Where pads are clamped the current follows the force, and friction or a curve that bend a little look the same: on
+simulated brakes without it this effect was found. There a term is made of it, which has to stand out against a whole grammar.
 """
 
 from emb_daemon.effects.base import Effect, Parameter
@@ -28,4 +29,5 @@ EFFECT = Effect(
     source="saturation of the quadrature axis: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 5",
     signal="current",
     manoeuvre="strokes to low and to the largest force at the same speed, both ways",
+    bare=True,
 )
