@@ -121,8 +121,7 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     be made may be the shadow of what no catalogue holds. It is then asked again beside the terms."""
     doubted = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
     known = any(catalogue.candidates[name].in_calibration for name in doubted)
-    # A calibration's own data lack several effects at once, and terms find other shapes for those that have a name.
-    if not doubted or known or found.accepted == catalogue.accepted or found.model.bench.own_data:
+    if not doubted or known or found.accepted == catalogue.accepted:
         return found
     bare = catalogue
     for name in doubted:
