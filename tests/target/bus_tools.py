@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ import pytest
 CHANNEL = "vcan0"
 PROJECT = Path(__file__).resolve().parents[2]
 RIG = PROJECT.parent / "shared" / "rig"
+RESOLVER, CLAMP_FORCE = 0x100, 0x200  # of the first corner
+PREDICTED = 3
 
 
 def wait_for(what: str, condition: Callable[[], object], timeout_s: float, poll_s: float = 0.05) -> float:
@@ -92,3 +95,16 @@ def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
     finally:
         process.kill()
         process.wait(10)
+
+
+def answers(frames: list[Frame]) -> list[bytes]:
+    """Payloads behind the E2E header of the clamp force frames that answer a resolver sample, not of the predictions."""
+    return [frame.data[2:] for frame in frames if frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED]
+
+
+def replayed(log: Path, environment: dict[str, str] | None = None) -> list[bytes]:
+    """Answers that `emb-daemon replay` gives to a log."""
+    output = log.with_suffix(".replayed.log")
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "replay", str(log), "--output", str(output)]
+    subprocess.run(command, check=True, stdout=sys.stdout, env=os.environ | (environment or {}))
+    return answers(read_log(output))

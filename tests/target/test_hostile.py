@@ -10,13 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, PROJECT, Recording, playing, wait_for
+from bus_tools import CHANNEL, CLAMP_FORCE, PROJECT, RESOLVER, Recording, answers, playing, replayed, wait_for
 
 pytestmark = pytest.mark.target("can")
 
 ROAD = PROJECT.parent / "shared" / "measured" / "road_can" / "rav4" / "rav4_60s.log.gz"
-RESOLVER, CLAMP_FORCE = 0x100, 0x200
-SECOND_SENDER = 1 << 15
 
 
 @pytest.fixture
@@ -45,17 +43,21 @@ def traffic(tmp_path: Path) -> Path:
 
 
 def test_no_sample_is_lost_in_road_traffic(
-    daemon: subprocess.Popen[bytes], record: Callable[..., Recording], rig_log: Path, traffic: Path
+    daemon: subprocess.Popen[bytes], record: Callable[..., Recording], rig_log: Path, traffic: Path, tmp_path: Path
 ) -> None:
-    """Every resolver sample is answered once by its counter, with a road car's frames at full rate beside it."""
+    """With a road car's frames at full rate beside the samples, the daemon answers what was on the bus as replay does, which
+    has all the time it wants: sample for sample, bit for bit. What the machine held up on its way to the bus, both hear late.
+    """
     with record(f",{CLAMP_FORCE:X}:7FF") as waiting:
-        wait_for("the daemon speaks", lambda: waiting.path.read_text().strip(), timeout_s=120)
-    with record(f",{RESOLVER:X}:7FF,{CLAMP_FORCE:X}:7FF") as recording, playing(traffic), playing(rig_log) as player:
+        wait_for("the daemon speaks", lambda: waiting.path.read_text().strip(), timeout_s=300)
+    with record(f",{CLAMP_FORCE:X}:7FF,100:700") as recording, playing(traffic), playing(rig_log) as player:
         wait_for("ten seconds of samples", lambda: recording.path.read_text().count(f" {RESOLVER:03X}#") > 2500, timeout_s=60)
         player.terminate()
     assert daemon.poll() is None
-    asked = [frame.data[1] & 15 for frame in recording.frames if frame.can_id == RESOLVER]
-    answered = [
-        frame.data[6] & 15 for frame in recording.frames if frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 in (0, 1, 2)
-    ]
-    assert len(asked) > 2500 and len(answered) >= 0.99 * (len(asked) - 2)
+    heard = tmp_path / "heard.log"
+    heard.write_text("".join(f"{line}\n" for line in recording.path.read_text().splitlines() if line.split()[2][0] == "1"))
+    live, alone = answers(recording.frames), replayed(heard)
+    samples = sum(frame.can_id == RESOLVER for frame in recording.frames)
+    print(f"{samples} samples, {len(live)} answered live, {len(alone)} by replay")
+    assert len(live) > 2000
+    assert live == alone[: len(live)] and len(alone) - len(live) <= 2

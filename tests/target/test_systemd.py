@@ -13,13 +13,12 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, RIG, Frame, Recording, playing, read_log, wait_for
+from bus_tools import CHANNEL, CLAMP_FORCE, RESOLVER, RIG, Recording, answers, playing, replayed, wait_for
 
 pytestmark = pytest.mark.target("systemd")
 
@@ -27,8 +26,7 @@ UNIT = "emb-daemon.service"
 CONFIG = Path("/etc/emb_daemon/emb.yaml")
 CACHE, STATE = Path("/var/cache/emb_daemon"), Path("/var/lib/emb_daemon")
 LOG = RIG / "static" / "random_6p5mm.log.gz"
-RESOLVER, CURRENT, CLAMP_FORCE = 0x100, 0x110, 0x200
-PREDICTED = 3
+CURRENT = 0x110
 FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
 PERIOD_S = 0.004
 PAIRING_S = 0.002
@@ -169,7 +167,7 @@ def test_forces_come_250_times_a_second(inputs: None, record: Callable[..., Reco
     with record(FORCES + ",100:7FF") as recording:
         time.sleep(10)
     heard = sum(frame.can_id == RESOLVER for frame in recording.frames)
-    answered = sum(frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED for frame in recording.frames)
+    answered = len(answers(recording.frames))
     print(
         f"{answered} answers to {heard} resolver samples in {recording.frames[-1].time_s - recording.frames[0].time_s:.2f} s"
     )
@@ -291,21 +289,6 @@ def flags(link: str) -> str:
 # --- it says what replay says ----------------------------------------------------------------------------------------
 
 
-def answers(frames: list[Frame]) -> list[bytes]:
-    """Payloads behind the E2E header of the clamp force frames that answer a resolver sample, not of the predictions."""
-    return [f.data[2:] for f in frames if f.can_id == CLAMP_FORCE and f.data[6] >> 4 < PREDICTED]
-
-
-def replayed(log: Path) -> list[bytes]:
-    """Answers that `emb-daemon replay` gives to a log."""
-    output = log.with_suffix(".replayed.log")
-    # With the daemon's own compiled code: compiling anew beside the running daemon takes minutes in a guest with one CPU.
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(CACHE / "numba")}
-    command = ["emb-daemon", "replay", str(log), "--output", str(output)]
-    subprocess.run(command, check=True, stdout=sys.stdout, env=environment)
-    return answers(read_log(output))
-
-
 def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., Recording], tmp_path: Path) -> None:
     """Every resolver sample on the bus is answered by the payload that replay gives it: replay of the log that was played
     and, with whatever delays the machine added, of the bus as it was recorded."""
@@ -324,7 +307,9 @@ def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., 
     heard = tmp_path / "heard.log"
     inputs = [line for line in recording.path.read_text().splitlines() if line.split()[2].startswith("1")]
     heard.write_text("\n".join([*inputs, ""]))
-    live, as_heard, as_played = answers(recording.frames), replayed(heard), replayed(played)
+    # With the daemon's own compiled code: compiling anew beside it takes minutes in a guest with one CPU.
+    code = {"NUMBA_CACHE_DIR": str(CACHE / "numba")}
+    live, as_heard, as_played = answers(recording.frames), replayed(heard, code), replayed(played, code)
     samples = [frame.time_s for frame in recording.frames if frame.can_id == RESOLVER]
     currents = [frame.time_s for frame in recording.frames if frame.can_id == CURRENT]
     held_up = sum(current - sample > PAIRING_S for sample, current in zip(samples, currents, strict=True))
