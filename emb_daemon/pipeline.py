@@ -12,7 +12,7 @@ import numpy as np
 from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, entry, fields, njit
 from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
@@ -45,21 +45,10 @@ _SHOWN_NS = 1_000_000_000
 #: last sent one of our messages; ``unproven`` where authentication is asked for and a key is missing.
 CORNER = np.dtype(
     [
-        ("active", "?"),
-        ("started", "?"),
-        ("pending", "i8"),
-        ("pending_ns", "i8"),
-        ("pending_angle", "f8"),
-        ("pending_speed", "f8"),
-        ("sample_ns", "i8"),
-        ("counter", "i8"),
-        ("cycle", "i8"),
-        ("announced", "i8"),
-        ("predicted", "i8"),
-        ("clock_ns", "i8"),
-        ("late_ns", "i8"),
-        ("agreed", "i8"),
-        ("second_sender_ns", "i8"),
+        *fields("?", "active started"),
+        *fields("i8", "pending pending_ns"),
+        *fields("f8", "pending_angle pending_speed"),
+        *fields("i8", "sample_ns counter cycle announced predicted clock_ns late_ns agreed second_sender_ns"),
         ("unproven", "?"),
     ],
     align=True,

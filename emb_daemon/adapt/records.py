@@ -33,8 +33,7 @@ TRAINING = np.dtype(
 #: whether this process estimates the corner at all.
 LIMITS = np.dtype(
     [
-        ("estimated", "?"),
-        ("enabled", "?"),
+        *fields("?", "estimated enabled"),
         *fields(
             "f8",
             "minimum_ambient maximum_ambient parking_force low_force high_force dither_amplitude dither_frequency "
@@ -57,11 +56,9 @@ ADAPTER = np.dtype(
         *fields("f8", "power_on_angle parked_time phase_time still_time still_angle tail_time force pulse"),
         ("parked", "?"),
         ("snapshot_ns", "i8"),
-        ("snapshot_wanted", "?"),
-        ("holding", "?"),
+        *fields("?", "snapshot_wanted holding"),
         *fields("i8", "rows training_rows generation"),
-        ("evaluation_wanted", "?"),
-        ("evaluation_ready", "?"),
+        *fields("?", "evaluation_wanted evaluation_ready"),
         ("evaluation", "i8"),
         *fields("f8", "contact_angle contact_sigma torque_error torque_error_sigma"),
         ("ended", "?"),

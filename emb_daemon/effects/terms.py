@@ -9,7 +9,7 @@ from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 
 #: Most terms of one calibration.
 MOST = 4
@@ -61,20 +61,8 @@ CLAMPED_N, TURNING_RAD_PER_S = 150.0, 0.5
 
 TERM = np.dtype(
     [
-        ("port", "i8"),
-        ("signal", "i8"),
-        ("memory", "i8"),
-        ("shape", "i8"),
-        ("gate", "i8"),
-        ("coefficient", "f8"),
-        ("sine", "f8"),
-        ("sigma", "f8"),
-        ("scale", "f8"),
-        ("centre", "f8"),
-        ("exponent", "f8"),
-        ("memory_scale", "f8"),
-        ("low", "f8"),
-        ("high", "f8"),
+        *fields("i8", "port signal memory shape gate"),
+        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high"),
     ],
     align=True,
 )

@@ -11,7 +11,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 
 #: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
 #: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``early``: what was above it, N m, in the
@@ -19,18 +19,10 @@ from emb_daemon.jit import njit
 #: ``agreed``: closing samples that confirm.
 CONTACT = np.dtype(
     [
-        ("engaged", "?"),
-        ("lost", "?"),
-        ("confirmed", "?"),
-        ("level", "f8"),
-        ("samples", "f8"),
-        ("early", "f8"),
-        ("begun", "f8"),
-        ("rise", "f8"),
-        ("shortfall", "f8"),
+        *fields("?", "engaged lost confirmed"),
+        *fields("f8", "level samples early begun rise shortfall"),
         ("agreed", "i8"),
-        ("excess", "f8"),
-        ("watched", "f8"),
+        *fields("f8", "excess watched"),
     ],
     align=True,
 )

@@ -16,7 +16,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
@@ -30,20 +30,11 @@ PLAUSIBILITY = np.dtype(
         ("contradiction", "f8"),
         ("verdict", "i8"),
         ("apart", "f8"),
-        ("still", "i8"),
-        ("idle", "i8"),
-        ("alike", "i8"),
-        ("flickered", "i8"),
-        ("current_flickered", "i8"),
-        ("current", "f8"),
-        ("frozen_s", "f8"),
+        *fields("i8", "still idle alike flickered current_flickered"),
+        *fields("f8", "current frozen_s"),
         ("averaged", "?"),
-        ("torque_mean", "f8"),
-        ("torque_variance", "f8"),
-        ("held_low", "f8"),
-        ("held_high", "f8"),
-        ("swing", "i8"),
-        ("swings", "i8"),
+        *fields("f8", "torque_mean torque_variance held_low held_high"),
+        *fields("i8", "swing swings"),
     ],
     align=True,
 )

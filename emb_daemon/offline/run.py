@@ -16,7 +16,7 @@ from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
 from emb_daemon.estimator.step import step
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 
 #: The two force paths at each sample. ``force`` N by the stiffness path; ``torque`` N m left to the clamp force over the cycle
 #: that ends here (NaN where the current says nothing), its ``leverage`` m/rad, mean friction state over the cycle (-1 to 1)
@@ -30,11 +30,7 @@ PATHS = np.dtype(
 #: and disc in degC.
 TRACE = np.dtype(
     [
-        ("force", "f8"),
-        ("torque", "f8"),
-        ("leverage", "f8"),
-        ("torque_constant", "f8"),
-        ("power", "f8"),
+        *fields("f8", "force torque leverage torque_constant power"),
         ("temperature", "f8", (9,)),
         ("temperature_known", "?"),
     ],

@@ -199,23 +199,10 @@ PLANT_STATE = np.dtype(
     [
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
-        ("driven_angle", "f8"),
-        ("past_contact", "f8"),
-        ("slip", "f8"),
-        ("further_slip", "f8"),
-        ("drive", "f8"),
-        ("slow", "f8"),
-        ("settled", "f8"),
-        ("slower", "f8"),
-        ("creep", "f8"),
-        ("motor_heat", "f8"),
+        *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat"),
         # What drawn effects add, in the order of their table.
         ("drawn", "f8", (6,)),
-        ("excitation", "f8"),
-        ("force", "f8"),
-        ("force_rate", "f8"),
-        ("static_force", "f8"),
-        ("stiffness_factor", "f8"),
+        *fields("f8", "excitation force force_rate static_force stiffness_factor"),
         # Controller.
         ("latched", "?"),
         *fields("f8", "position_target target_rate speed_integral force_correction"),
@@ -228,8 +215,7 @@ PLANT_STATE = np.dtype(
         ("plate", "f8", (2,)),
         ("plate_reading", "f8", (2,)),
         # For drawn effects: wheel speed, rad/s, and the mean temperature of both pads.
-        ("wheel_speed", "f8"),
-        ("pad_mean", "f8"),
+        *fields("f8", "wheel_speed pad_mean"),
         *fields("f8", "caliper disc winding_rise magnet_rise softening_memory wear"),
         # Sensors.
         *fields("f8", "current_error mean_current mean_current_error"),
@@ -253,8 +239,7 @@ COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=Tru
 DRIVE = np.dtype(
     [
         *fields("f8", "wheel_speed target_speed ambient"),
-        ("park_brake", "i8"),
-        ("brake_request", "i8"),
+        *fields("i8", "park_brake brake_request"),
     ],
     align=True,
 )
@@ -264,11 +249,9 @@ DRIVE = np.dtype(
 #: request was last heard.
 TRAINING = np.dtype(
     [
-        ("requested", "?"),
-        ("running", "?"),
+        *fields("?", "requested running"),
         *fields("f8", "low high amplitude frequency start"),
-        ("tick", "i8"),
-        ("silent", "i8"),
+        *fields("i8", "tick silent"),
     ],
     align=True,
 )
@@ -276,10 +259,8 @@ TRAINING = np.dtype(
 #: The car's longitudinal motion and what its messages need.
 CAR = np.dtype(
     [
-        ("time_ns", "i8"),
-        ("tick", "i8"),
-        ("speed", "f8"),
-        ("wheel_speed", "f8"),
+        *fields("i8", "time_ns tick"),
+        *fields("f8", "speed wheel_speed"),
         # kg carried by the simulated corners, m, N/(m/s)^2, N, m/s^2
         *fields("f8", "mass wheel_radius drag rolling acceleration supply_voltage"),
         # s; messages leave up to this late after their sample.
@@ -300,8 +281,7 @@ TRUTH = np.dtype(
         ("depth", "f8", (2, len(PAD_DEPTHS_M))),
         ("plate", "f8", (2,)),
         *fields("f8", "caliper disc wheel_speed wheel_angle vehicle_speed wear"),
-        ("park_brake", "i8"),
-        ("brake_request", "i8"),
+        *fields("i8", "park_brake brake_request"),
         ("training", "?"),
     ],
     align=True,

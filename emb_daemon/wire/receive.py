@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 from emb_daemon.wire.contract import STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, UNAUTHENTIC
@@ -32,19 +32,9 @@ _LONG = np.iinfo(np.int64).max
 RECEPTION = np.dtype(
     [
         ("values", "f8", (SIGNALS,)),
-        ("time_ns", "i8"),
-        ("counter", "i8"),
+        *fields("i8", "time_ns counter"),
         ("degraded", "?"),
-        ("sequence_ns", "i8"),
-        ("sequence", "i8"),
-        ("due_ns", "i8"),
-        ("later_ns", "i8"),
-        ("seen", "i8"),
-        ("window", "i8"),
-        ("candidate", "i8"),
-        ("candidate_ns", "i8"),
-        ("refused_ns", "i8"),
-        ("range_ns", "i8"),
+        *fields("i8", "sequence_ns sequence due_ns later_ns seen window candidate candidate_ns refused_ns range_ns"),
         ("data", "u8"),
         ("contested_ns", "i8"),
         ("count", "i8", (len(VERDICTS),)),
