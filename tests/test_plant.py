@@ -15,14 +15,14 @@ from emb_daemon.offline import estimate, log_of
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios
 from emb_daemon.plant.brake import move_motor, static_curve
-from emb_daemon.plant.car import CYCLE_S, Car, idle
+from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.heat import cell_count, heat_cycle
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.records import EFFECTS, FORCE, LATCH, PLANT_STATE, SUBSTEP_S
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import socket_pair
-from emb_daemon.wire.contract import PARK_APPLIED, PARK_RELEASED
+from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PARK_RELEASED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import ADAPT_REQUEST, CORNERS, default_layout, pack
@@ -90,10 +90,10 @@ def same(a, b):
 
 
 def settled(car, mode, target, seconds, drive=None):
-    commands, standing = idle(1)
-    commands["mode"], commands["target"] = mode, target
+    standing = scenarios.rest(CYCLE_S)
+    standing.commands["mode"], standing.commands["target"] = mode, target
     for _ in range(round(seconds / CYCLE_S)):
-        car.tick(commands, standing[0] if drive is None else drive)
+        car.tick(standing.commands, standing.drives[0] if drive is None else drive)
     return car
 
 
@@ -436,8 +436,8 @@ class Parked:
 
     def __init__(self, plant):
         self.car = Car(np.atleast_1d(plant))
-        self.commands, drive = idle(1)
-        self.drive = drive[0]
+        standing = scenarios.rest(CYCLE_S)
+        self.commands, self.drive = standing.commands, standing.drives[0]
         self.commands["mode"], self.commands["target"] = FORCE, 9000.0
         self.drive["park_brake"] = PARK_APPLIED
         self.counter = 0

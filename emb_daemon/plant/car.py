@@ -1,6 +1,7 @@
 """The car: one to four brakes, longitudinal motion, training motion on request, and everything that it says on the bus."""
 
 from math import cos, pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,14 +12,11 @@ from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
 from emb_daemon.plant.records import (
     ANGLE,
     CAR,
-    COMMAND,
     CYCLE_NS,
-    DRIVE,
     HISTORY,
     PAD_DEPTHS_M,
     PLANT,
     PLANT_STATE,
-    RELEASE,
     SUBSTEP_S,
     SUBSTEPS,
     TRAINING,
@@ -26,12 +24,11 @@ from emb_daemon.plant.records import (
 )
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
-from emb_daemon.wire.contract import PARK_APPLIED, PARK_RELEASED, PULSE_MODULO, PULSES_PER_TURN
+from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PULSE_MODULO, PULSES_PER_TURN
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import SIGNAL, pack, unpack
 
-CYCLE_S = 1e-9 * CYCLE_NS
 #: Period of the slow clamp and release of training motion, and the time in which a corner joins it from where it stands.
 TRAINING_PERIOD_S = 20.0
 _JOINING_S = 1.0
@@ -47,6 +44,21 @@ FRAMES_PER_TICK = 32
 
 #: Layouts of the rig's own messages: force, inner pad, outer pad; ``id[kind, corner]``.
 REFERENCE_WIRES = np.dtype([("signal", SIGNAL, (3, 4)), ("id", "i8", (3, 4))], align=True)
+
+
+class World(NamedTuple):
+    """The car and what it sends with: CAR, shape (1,), records by corner, which corners they are, LAYOUT and REFERENCE_WIRES,
+    shape (1,), CAN ids by slot, and the source of all noise."""
+
+    car: np.ndarray
+    plants: np.ndarray
+    states: np.ndarray
+    trainings: np.ndarray
+    corners: np.ndarray
+    wires: np.ndarray
+    reference: np.ndarray
+    ids: np.ndarray
+    rng: np.random.Generator
 
 
 def _reference_wires() -> np.ndarray:
@@ -134,86 +146,86 @@ def _put(frames, count, time_ns, can_id, data):
 
 
 @njit
-def _say(car, slot, payload, ids, frames, count, time_ns):
-    """A protected message of the car."""
+def _say(w, slot, payload, frames, count, due_ns, least_late):
+    """A protected message of the car, which leaves later than ``due_ns`` by ``least_late`` to one more of the jitter."""
+    car, can_id = w.car[0], w.ids[slot]
+    sent = due_ns + np.int64(1e9 * car.jitter * (least_late + w.rng.random()))
     counter = car.counter[slot]
     car.counter[slot] = (counter + 1) % COUNTER_MODULO
-    return _put(frames, count, time_ns, ids[slot], protect(ids[slot], payload, counter, 0))
+    return _put(frames, count, sent, can_id, protect(can_id, payload, counter, 0))
 
 
 @njit
-def _fast_frames(car, p, s, corner, wires, ids, rng, frames, count):
+def _fast_frames(w, row, frames, count):
     """Resolver and current of one sample share their counter."""
-    base = wire.CORNER_MESSAGES * corner
+    car, p, s, received, rng = w.car[0], w.plants[row], w.states[row], w.wires[0].received, w.rng
+    base = wire.CORNER_MESSAGES * w.corners[row]
     noisy = p.released_angle + delayed_angle(p, s) + p.angle_noise * rng.standard_normal()
     # Resolver-to-digital converters have hysteresis, so that a standing motor reads as standing.
     if abs(noisy - s.angle_reading) > 0.5 * p.angle_count + p.angle_hysteresis:
         s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
     speed = s.speed + p.speed_noise * rng.standard_normal()
-    payload = pack(s.angle_reading, wires.received[base, 0]) | pack(speed, wires.received[base, 1])
-    sent = car.time_ns + np.int64(1e9 * car.jitter * rng.random())
-    count = _say(car, base + wire.RESOLVER, payload, ids, frames, count, sent)
+    payload = pack(s.angle_reading, received[base, 0]) | pack(speed, received[base, 1])
+    count = _say(w, base + wire.RESOLVER, payload, frames, count, car.time_ns, 0.0)
     slot = base + wire.CURRENT
     mean = s.mean_current if p.effects.current_delay.delay_s == 0.0 else delayed_mean_current(p, s)
     current = mean + s.mean_current_error - p.effects.current_offset.offset_A
-    payload = pack(current, wires.received[slot, 0]) | pack(0.15 * rng.standard_normal(), wires.received[slot, 1])
-    payload |= pack(car.supply_voltage, wires.received[slot, 2])
-    sent = car.time_ns + np.int64(1e9 * car.jitter * (0.5 + rng.random()))
-    return _say(car, slot, payload, ids, frames, count, sent)
+    payload = pack(current, received[slot, 0]) | pack(0.15 * rng.standard_normal(), received[slot, 1])
+    payload |= pack(car.supply_voltage, received[slot, 2])
+    return _say(w, slot, payload, frames, count, car.time_ns, 0.5)
 
 
 @njit
-def _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, count, due_ns):
+def _slow_frames(w, drive, frames, count, due_ns):
     """Thermocouples, wheels and, ten times a second, the vehicle's status; sampled at ``due_ns``, within this cycle."""
-    for row in range(len(corners)):
-        p, s = plants[row], states[row]
-        slot = wire.CORNER_MESSAGES * corners[row] + wire.THERMOCOUPLE
-        payload = pack(s.plate_reading[0] + p.temperature_noise * rng.standard_normal(), wires.received[slot, 0])
-        payload |= pack(s.plate_reading[1] + p.temperature_noise * rng.standard_normal(), wires.received[slot, 1])
-        payload |= pack(s.caliper + p.temperature_noise * rng.standard_normal(), wires.received[slot, 2])
-        sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
-        count = _say(car, slot, payload, ids, frames, count, sent)
+    car, received, rng = w.car[0], w.wires[0].received, w.rng
+    leaves_ns = due_ns + _AFTER_NS
+    for row in range(len(w.corners)):
+        p, s = w.plants[row], w.states[row]
+        slot = wire.CORNER_MESSAGES * w.corners[row] + wire.THERMOCOUPLE
+        payload = pack(s.plate_reading[0] + p.temperature_noise * rng.standard_normal(), received[slot, 0])
+        payload |= pack(s.plate_reading[1] + p.temperature_noise * rng.standard_normal(), received[slot, 1])
+        payload |= pack(s.caliper + p.temperature_noise * rng.standard_normal(), received[slot, 2])
+        count = _say(w, slot, payload, frames, count, leaves_ns, 0.0)
     speeds, pulses = np.uint64(0), np.uint64(0)
     elapsed = 1e-9 * (due_ns - car.time_ns)
     for corner in range(4):
-        speeds |= pack(car.wheel_speed, wires.received[wire.WHEEL_SPEED, corner])
-        angle = states[0].wheel_angle
-        for row in range(len(corners)):
-            if corners[row] == corner:
-                angle = states[row].wheel_angle
+        speeds |= pack(car.wheel_speed, received[wire.WHEEL_SPEED, corner])
+        angle = w.states[0].wheel_angle
+        for row in range(len(w.corners)):
+            if w.corners[row] == corner:
+                angle = w.states[row].wheel_angle
         angle += elapsed * car.wheel_speed
         pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % PULSE_MODULO
-        pulses |= pack(float(pulse), wires.received[wire.WHEEL_PULSE, corner])
-    sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
-    count = _say(car, wire.WHEEL_SPEED, speeds, ids, frames, count, sent)
-    sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
-    count = _say(car, wire.WHEEL_PULSE, pulses, ids, frames, count, sent)
+        pulses |= pack(float(pulse), received[wire.WHEEL_PULSE, corner])
+    count = _say(w, wire.WHEEL_SPEED, speeds, frames, count, leaves_ns, 0.0)
+    count = _say(w, wire.WHEEL_PULSE, pulses, frames, count, leaves_ns, 0.0)
     if due_ns % _STATUS_NS == 0:
-        signals = wires.received[wire.VEHICLE_STATUS]
+        signals = received[wire.VEHICLE_STATUS]
         payload = pack(float(drive.park_brake), signals[0]) | pack(float(drive.brake_request), signals[1])
         payload |= pack(drive.ambient, signals[2]) | pack(car.speed, signals[3])
-        sent = due_ns + _AFTER_NS + np.int64(1e9 * car.jitter * (0.5 + rng.random()))
-        count = _say(car, wire.VEHICLE_STATUS, payload, ids, frames, count, sent)
+        count = _say(w, wire.VEHICLE_STATUS, payload, frames, count, leaves_ns, 0.5)
     return count
 
 
 @njit
-def _reference_frames(car, p, s, corner, reference, rng, frames, count, slow):
+def _reference_frames(w, row, frames, count, slow):
     """What a rig's instruments add; they carry neither counter nor CRC."""
-    signal = reference.signal
+    car, p, s, rng = w.car[0], w.plants[row], w.states[row], w.rng
+    signal, can_id = w.reference[0].signal, w.reference[0].id[:, w.corners[row]]
     force = s.force + p.force_lead * s.force_rate + p.force_noise * rng.standard_normal()
     torque = s.brake_torque + p.brake_torque_noise * rng.standard_normal()
     payload = pack(force, signal[0, 0]) | pack(torque, signal[0, 1])
     payload |= pack(s.disc + p.temperature_noise * rng.standard_normal(), signal[0, 2])
     sent = car.time_ns + _REFERENCE_AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
-    count = _put(frames, count, sent, reference.id[0, corner], payload)
+    count = _put(frames, count, sent, can_id[0], payload)
     if slow:
         for side in range(2):
             payload = np.uint64(0)
             for index in range(len(PAD_DEPTHS_M)):
                 reading = pad_at(p, s, side, PAD_DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
                 payload |= pack(reading, signal[1 + side, index])
-            count = _put(frames, count, sent, reference.id[1 + side, corner], payload)
+            count = _put(frames, count, sent, can_id[1 + side], payload)
     return count
 
 
@@ -259,59 +271,47 @@ def _drive(car, states, drive):
 
 
 @njit
-def _tick(car, plants, states, trainings, corners, commands, drive, wires, ids, reference, rng, frames, truth):
+def _tick(w, commands, drive, frames, truth):
     """Advance everything by one cycle and write its frames in order of time; returns their number."""
-    wheel_speed = _drive(car, states, drive)
+    car = w.car[0]
+    wheel_speed = _drive(car, w.states, drive)
     car.time_ns += CYCLE_NS
     car.tick += 1
     slow_reference = car.time_ns // _REFERENCE_SLOW_NS != (car.time_ns - CYCLE_NS) // _REFERENCE_SLOW_NS
     count = 0
-    for row in range(len(corners)):
-        p, s, corner = plants[row], states[row], corners[row]
-        mode, target, rate = _train(p, s, trainings[row], commands[row], drive, car.speed == 0.0)
-        _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, rng)
-        _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, trainings[row], truth[row])
-        count = _fast_frames(car, p, s, corner, wires, ids, rng, frames, count)
+    for row in range(len(w.corners)):
+        p, s, training, corner = w.plants[row], w.states[row], w.trainings[row], w.corners[row]
+        mode, target, rate = _train(p, s, training, commands[row], drive, car.speed == 0.0)
+        _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, w.rng)
+        _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, training, truth[row])
+        count = _fast_frames(w, row, frames, count)
         if car.reference:
-            count = _reference_frames(car, p, s, corner, reference, rng, frames, count, slow_reference)
+            count = _reference_frames(w, row, frames, count, slow_reference)
     due = (car.time_ns + _SLOW_NS - 1) // _SLOW_NS * _SLOW_NS
     if due < car.time_ns + CYCLE_NS:
-        count = _slow_frames(car, plants, states, corners, drive, wires, ids, rng, frames, count, due)
+        count = _slow_frames(w, drive, frames, count, due)
     return count
 
 
 @njit
-def _run(car, plants, states, trainings, corners, commands, drives, wires, ids, reference, rng, frames, truth):
+def _run(w, commands, drives, frames, truth):
     total = 0
     for tick in range(len(drives)):
-        total += _tick(
-            car,
-            plants,
-            states,
-            trainings,
-            corners,
-            commands[tick],
-            drives[tick],
-            wires,
-            ids,
-            reference,
-            rng,
-            frames[total:],
-            truth[tick],
-        )
+        total += _tick(w, commands[tick], drives[tick], frames[total:], truth[tick])
     return total
 
 
 @njit
-def _hear(frames, corners, plants, trainings, wires):
+def _hear(w, frames):
     """Take adaptation requests out of what is on the bus."""
+    wires = w.wires[0]
     signals = wires.sent[wire.ADAPT_REQUEST]
     for index in range(len(frames)):
         frame = frames[index]
-        for row in range(len(corners)):
-            if np.int64(frame.can_id) != wires.sent_id[wire.ADAPT_REQUEST, corners[row]]:
+        for row in range(len(w.corners)):
+            if np.int64(frame.can_id) != wires.sent_id[wire.ADAPT_REQUEST, w.corners[row]]:
                 continue
-            training, p = trainings[row], plants[row]
+            training, p = w.trainings[row], w.plants[row]
             training.silent = 0
             training.requested = unpack(frame.data, signals[0]) == 1.0
             low = 1e3 * unpack(frame.data, signals[3])
@@ -352,7 +352,6 @@ class Car:
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
         self.plants = np.ascontiguousarray(plants, PLANT)
         self.corners = tuple(corners)
-        self._corners = np.array([wire.CORNERS.index(corner) for corner in corners])
         self.states = np.zeros(len(plants), PLANT_STATE)
         for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
             self.states[field] = ambient
@@ -364,7 +363,7 @@ class Car:
         self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
         self.trainings = np.zeros(len(plants), TRAINING)
         self.truth = np.zeros(len(plants), TRUTH)
-        self._rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
         self.motion = np.zeros(1, CAR)
         motion = self.motion[0]
         # A middle-sized car; brakes that are not simulated carry their own quarter.
@@ -372,39 +371,28 @@ class Car:
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
         motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
-        self.states["wheel_angle"] = self._rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
-        motion["counter"] = self._rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
+        self.states["wheel_angle"] = rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
+        motion["counter"] = rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
         for corner in range(4):
             # Both frames of a sample share their counter.
             base = wire.CORNER_MESSAGES * corner
             motion["counter"][base + wire.CURRENT] = motion["counter"][base + wire.RESOLVER]
-        self._wires = wire.default_layout()
-        slots = self._wires["slot"][0]
-        self._ids = np.zeros(wire.SLOTS, np.int64)
+        layout = wire.default_layout()
+        slots = layout["slot"][0]
+        ids = np.zeros(wire.SLOTS, np.int64)
         for can_id in np.flatnonzero(slots >= 0):
-            self._ids[slots[can_id]] = can_id
-        self._reference = _reference_wires()
+            ids[slots[can_id]] = can_id
+        places = np.array([wire.CORNERS.index(corner) for corner in corners])
+        self._world = World(
+            self.motion, self.plants, self.states, self.trainings, places, layout, _reference_wires(), ids, rng
+        )
         self._frames = np.zeros(FRAMES_PER_TICK, FRAME)
 
     def tick(self, commands: np.ndarray, drive: np.void) -> np.ndarray:
         """One 4 ms cycle under COMMAND rows (one per corner) and a DRIVE record.
 
         Returns the cycle's frames in order of time, as a FRAME array valid until the next call."""
-        count = _tick(
-            self.motion[0],
-            self.plants,
-            self.states,
-            self.trainings,
-            self._corners,
-            commands,
-            drive,
-            self._wires[0],
-            self._ids,
-            self._reference[0],
-            self._rng,
-            self._frames,
-            self.truth,
-        )
+        count = _tick(self._world, commands, drive, self._frames, self.truth)
         return self._frames[:count]
 
     def run(self, commands: np.ndarray, drives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -413,32 +401,9 @@ class Car:
         Returns (FRAME array, TRUTH array of shape (cycles, corners))."""
         frames = np.zeros(len(drives) * FRAMES_PER_TICK, FRAME)
         truth = np.zeros((len(drives), len(self.corners)), TRUTH)
-        count = _run(
-            self.motion[0],
-            self.plants,
-            self.states,
-            self.trainings,
-            self._corners,
-            commands,
-            drives,
-            self._wires[0],
-            self._ids,
-            self._reference[0],
-            self._rng,
-            frames,
-            truth,
-        )
+        count = _run(self._world, commands, drives, frames, truth)
         return frames[:count].copy(), truth
 
     def hear(self, frames: np.ndarray) -> None:
         """Take what the daemon says: EMB_c_AdaptRequest starts and ends training motion."""
-        _hear(frames, self._corners, self.plants, self.trainings, self._wires[0])
-
-
-def idle(corners: int, ambient: float = 22.0) -> tuple[np.ndarray, np.ndarray]:
-    """(COMMAND array of shape (corners,), DRIVE array of shape (1,)) of a car that stands, released."""
-    commands = np.zeros(corners, COMMAND)
-    commands["mode"] = RELEASE
-    drive = np.zeros(1, DRIVE)
-    drive[0] = (np.nan, 0.0, ambient, PARK_RELEASED, 0)
-    return commands, drive
+        _hear(self._world, frames)

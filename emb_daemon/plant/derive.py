@@ -49,7 +49,6 @@ def _friction_plane(calibration: Calibration) -> np.ndarray:
 def plant_from_calibration(
     calibration: Calibration,
     seed: int | None = None,
-    scatter: float = 1.0,
     effects: dict[str, dict[str, float]] | None = None,
     pad_thickness_mm: float | None = None,
 ) -> np.void:
@@ -57,7 +56,6 @@ def plant_from_calibration(
 
     Args:
         seed: of the unit-to-unit scatter; None gives the calibration's own numbers.
-        scatter: 1 for `_SCATTER`, more for a calibration that fits worse.
         effects: effects to switch on, with their parameters (`records.EFFECTS`); a parameter left out is zero. They stand
             beside those of the calibration, and replace one of the same name.
         pad_thickness_mm: of the pads mounted, if not the calibration's.
@@ -121,16 +119,16 @@ def plant_from_calibration(
                 raise KeyError(f"effect {name} has no parameter {key}; expected {', '.join(known)}")
             p["effects"][name][key] = value
     if seed is not None:
-        _scatter(p, np.random.default_rng(seed), scatter, set(c.effects) - set(effects or {}))
+        _scatter(p, np.random.default_rng(seed), set(c.effects) - set(effects or {}))
     return p
 
 
-def _scatter(p: np.void, rng: np.random.Generator, scatter: float, scattered_effects: set[str]) -> None:
+def _scatter(p: np.void, rng: np.random.Generator, scattered_effects: set[str]) -> None:
     for name, sigma in _SCATTER.items():
-        p[name] = p[name] * (1.0 + scatter * sigma * rng.standard_normal(p[name].shape))
-    p["curve"] *= 1.0 + scatter * _CURVE_SCATTER * rng.standard_normal()
-    p["contact_angle"] += scatter * _CONTACT_SCATTER_RAD * rng.standard_normal()
+        p[name] = p[name] * (1.0 + sigma * rng.standard_normal(p[name].shape))
+    p["curve"] *= 1.0 + _CURVE_SCATTER * rng.standard_normal()
+    p["contact_angle"] += _CONTACT_SCATTER_RAD * rng.standard_normal()
     p["released_angle"] = rng.uniform(*_RELEASED_RANGE_RAD)
     for name in sorted(scattered_effects & set(EFFECTS)):
         for field in EFFECTS[name]:
-            p["effects"][name][field.name] *= 1.0 + scatter * _EFFECT_SCATTER * rng.standard_normal()
+            p["effects"][name][field.name] *= 1.0 + _EFFECT_SCATTER * rng.standard_normal()

@@ -8,13 +8,13 @@ from math import ceil
 
 from emb_daemon.jit import njit
 from emb_daemon.plant.brake import drawn
-from emb_daemon.plant.records import CELLS, CYCLE_NS
+from emb_daemon.plant.records import CELLS
+from emb_daemon.wire.contract import CYCLE_S
 
 _STEFAN_BOLTZMANN = 5.670374419e-8
 _KELVIN = 273.15
 _REFERENCE_C = 20.0
 _CELL_M = 0.0004
-_STEP_S = 1e-9 * CYCLE_NS
 
 
 @njit
@@ -64,7 +64,7 @@ def friction_of_pads(p, s, wheel_speed):
 @njit
 def heat_cycle(p, s, wheel_speed, ambient):
     """One 4 ms cycle of all temperatures, and of what depends on them: friction torque, wear, softening."""
-    e, dt = p.effects, _STEP_S
+    e, dt = p.effects, CYCLE_S
     # What the friction follows of brake torque is that of the cycle before.
     s.brake_torque = 2.0 * friction_of_pads(p, s, wheel_speed) * p.effective_radius * s.force if wheel_speed > 0.0 else 0.0
     power = s.brake_torque * wheel_speed

@@ -6,9 +6,9 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.plant.brake import static_angle
-from emb_daemon.plant.car import CYCLE_S, Car
+from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import ANGLE, COMMAND, DRIVE, FORCE, RELEASE
-from emb_daemon.wire.contract import PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
+from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
 
 #: A request is signalled while the demanded force is above this, N.
 _REQUEST_N = 200.0
@@ -61,12 +61,11 @@ def _forces(schedule: Schedule, force: np.ndarray) -> Schedule:
     return schedule
 
 
-def _approach(angle: np.ndarray, start: float = 0.0, seconds: float = 0.5) -> np.ndarray:
-    """Join a motion from ``start``, and leave it to the same again."""
+def _approach(angle: np.ndarray) -> np.ndarray:
+    """Join a motion from the released position within half a second, and leave it to the same again."""
     time = CYCLE_S * np.arange(len(angle))
-    share = np.clip(np.minimum(time, time[-1] - time) / seconds, 0.0, 1.0)
-    share = 0.5 * (1.0 - np.cos(np.pi * share))
-    return start + share * (angle - start)
+    share = np.clip(np.minimum(time, time[-1] - time) / 0.5, 0.0, 1.0)
+    return 0.5 * (1.0 - np.cos(np.pi * share)) * angle
 
 
 def angle_at(plant: np.void, force_N: float) -> float:
@@ -74,41 +73,32 @@ def angle_at(plant: np.void, force_N: float) -> float:
     return float(plant["contact_angle"] + static_angle(plant, force_N))
 
 
-def curve(plant: np.void, force_N: float = 25000.0, seconds: float = 40.0, strokes: int = 1) -> Schedule:
+def curve(plant: np.void, force_N: float = 25000.0, seconds: float = 40.0) -> Schedule:
     """Slow clamp and release over the whole characteristic curve (thesis 2.1)."""
     schedule = rest(seconds)
     time = CYCLE_S * np.arange(len(schedule))
-    shape = 0.5 * (1.0 - np.cos(2.0 * np.pi * strokes * time / seconds))
+    shape = 0.5 * (1.0 - np.cos(2.0 * np.pi * time / seconds))
     return _angles(schedule, angle_at(plant, force_N) * shape)
 
 
-def random_angle(
-    plant: np.void, seconds: float, rng: np.random.Generator, low_N: float = 0.0, high_N: float = 15000.0, hold: float = 0.1
-) -> Schedule:
-    """A uniform random motor angle every ``hold`` seconds (thesis 3.3.2)."""
+def random_angle(plant: np.void, seconds: float, rng: np.random.Generator, high_N: float = 15000.0) -> Schedule:
+    """A uniform random motor angle every 100 ms (thesis 3.3.2)."""
     schedule = rest(seconds)
-    cycles = round(hold / CYCLE_S)
-    targets = rng.uniform(angle_at(plant, low_N), angle_at(plant, high_N), len(schedule) // cycles + 1)
+    cycles = round(0.1 / CYCLE_S)
+    targets = rng.uniform(angle_at(plant, 0.0), angle_at(plant, high_N), len(schedule) // cycles + 1)
     schedule.commands["mode"] = ANGLE
     schedule.commands["target"] = np.repeat(targets, cycles)[: len(schedule)]
     schedule.drives["brake_request"] = 1
     return schedule + rest(0.5)
 
 
-def training(
-    plant: np.void,
-    seconds: float = 42.0,
-    high_N: float = 15000.0,
-    period: float = 20.0,
-    amplitude: float = 0.8,
-    frequency: float = 6.0,
-) -> Schedule:
-    """Park brake applied; slow clamp and release with a small fast sinusoid on top (thesis Fig. 3-9)."""
+def training(plant: np.void, seconds: float = 42.0, high_N: float = 15000.0) -> Schedule:
+    """Park brake applied; slow clamp and release in 20 s, a sinusoid of 0.8 rad and 6 Hz on top (thesis Fig. 3-9)."""
     schedule = rest(seconds)
     time = CYCLE_S * np.arange(len(schedule))
-    low, high = plant["contact_angle"] - 2.0, angle_at(plant, high_N) - amplitude
-    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * time / period))
-    angle += amplitude * np.sin(2.0 * np.pi * frequency * time)
+    low, high = plant["contact_angle"] - 2.0, angle_at(plant, high_N) - 0.8
+    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * time / 20.0))
+    angle += 0.8 * np.sin(2.0 * np.pi * 6.0 * time)
     schedule.drives["park_brake"] = PARK_APPLIED
     return _angles(schedule, _approach(angle)) + rest(0.5)
 
