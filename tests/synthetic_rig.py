@@ -14,7 +14,7 @@ from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.campaign import Actuator, Datasheet, Resolver
 from emb_daemon.identify.dynamics import RELAXATION, Pads, curve_keys, simulate
-from emb_daemon.identify.example import DATASHEET
+from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, PRESLIDING, TORQUE_CONSTANT
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
@@ -84,7 +84,7 @@ def datasheet(torque_constant: float, inertia: float, tolerance: float = 0.3) ->
         rated_clamp_force_N=20e3,
         pad_clearance_rad=5.0,
     )
-    usual = load_yaml(Path("example"), Datasheet, DATASHEET)
+    usual = load_yaml(FILES / "datasheet.yaml", Datasheet)
     resolver = Resolver(counts_per_revolution=round(2.0 * np.pi / COUNT_RAD))
     return msgspec.structs.replace(usual, actuator=actuator, resolver=resolver)
 

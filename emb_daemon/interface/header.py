@@ -5,6 +5,7 @@ sources, or the program does not link.
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -19,78 +20,9 @@ from emb_daemon.interface.places import Place, places
 from emb_daemon.interface.signals import describe
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
+#: The header, with places for `str.format`.
+_TEXT = Path(__file__).with_name("emb.h.in").read_text(encoding="utf-8")
 _KINDS = {"f": "double", "i": "int64_t", "b": "bool"}
-
-_TEXT = """\
-/* Virtual clamp force sensor: the estimator of emb_daemon {version} in C.
- *
- * Made by emb-daemon export from the calibration {hash} of {actuator}. Link with the library of emb-daemon compile:
- *
- *     cc program.c kernels.so -lm
- *
- * SI units, temperatures in degC. One emb_brake for each corner; nothing is allocated, no function blocks, and different
- * brakes may be served by different threads. What adaptation learns while parked is not part of this interface.
- */
-#ifndef EMB_H
-#define EMB_H
-
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-
-/* Cycle of the motor's signals, s. */
-#define EMB_CYCLE_S {cycle!r}
-
-{codes}
-
-/* One sample, or a question for what can be said without one. */
-{sample}
-
-/* The answer. */
-{estimate}
-
-/* One actuator's calibration, as the estimator takes it. */
-{parameters}
-
-/* One corner's estimator: emb_init prepares it, its content is its own. */
-typedef struct {{
-    emb_parameters parameters;
-    _Alignas(8) unsigned char state[{state}];
-}} emb_brake;
-
-{asserts}
-
-/* In the library: that it was made from the same sources as this header; arguments as eight-byte words. */
-extern const char {mark};
-int32_t {function}(int64_t *words);
-
-/* A brake that has seen nothing. */
-static inline void emb_init(emb_brake *brake, const emb_parameters *calibration) {{
-    (void)*(const volatile char *)&{mark};
-    memset(brake, 0, sizeof *brake);
-    brake->parameters = *calibration;
-}}
-
-/* Take one sample and answer it, in some microseconds. Samples come every EMB_CYCLE_S; where some are missing, the next one's
- * dt says so. At the first the brake is released and the motor stands, or the contact angle counts as unknown until both were
- * seen. Returns 0; anything else is a defect of the library. */
-static inline int emb_step(emb_brake *brake, const emb_sample *sample, emb_estimate *estimate) {{
-    int64_t words[] = {{
-        (int64_t)(intptr_t)sample, 1, 1, (int64_t)(intptr_t)brake->state, 1,
-        (int64_t)(intptr_t)&brake->parameters, 1, (int64_t)(intptr_t)estimate, 1,
-    }};
-    memset(estimate, 0, sizeof *estimate);
-    return {function}(words);
-}}
-
-/* {actuator}, {hash}. What is not named here is zero. */
-static const emb_parameters emb_calibration = {{
-{calibration}
-}};
-
-#endif
-"""
 
 
 def _declared(kind: np.dtype, name: str, shape: tuple[int, ...], describe_field, indent: str) -> Iterator[str]:
