@@ -13,10 +13,10 @@ from adaptkit import ClosedLoop, parked
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.adaptation import Adaptation
-from emb_daemon.adapt.files import encode
+from emb_daemon.adapt.files import decode, encode
 from emb_daemon.adapt.fit import fit_training
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, curve_values, why_out_of_bounds, with_learned
-from emb_daemon.adapt.memory import Memory, decode, state_directory, with_entry
+from emb_daemon.adapt.memory import FORMAT, Memory, Store, state_directory, with_entry
 from emb_daemon.adapt.pairs import FORCE, pairs_of_passes
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
@@ -705,7 +705,7 @@ def test_history_is_bounded_and_a_rejection_changes_nothing_in_use():
         store = with_entry(store, rejected)
     assert store.current == specimen(1).current
     assert len(store.history) == 50
-    assert decode(encode(store)) == store
+    assert decode(encode(store), Store, FORMAT) == store
 
 
 def test_a_kill_leaves_a_whole_set():

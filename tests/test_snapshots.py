@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import json
 import os
 
 import adaptkit
@@ -125,7 +126,7 @@ def test_a_file_of_another_format_is_set_aside(tmp_path):
     snapshots = Snapshots(tmp_path, RECORD)
     snapshots.save("FL", SHIPPED, record(), 1)
     path = snapshots.path("FL")
-    content = files.decode(path.read_bytes(), dict)
+    content = json.loads(path.read_bytes())["content"]
     path.write_bytes(files.encode(content | {"format": 9}))
     assert "format 9" in snapshots.load("FL", SHIPPED)[2] and not path.exists()
 
@@ -166,7 +167,7 @@ def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name
     """The checksum is right, the values are not."""
     loop, _, stopped_ns = driven
     path = tmp_path / "restart-FL.json"
-    content = files.decode(path.read_bytes(), dict)
+    content = json.loads(path.read_bytes())["content"]
     path.write_bytes(files.encode(content | {"state": content["state"] | {name: value}}))
     restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
     assert f"{name}: beyond what this brake can have" in caplog.text and not loop.adaptation._resumable

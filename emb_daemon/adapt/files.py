@@ -29,8 +29,8 @@ def read(path: Path) -> bytes:
     return read_bounded(path, _MOST_BYTES)
 
 
-def decode(data: bytes, kind: type):
-    """What `encode` was given, of type ``kind``.
+def decode(data: bytes, kind: type, version: int):
+    """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``.
 
     Raises:
         ValueError: not one of our files, or damaged; says which.
@@ -39,9 +39,31 @@ def decode(data: bytes, kind: type):
         file = msgspec.json.decode(data, type=_Sealed)
         if hashlib.sha256(bytes(file.content)).hexdigest() != file.sha256:
             raise ValueError("checksum is wrong")
-        return msgspec.json.decode(file.content, type=kind)
+        content = msgspec.json.decode(file.content, type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(str(error)) from None
+    if content.format != version:
+        raise ValueError(f"format {content.format}, expected {version}")
+    return content
+
+
+def read_own(path: Path, kind: type, ours: dict):
+    """A file's content of type ``kind``, or None, and a warning for the log, or None.
+
+    A damaged file is set aside; one that belongs to something else than ``ours`` (fields that both have) is not used.
+    """
+    try:
+        found = decode(read(path), kind, ours["format"])
+    except FileNotFoundError:
+        return None, None
+    except ValueError as error:
+        return None, f"{path}: damaged ({error}), {set_aside(path)}"
+    except OSError as error:
+        return None, f"{path}: not readable: {error.strerror}"
+    for name, expected in ours.items():
+        if getattr(found, name) != expected:
+            return None, f"{path}: belongs to {name} {getattr(found, name)}, not {expected}; not used"
+    return found, None
 
 
 def write(path: Path, content: msgspec.Struct) -> None:

@@ -21,7 +21,7 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError, Unavailable
 
-_FORMAT = 2
+FORMAT = 2
 #: Trainings that a file remembers, and the age from which an unfinished file is nobody's, s.
 _HISTORY = 50
 _ABANDONED_S = 3600.0
@@ -75,18 +75,6 @@ def entry_of(outcome: int, evaluation: Evaluation, date: str, ambient_C: float, 
     )
 
 
-def decode(content: bytes) -> Store:
-    """Read a file's content.
-
-    Raises:
-        ValueError: not one of our files, or damaged; says which.
-    """
-    store = files.decode(content, Store)
-    if store.format != _FORMAT:
-        raise ValueError(f"format {store.format}, expected {_FORMAT}")
-    return store
-
-
 def state_directory(configured: str | None, relative_to: Path, environment=os.environ) -> Path | None:
     """Folder for learned values: systemd's STATE_DIRECTORY, or else the configured one; None if there is neither."""
     if given := environment.get("STATE_DIRECTORY"):
@@ -135,7 +123,7 @@ class Memory:
             content = files.read(self.path(corner))
         except FileNotFoundError:
             return None
-        return decode(content)
+        return files.decode(content, Store, FORMAT)
 
     def load(self, corner: str, calibration: Calibration) -> tuple[Store, str | None]:
         """What is known of a corner with this calibration, and a warning for the log or None.
@@ -143,26 +131,14 @@ class Memory:
         A file that is damaged, or holds values that this brake cannot have, is set aside; one of another actuator or
         calibration stays until something new is learned, but nothing of it is used.
         """
-        empty = Store(
-            format=_FORMAT, corner=corner, actuator=calibration.actuator, calibration=calibration_hash(calibration),
-            current=None, history=(),
-        )  # fmt: skip
+        path = self.path(corner)
+        ours = {"format": FORMAT, "corner": corner, "actuator": calibration.actuator}
+        ours["calibration"] = calibration_hash(calibration)
         self._sweep()
-        try:
-            store = self.read(corner)
-        except ValueError as error:
-            return empty, f"{self.path(corner)}: damaged ({error}), {files.set_aside(self.path(corner))}"
-        except OSError as error:
-            return empty, f"{self.path(corner)}: not readable: {error.strerror}"
-        if store is None:
-            return empty, None
-        for name in ("corner", "actuator", "calibration"):
-            if getattr(store, name) != getattr(empty, name):
-                theirs, ours = getattr(store, name), getattr(empty, name)
-                return empty, f"{self.path(corner)}: belongs to {name} {theirs}, not {ours}; not used"
-        if store.current and (fault := why_out_of_bounds(calibration, store.current.values)):
-            return empty, f"{self.path(corner)}: refused ({fault}), {files.set_aside(self.path(corner))}"
-        return store, None
+        store, warning = files.read_own(path, Store, ours)
+        if store and store.current and (fault := why_out_of_bounds(calibration, store.current.values)):
+            store, warning = None, f"{path}: refused ({fault}), {files.set_aside(path)}"
+        return store or Store(**ours, current=None, history=()), warning
 
     def _sweep(self) -> None:
         """Remove what writers left that were killed long ago."""

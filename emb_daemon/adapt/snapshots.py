@@ -79,29 +79,22 @@ class Snapshots:
 
     def save(self, corner: str, calibration: Calibration, record: np.void, time_ns: int) -> None:
         """Keep a record of ``dtype``. Raises OSError; the old file is then untouched."""
-        content = Snapshot(
-            format=_FORMAT, corner=corner, actuator=calibration.actuator, calibration=calibration_hash(calibration),
-            time_ns=time_ns, state=to_fields(record),
-        )  # fmt: skip
-        files.write(self.path(corner), content)
+        files.write(self.path(corner), Snapshot(**_header(corner, calibration), time_ns=time_ns, state=to_fields(record)))
 
     def load(self, corner: str, calibration: Calibration) -> tuple[np.void | None, int, str | None]:
         """What was kept of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
         the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
         path = self.path(corner)
+        found, warning = files.read_own(path, Snapshot, _header(corner, calibration))
+        if found is None:
+            return None, 0, warning
         try:
-            found = files.decode(files.read(path), Snapshot)
-            if found.format != _FORMAT:
-                raise ValueError(f"format {found.format}, expected {_FORMAT}")
-            record = from_fields(found.state, self._dtype)
-        except FileNotFoundError:
-            return None, 0, None
+            return from_fields(found.state, self._dtype), found.time_ns, None
         except ValueError as error:
             return None, 0, f"{path}: damaged ({error}), {files.set_aside(path)}"
-        except OSError as error:
-            return None, 0, f"{path}: not readable: {error.strerror}"
-        ours = {"corner": corner, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}
-        for name, expected in ours.items():
-            if getattr(found, name) != expected:
-                return None, 0, f"{path}: belongs to {name} {getattr(found, name)}, not {expected}; not used"
-        return record, found.time_ns, None
+
+
+def _header(corner: str, calibration: Calibration) -> dict:
+    """What a file of a corner with this calibration in use begins with."""
+    ours = {"format": _FORMAT, "corner": corner, "actuator": calibration.actuator}
+    return ours | {"calibration": calibration_hash(calibration)}

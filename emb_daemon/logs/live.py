@@ -5,15 +5,14 @@ averaged; slower ones stay as they are, since nothing can be put between samples
 """
 
 import math
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.mapping import Mapping, Source
-from emb_daemon.logs.resample import HEADER, our_messages, unrepeated
-from emb_daemon.runtime.bus import PythonCanBus
+from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
+from emb_daemon.runtime.bus import PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
@@ -21,10 +20,6 @@ from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
 _DUE = 0.9
-#: Cycles of a slow message for which a value is carried on.
-_CARRIED_CYCLES = 5
-#: Cycle of a message whose DBC states none, ms.
-_SLOW_MS = 40
 
 
 @dataclass
@@ -68,7 +63,7 @@ class _Message:
 
     def fresh(self, now_ns: int) -> bool:
         """Whether every signal that the rig sends has been heard, not too long ago."""
-        most = _CARRIED_CYCLES * max(self.cycle_ns, CYCLE_NS)
+        most = CARRIED_CYCLES * max(self.cycle_ns, CYCLE_NS)
         values = [value for value in self.signals.values() if isinstance(value, _Value)]
         return all(value.heard_ns and now_ns - value.heard_ns <= most for value in values)
 
@@ -120,25 +115,13 @@ class MappedBus(PythonCanBus):
             for signal, source in mapping.messages[name].items()
         }
         layout = dict(zip(names, signal_columns(database, name, names), strict=True))
-        return _Message(message.frame_id, (message.cycle_time or _SLOW_MS) * 1_000_000, signals, layout)
+        return _Message(message.frame_id, cycle_ns(message), signals, layout)
 
     def drain(self) -> np.ndarray:
-        import can
-
-        rows, offset = [], time.time_ns() - time.monotonic_ns()
-        while True:
-            try:
-                message = self._early.popleft() if self._early else self._bus.recv(0)
-                self.down = False
-            except can.CanError:
-                self.down = True
-                break
-            if message is None:
-                break
-            if message.is_error_frame or message.is_remote_frame:
-                continue
-            now, stamp = time.monotonic_ns(), round(message.timestamp * 1e9) - offset
-            rows += self.heard(message, stamp if 0 <= now - stamp < 1_000_000_000 else now)
+        rows = []
+        for message, time_ns in self._arrived():
+            if not (message.is_error_frame or message.is_remote_frame):
+                rows += self.heard(message, time_ns)
         return np.array(rows, FRAME)
 
     def heard(self, message, time_ns: int) -> list[tuple]:
@@ -214,6 +197,4 @@ def open_mapped(options: dict, mapping: Mapping) -> MappedBus:
         InputError: no interface is named, or an unknown one, or the mapping has no DBC.
         Unavailable: it cannot be opened now.
     """
-    from emb_daemon.runtime.bus import open_python_can
-
     return MappedBus(open_python_can(options), mapping)

@@ -24,7 +24,7 @@ _SAME_PERIOD = 0.05
 #: the estimator bridges what lies between. A brake clamps in some fifty cycles.
 _SPARSE_CYCLES = 5
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
-_CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
+CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
 #: Periods from which a step of time is a pause.
@@ -78,7 +78,7 @@ class Series:
             return np.full(len(at_ns), np.nan)
         row = np.searchsorted(self.time_ns, at_ns, side="right") - 1
         age = at_ns - self.time_ns[np.maximum(row, 0)]
-        fresh = (row >= 0) & (age <= max(_CARRIED_CYCLES * cycle_ns, _CARRIED_PERIODS * self.period_ns))
+        fresh = (row >= 0) & (age <= max(CARRIED_CYCLES * cycle_ns, _CARRIED_PERIODS * self.period_ns))
         return np.where(fresh, self.values[np.maximum(row, 0)], np.nan)
 
     def sampled(self, at_ns: np.ndarray) -> np.ndarray:
@@ -228,6 +228,11 @@ def our_messages() -> dict[str, tuple]:
     return {message.name: (message, database) for database in databases for message in database.messages}
 
 
+def cycle_ns(message) -> int:
+    """Of a cantools message."""
+    return (message.cycle_time or _SLOW_MS) * 1_000_000
+
+
 def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     """FRAME array, in time order, of our messages by name.
 
@@ -302,10 +307,12 @@ def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, i
         times, cycles = ticks[corner]
         columns = {key: _fast(key, source, times) for key, source in signals.items()}
     else:
-        cycle_ns = (message.cycle_time or _SLOW_MS) * 1_000_000
-        times = np.arange(span[0], span[1] + 1, cycle_ns)
+        times = np.arange(span[0], span[1] + 1, cycle_ns(message))
         cycles = np.arange(len(times))
-        columns = {key: _slow(source, times, cycle_ns) for key, source in signals.items()}
+        columns = {
+            key: source.held(times, cycle_ns(message)) if isinstance(source, Series) else source
+            for key, source in signals.items()
+        }
     is_reference = message.name.startswith("RIG_")
     names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
     payload, usable = np.zeros(len(times), np.uint64), np.ones(len(times), bool)
@@ -350,10 +357,6 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
     A resolver's speed has noise, and one that repeats itself to the bit hangs. An encoder at rest repeats itself for minutes,
     as does a speed that is the change of an angle."""
     return np.where(np.abs(speed) < 0.5 * _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
-
-
-def _slow(source: Series | float | None, times: np.ndarray, cycle_ns: int) -> np.ndarray | float | None:
-    return source.held(times, cycle_ns) if isinstance(source, Series) else source
 
 
 def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:

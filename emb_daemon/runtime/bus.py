@@ -3,6 +3,7 @@
 import select
 import time
 from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -48,25 +49,32 @@ class PythonCanBus:
             self._early.append(message)
         return message is not None
 
-    def drain(self) -> np.ndarray:
+    def _arrived(self) -> Iterator[tuple]:
+        """python-can messages that have come, with their time on the monotonic clock in ns."""
         import can
 
-        count, now, offset = 0, time.monotonic_ns(), time.time_ns() - time.monotonic_ns()
-        while count < len(self._frames):
+        offset = time.time_ns() - time.monotonic_ns()
+        while True:
             try:
                 message = self._early.popleft() if self._early else self._bus.recv(0)
                 self.down = False
             except can.CanError:
                 self.down = True
-                break
+                return
             if message is None:
-                break
+                return
+            # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
+            now, stamp = time.monotonic_ns(), round(message.timestamp * 1e9) - offset
+            yield message, stamp if 0 <= now - stamp < 1_000_000_000 else now
+
+    def drain(self) -> np.ndarray:
+        count, arrived = 0, self._arrived()
+        while count < len(self._frames) and (found := next(arrived, None)):
+            message, time_ns = found
             if not self._concerns_us(message) or self._is_echo(message):
                 continue
             frame = self._frames[count]
-            # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
-            stamp = round(message.timestamp * 1e9) - offset
-            frame["time_ns"] = stamp if 0 <= now - stamp < 1_000_000_000 else now
+            frame["time_ns"] = time_ns
             frame["can_id"] = message.arbitration_id
             frame["length"] = len(message.data)
             frame["data"] = int.from_bytes(message.data[:8], "little")

@@ -43,10 +43,7 @@ class FreshnessFile:
     def load(self) -> Freshness:
         """What is kept; nothing if there is no file or a damaged one, which is set aside: old messages are then new."""
         try:
-            kept = files.decode(files.read(self.path), Freshness)
-            if kept.format != _FORMAT:
-                raise ValueError(f"format {kept.format}, expected {_FORMAT}")
-            return kept
+            return files.decode(files.read(self.path), Freshness, _FORMAT)
         except FileNotFoundError:
             return Freshness()
         except ValueError as error:

@@ -108,9 +108,9 @@ class TroubleMemory:
         self._row = [0] * CODES
         self._dirty_s: float | None = None
         try:
-            stored = files.decode(files.read(self.path), _Stored)
-            if stored.format != _FORMAT or not stored.entries.keys() <= self.entries.keys():
-                raise ValueError(f"format {stored.format}")
+            stored = files.decode(files.read(self.path), _Stored, _FORMAT)
+            if unknown := stored.entries.keys() - self.entries.keys():
+                raise ValueError(f"unknown codes {sorted(unknown)}")
             self.entries |= stored.entries
         except FileNotFoundError:
             pass

@@ -16,7 +16,7 @@ os.environ["NUMBA_DISABLE_JIT"] = "1"
 import atheris
 
 with atheris.instrument_imports(include=["emb_daemon"]):
-    from emb_daemon.adapt import memory
+    from emb_daemon.adapt import files, memory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.errors import InputError
@@ -123,7 +123,8 @@ def state(data: bytes) -> None:
     """A file of the state directory, its checksum right."""
     body = _edited(_STORE, data)
     with contextlib.suppress(ValueError):
-        memory.decode(b'{"sha256":"%s","content":%s}' % (hashlib.sha256(body).hexdigest().encode(), body))
+        sealed = b'{"sha256":"%s","content":%s}' % (hashlib.sha256(body).hexdigest().encode(), body)
+        files.decode(sealed, memory.Store, memory.FORMAT)
 
 
 def _edited(good: bytes, data: bytes) -> bytes:
