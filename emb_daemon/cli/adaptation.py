@@ -4,6 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from emb_daemon.errors import InputError
+
 EXAMPLE = "emb-daemon adaptation show --state /var/lib/emb_daemon"
 
 
@@ -18,7 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.adapt.memory import Memory, state_directory
-    from emb_daemon.errors import InputError
     from emb_daemon.offline import corner_index
     from emb_daemon.wire.layout import CORNERS
 
@@ -60,8 +61,6 @@ def _ask(corners: list[str]) -> None:
     Raises:
         InputError: nobody is there to answer, or the answer is no.
     """
-    from emb_daemon.errors import InputError
-
     if not corners:
         return
     if not sys.stdin.isatty():

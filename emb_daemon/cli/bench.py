@@ -1,6 +1,7 @@
 """emb-daemon bench."""
 
 import argparse
+import json
 
 from emb_daemon.errors import InputError
 
@@ -23,8 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import json
-
     if not arguments.seconds >= _LEAST_S:
         raise InputError(f"--seconds {arguments.seconds:g}: expected at least {_LEAST_S:g}: the first second does not count")
     from emb_daemon.ahead import library

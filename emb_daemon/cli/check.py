@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.errors import InputError, InputErrors
 
 EXAMPLE = "emb-daemon check --config config/emb.yaml"
 
@@ -16,7 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.calibration.files import calibration_hash
-    from emb_daemon.errors import InputError, InputErrors
 
     if not arguments.config and not arguments.mapping:
         raise InputError("check: expected --config FILE, --mapping FILE or both")

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
+from emb_daemon.cli.outputs import check_output
 
 EXAMPLE = "emb-daemon convert bench.csv --mapping my_rig.yaml --output bench.log"
 
@@ -15,7 +16,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from emb_daemon.cli.outputs import check_output
     from emb_daemon.logs.write import FRAME_ENDINGS, write_frames
 
     check_output(arguments.output, [arguments.log, arguments.mapping], FRAME_ENDINGS)

@@ -1,10 +1,13 @@
 """emb-daemon diagnose."""
 
 import argparse
+import json
 from pathlib import Path
 
+from emb_daemon.atomic import write_atomically
 from emb_daemon.cli.logoptions import add_mapping_argument, log_reader
 from emb_daemon.cli.progress import progress
+from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon diagnose fit.log.gz --calibration config/calibration.yaml --validate val.log.gz --output found"
 
@@ -21,17 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import json
-
     from rich.console import Console
 
-    from emb_daemon.atomic import write_atomically
     from emb_daemon.calibration.files import load_calibration, save_calibration
     from emb_daemon.diagnose.diagnosis import diagnose, log_paths
     from emb_daemon.diagnose.page import page
     from emb_daemon.diagnose.report import report
     from emb_daemon.diagnose.text import table, verdict
-    from emb_daemon.errors import InputError
     from emb_daemon.offline import corner_index, load_log
 
     corner_index(arguments.corner)

@@ -3,6 +3,10 @@
 import argparse
 from pathlib import Path
 
+from emb_daemon.atomic import write_atomically
+from emb_daemon.cli.outputs import check_output
+from emb_daemon.errors import InputError
+
 EXAMPLE = "emb-daemon effect export calibration.yaml term:gear_friction:motor_angle --output screw_friction.py"
 
 
@@ -15,12 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from emb_daemon.atomic import write_atomically
     from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.cli.outputs import check_output
     from emb_daemon.diagnose.export import effect_name, source, values
     from emb_daemon.diagnose.forms import equation
-    from emb_daemon.errors import InputError
 
     check_output(arguments.output, [arguments.calibration])
     calibration = load_calibration(arguments.calibration)

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 
 from emb_daemon.ahead.library import default_path
+from emb_daemon.atomic import write_atomically
+from emb_daemon.cli.outputs import check_output
 
 EXAMPLE = "emb-daemon export --calibration calibration.yaml --output brake.fmu"
 
@@ -23,9 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from emb_daemon.atomic import write_atomically
     from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.cli.outputs import check_output
 
     check_output(arguments.output, [arguments.calibration, arguments.kernels], (".h", ".fmu"))
     calibration = load_calibration(arguments.calibration)

@@ -3,29 +3,22 @@
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from emb_daemon.cli.outputs import check_output
 from emb_daemon.cli.progress import progress
+from emb_daemon.resources import resource
 
 EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
   emb-daemon fleet diagnose fleet --units units.csv
   emb-daemon fleet report fleet --output fleet.html"""
 
-_COMMANDS = {
-    "ingest": "log files into a data set partitioned by unit, corner and day: each once, damaged ones listed",
-    "replay": "estimates, figures and integrity of every drive, equal to those of emb-daemon replay",
-    "learn": "what park brake adaptation learns of each unit, drive by drive",
-    "diagnose": "what sets units and batches apart, what drifts, by the disagreement of the force paths",
-    "prior": "a calibration with the population's values, their spread, and bounds for adaptation",
-    "report": "one page: map of units, worst ten, batches, trend, next action",
-    "bench": "how fast one core of this machine replays a log, stage by stage",
-}
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="fleet_command", metavar="COMMAND", required=True)
-    parsers = {name: commands.add_parser(name, help=text, description=text) for name, text in _COMMANDS.items()}
+    parsers = {name: commands.add_parser(name, help=text, description=text) for name, (_, text) in _COMMANDS.items()}
     ingest = parsers["ingest"]
     ingest.add_argument(
         "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"
@@ -49,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see DIR; default: this machine"
         )
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
-    for name in ("ingest", "replay", "learn", "diagnose"):
         parsers[name].add_argument("--resume", action="store_true", help="go on: keep what is there of the same calibration")
     parsers["diagnose"].add_argument(
         "--units", type=Path, metavar="FILE.csv", help="what units have in common: columns unit, batch, supplier, ..."
@@ -59,12 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    return _RUN[arguments.fleet_command](arguments)
+    return _COMMANDS[arguments.fleet_command][0](arguments)
 
 
 def _calibration(arguments: argparse.Namespace):
     from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.resources import resource
 
     return load_calibration(arguments.calibration or resource("config/calibration.yaml"))
 
@@ -81,8 +72,6 @@ def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list,
 
 
 def _ingest(arguments: argparse.Namespace) -> int:
-    from functools import partial
-
     from emb_daemon.fleet import ingest
 
     root = arguments.output.absolute()
@@ -101,8 +90,6 @@ def _ingest(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from functools import partial
-
     from emb_daemon.calibration.files import calibration_hash
     from emb_daemon.fleet import dataset, replaying
 
@@ -123,8 +110,6 @@ def _fault(_item: Any, reason: str) -> str:
 
 
 def _diagnose(arguments: argparse.Namespace) -> int:
-    from functools import partial
-
     from emb_daemon.calibration.files import calibration_hash
     from emb_daemon.fleet import dataset, findings, scores
 
@@ -157,7 +142,6 @@ def _print(found) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from emb_daemon.cli.outputs import check_output
     from emb_daemon.fleet.page import fleet_page
 
     check_output(arguments.output, ())
@@ -166,8 +150,6 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from functools import partial
-
     from emb_daemon.fleet import dataset, learning
 
     root, calibration = arguments.data.absolute(), _calibration(arguments)
@@ -184,7 +166,6 @@ def _learn(arguments: argparse.Namespace) -> int:
 
 def _prior(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.files import save_calibration
-    from emb_daemon.cli.outputs import check_output
     from emb_daemon.fleet.learning import prior
 
     check_output(arguments.output, (arguments.calibration,), (".yaml",))
@@ -204,12 +185,13 @@ def _bench(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_RUN = {
-    "ingest": _ingest,
-    "replay": _replay,
-    "learn": _learn,
-    "diagnose": _diagnose,
-    "prior": _prior,
-    "report": _report,
-    "bench": _bench,
+#: What runs each command, and what it does.
+_COMMANDS = {
+    "ingest": (_ingest, "log files into a data set partitioned by unit, corner and day: each once, damaged ones listed"),
+    "replay": (_replay, "estimates, figures and integrity of every drive, equal to those of emb-daemon replay"),
+    "learn": (_learn, "what park brake adaptation learns of each unit, drive by drive"),
+    "diagnose": (_diagnose, "what sets units and batches apart, what drifts, by the disagreement of the force paths"),
+    "prior": (_prior, "a calibration with the population's values, their spread, and bounds for adaptation"),
+    "report": (_report, "one page: map of units, worst ten, batches, trend, next action"),
+    "bench": (_bench, "how fast one core of this machine replays a log, stage by stage"),
 }

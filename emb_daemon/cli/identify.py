@@ -7,6 +7,7 @@ from pathlib import Path
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.cli.progress import progress
+from emb_daemon.errors import InputError
 
 #: Exit status of a calibration that is written although a log that it rests on is missing or could not serve. Thermocouples in
 #: the pads are another rig's, which many have not.
@@ -28,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.files import calibration_hash, save_calibration
-    from emb_daemon.errors import InputError
     from emb_daemon.identify.campaign import load_campaign
     from emb_daemon.identify.report import build
     from emb_daemon.identify.run import identify
@@ -72,8 +72,6 @@ def _example(folder: Path) -> int:
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Minutes of work must not end in a file that cannot be written."""
-    from emb_daemon.errors import InputError
-
     if not arguments.campaign or not arguments.output:
         raise InputError("identify: expected CAMPAIGN.yaml and --output CALIBRATION.yaml, or --example DIR")
     check_output(arguments.output, [arguments.campaign, arguments.mapping])

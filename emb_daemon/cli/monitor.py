@@ -1,7 +1,14 @@
 """emb-daemon monitor."""
 
 import argparse
+import json
+import signal
+import sys
 from pathlib import Path
+
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.outputs import check_output
+from emb_daemon.errors import InputError
 
 EXAMPLE = (
     "emb-daemon monitor -i socketcan -c can0\n  emb-daemon monitor -c can0 -i socketcan --once --json\n"
@@ -12,8 +19,6 @@ _PORT = 8250
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from emb_daemon.cli.busoptions import add_bus_arguments
-
     parser.add_argument("--once", action="store_true", help="listen for two seconds, print one line per corner, end")
     parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
     page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
@@ -24,11 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import json
-    import sys
-
-    from emb_daemon.cli.busoptions import bus_options
-    from emb_daemon.errors import InputError
     from emb_daemon.monitor.listener import Listener
     from emb_daemon.monitor.terminal import listen, watch
     from emb_daemon.runtime.bus import open_bus
@@ -65,10 +65,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
     """Serve browsers, Prometheus and PlotJuggler, and record, until somebody ends it."""
-    import signal
-
-    from emb_daemon.cli.outputs import check_output
-    from emb_daemon.errors import InputError
     from emb_daemon.monitor.recording import Recording
     from emb_daemon.monitor.web import Datagrams, Web, hand_out
 

@@ -1,10 +1,14 @@
 """emb-daemon replay."""
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
 from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
+from emb_daemon.cli.outputs import check_output
+from emb_daemon.errors import InputError
+from emb_daemon.resources import resource
 
 #: Least share of a log's samples with which a reason is told in its summary; tables have them all.
 _SEEN = 0.001
@@ -40,15 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import json
-
     import msgspec
     import numpy as np
 
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
-    from emb_daemon.resources import resource
 
     _check(arguments)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
@@ -81,7 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _secured(arguments: argparse.Namespace, read):
     """``read`` of authentic frames alone, and what authenticates frames, as the daemon does both."""
-    from emb_daemon.errors import InputError
     from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile
     from emb_daemon.wire.keys import load_keys
     from emb_daemon.wire.secoc import load_links
@@ -100,8 +100,6 @@ def _secured(arguments: argparse.Namespace, read):
 
 def _check(arguments: argparse.Namespace) -> None:
     """What can be refused before the work."""
-    from emb_daemon.cli.outputs import check_output
-    from emb_daemon.errors import InputError
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
     from emb_daemon.replay import ALL
 

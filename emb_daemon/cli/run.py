@@ -6,12 +6,13 @@ import signal
 import sys
 from pathlib import Path
 
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.logoptions import open_mapping
+
 EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from emb_daemon.cli.busoptions import add_bus_arguments
-
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
     add_bus_arguments(parser)
@@ -28,7 +29,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(refusal, file=sys.stderr)
     from emb_daemon.adapt.memory import hold, state_directory
     from emb_daemon.calibration.configuration import Setup
-    from emb_daemon.cli.busoptions import bus_options
     from emb_daemon.jit import compiled_for_the_next_start
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.runtime.daemon import Daemon
@@ -48,7 +48,6 @@ def run(arguments: argparse.Namespace) -> int:
         hold(state)
     options = bus_options(arguments, configuration.bus)
     if arguments.mapping:
-        from emb_daemon.cli.logoptions import open_mapping
         from emb_daemon.logs.live import open_mapped
 
         bus = open_mapped(options, open_mapping(arguments.mapping))

@@ -2,14 +2,17 @@
 
 import argparse
 import signal
+import threading
 from pathlib import Path
+
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.errors import InputError
+from emb_daemon.resources import resource
 
 EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario drive"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from emb_daemon.cli.busoptions import add_bus_arguments
-
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds; without it, on Ctrl-C or SIGTERM")
     parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
@@ -22,18 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import threading
-
     import numpy as np
 
     from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.cli.busoptions import bus_options
-    from emb_daemon.errors import InputError
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
     from emb_daemon.plant.scenarios import scenario
-    from emb_daemon.resources import resource
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.wire.keys import load_keys
     from emb_daemon.wire.layout import CORNERS, default_layout

@@ -1,9 +1,12 @@
 """emb-daemon uds."""
 
 import argparse
+import signal
+import sys
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
@@ -27,13 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import signal
-    import sys
-
     from emb_daemon.adapt.memory import state_directory
     from emb_daemon.calibration.configuration import Setup
-    from emb_daemon.cli.busoptions import bus_options
-    from emb_daemon.errors import InputError
     from emb_daemon.monitor.listener import Listener
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.workshop.serve import Diagnostics

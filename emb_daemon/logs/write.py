@@ -2,6 +2,7 @@
 
 import datetime
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
+from emb_daemon.interface.signals import OUTPUTS
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import References, latest
 from emb_daemon.logs.read import needs_extra
@@ -19,27 +21,11 @@ TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
 FRAME_ENDINGS = (".log", ".blf", ".asc", ".trc", ".mf4")
 
 
-#: What each column of a table is, for files that can say so: by ending of its name after the unit is taken off.
-_COMMENTS = {
-    "clamp_force": "estimate, both paths fused",
-    "clamp_force_sigma": "one standard deviation of clamp_force",
-    "stiffness_force": "from motor angle by the characteristic curve",
-    "torque_force": "from motor current by the torque balance",
-    "ml_force": "both paths weighted by their variances, without memory",
-    "contact_angle": "motor angle at which the pads touch",
-    "stiffness_factor": "stiffness over that at the calibration's temperature",
-    "surface": "friction surface",
-    "mean": "mean over the pad's thickness",
-    "disc": "brake disc, lumped",
-    "mode": "mode of the estimator",
-    "source": "what clamp_force rests on",
-    "reasons": "why not to trust the row, joined by '; '",
-    "clamp_force_ref": "reference instrument of the rig",
-    "brake_torque_ref": "reference instrument of the rig",
-    "disc_ref": "reference instrument of the rig",
-    "corner": "wheel",
-}
+#: What columns of a table are that are no signal of the estimator's, for files that can say so.
+_COMMENTS = {"reasons": "why not to trust the row, joined by '; '", "corner": "wheel"}
 _UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
+#: Signals that no column is of.
+_NOT_WRITTEN = ("stiffness_force_sigma_N", "torque_force_sigma_N", "contact_angle_sigma_rad", "reasons")
 
 
 def ending_of(path: Path) -> str:
@@ -49,29 +35,14 @@ def ending_of(path: Path) -> str:
 
 def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of the command-line contract, from ESTIMATE rows."""
-    e = estimates
-    columns: dict[str, np.ndarray] = {
-        "time_s": time_s,
-        "corner": np.array(CORNERS)[e["corner"]],
-        "clamp_force_N": e["force"],
-        "clamp_force_sigma_N": e["sigma"],
-        "stiffness_force_N": e["stiffness_force"],
-        "torque_force_N": e["torque_force"],
-        "ml_force_N": e["ml_force"],
-        "contact_angle_rad": e["contact_angle"],
-        "stiffness_factor": e["stiffness_factor"],
-        "inner_surface_C": e["surface"][:, 0],
-        "inner_mean_C": e["mean"][:, 0],
-        "outer_surface_C": e["surface"][:, 1],
-        "outer_mean_C": e["mean"][:, 1],
-    }
-    for side, name in enumerate(("inner", "outer")):
-        for index, depth in enumerate((2, 4, 6, 8)):
-            columns[f"{name}_{depth}mm_C"] = e["depth"][:, side, index]
-    columns["disc_C"] = e["disc"]
-    columns["mode"] = np.array(MODES)[e["mode"]]
-    columns["source"] = np.array([SOURCES.get(code, "") for code in range(16)])[e["source"]]
-    raised, codes = np.unique(e["reasons"], return_inverse=True)
+    columns: dict[str, np.ndarray] = {"time_s": time_s, "corner": np.array(CORNERS)[estimates["corner"]]}
+    for signal in OUTPUTS:
+        if signal.name not in _NOT_WRITTEN:
+            name, *indices = re.findall(r"\w+", signal.field)
+            columns[signal.name] = estimates[name][:, *map(int, indices)]
+    columns["mode"] = np.array(MODES)[columns["mode"]]
+    columns["source"] = np.array([SOURCES.get(code, "") for code in range(16)])[columns["source"]]
+    raised, codes = np.unique(estimates["reasons"], return_inverse=True)
     columns["reasons"] = np.array(["; ".join(reason_words(value)) for value in raised])[codes]
     return columns
 
@@ -108,15 +79,9 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 
 def _unit_and_comment(name: str) -> tuple[str, str]:
-    stem, _, last = name.rpartition("_")
-    unit = _UNITS.get(last, "")
-    quantity = stem if unit else name
-    if quantity.removesuffix("_ref").endswith("mm"):
-        side, depth = quantity.removesuffix("_ref").split("_")
-        by = ", reference instrument of the rig" if quantity.endswith("_ref") else ""
-        return unit, f"{side} pad, {depth[:-2]} mm below the friction surface{by}"
-    pad = f"{quantity.split('_')[0]} pad, " if quantity.startswith(("inner_", "outer_")) else ""
-    return unit, pad + _COMMENTS.get(quantity, _COMMENTS.get(quantity.rpartition("_")[2], ""))
+    signal = next((signal for signal in OUTPUTS if signal.name == name), None)
+    comment = "reference instrument of the rig" if "_ref_" in name else _COMMENTS.get(name) or (signal and signal.meaning)
+    return _UNITS.get(name.rpartition("_")[2], ""), comment or ""
 
 
 def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
