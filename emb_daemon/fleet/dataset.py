@@ -141,8 +141,8 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
 
 
 def ingested(root: Path) -> list[dict]:
-    """What became of each log file: ``source``, ``size``, ``mtime_ns``, ``sha256``, ``notes``, ``fault`` (empty if it is good)
-    and its ``drives``."""
+    """What became of each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged one, its path's), ``notes``,
+    ``fault`` (empty if it is good) and its ``drives``."""
     return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
 
 

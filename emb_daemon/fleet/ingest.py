@@ -5,18 +5,18 @@ import datetime
 import hashlib
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.fleet.dataset import DIGEST, About, Drive, forget, ingested, note, write_drive
-from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_file, read_frames
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_with_digest
 from emb_daemon.offline import corner_index
-from emb_daemon.offline.log import CAPACITY, collect, make_log
+from emb_daemon.offline.log import make_log, samples_in
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.replay import corners_in
 from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, WHEEL_SPEED
@@ -84,11 +84,18 @@ def log_files(paths: Iterable[Path]) -> list[Path]:
 
 def give_up(root: Path, job: Job, reason: str) -> dict:
     """Note a file that took its workers along."""
+    known = _nothing_of(job) | {"fault": f"{job.path}: {reason}"}
+    note(root, known)
+    return known
+
+
+def _nothing_of(job: Job) -> dict:
+    """What is known of a file before it is read, see `dataset.ingested`: no content names it yet, its path does."""
     size, mtime_ns = _stamp(job.path)
     digest = hashlib.sha256(str(job.path).encode()).hexdigest()
-    known = {"source": str(job.path), "size": size, "mtime_ns": mtime_ns, "sha256": digest, "notes": "", "drives": []}
-    note(root, known | {"fault": f"{job.path}: {reason}"})
-    return known | {"fault": f"{job.path}: {reason}"}
+    return {
+        "source": str(job.path), "size": size, "mtime_ns": mtime_ns, "sha256": digest, "notes": "", "fault": "", "drives": [],
+    }  # fmt: skip
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -101,20 +108,16 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 def ingest(root: Path, job: Job) -> dict:
     """One log file; returns what became of it, see `dataset.ingested`."""
-    size, mtime_ns = _stamp(job.path)
-    known = {"source": str(job.path), "size": size, "mtime_ns": mtime_ns, "sha256": "", "notes": "", "fault": "", "drives": []}
-    words = io.StringIO()
+    known, words = _nothing_of(job), io.StringIO()
     try:
         with contextlib.redirect_stderr(words):
-            known["sha256"] = hashlib.sha256(read_file(job.path)).hexdigest()
-            frames = _reader(job.mapping)(job.path)
+            read = Mapping(job.mapping).read_with_digest if job.mapping else read_with_digest
+            frames, digest = read(job.path)
         notes = words.getvalue().strip()
-        found = ingest_frames(root, frames, job.unit, known["sha256"][:DIGEST], str(job.path), notes, job.day)
-        known |= {"notes": notes, "drives": [asdict(drive) for drive in found]}
+        found = ingest_frames(root, frames, job.unit, digest[:DIGEST], str(job.path), notes, job.day)
+        known |= {"sha256": digest, "notes": notes, "drives": [asdict(drive) for drive in found]}
     except (InputError, MemoryError) as error:
-        # A file that cannot even be read has no content to be named by.
-        digest = known["sha256"] or hashlib.sha256(str(job.path).encode()).hexdigest()
-        known |= {"sha256": digest, "fault": str(error) or "more than this machine's memory"}
+        known["fault"] = str(error) or "more than this machine's memory"
     if job.earlier and job.earlier["sha256"] != known["sha256"]:
         forget(root, job.earlier)
     note(root, known)
@@ -130,10 +133,8 @@ def ingest_frames(
         InputError: no resolver sample of any corner.
     """
     corners = corners_in(frames, Path(source))
-    pipeline = Pipeline(np.zeros(4, PARAMETERS), corners, capacity=CAPACITY)
     begin_ns = int(frames["time_ns"][0])
-    pipeline.begin(begin_ns)
-    samples = collect(frames, pipeline)
+    samples, pipeline = samples_in(frames, corners)
     day = day or datetime.datetime.fromtimestamp(1e-9 * begin_ns, datetime.UTC).date().isoformat()
     result = []
     for corner in corners:
@@ -150,14 +151,6 @@ def _refused(pipeline: Pipeline, index: int) -> dict[str, int]:
     own = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
     counts = own + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)
     return {VERDICTS[verdict]: int(counts[verdict]) for verdict in range(BAD_LENGTH, len(VERDICTS)) if counts[verdict]}
-
-
-def _reader(mapping: Path | None) -> Callable:
-    if mapping is None:
-        return read_frames
-    from emb_daemon.logs.mapping import Mapping
-
-    return Mapping(mapping).read
 
 
 assert CORNER_MESSAGES * len(CORNERS) == WHEEL_SPEED

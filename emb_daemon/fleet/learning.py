@@ -15,11 +15,10 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, moved, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.records import PARAMETERS, new_state
 from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
 from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
 from emb_daemon.offline import estimate
-from emb_daemon.pipeline import Pipeline
 
 #: Standard deviations between units that bounds of adaptation leave room for: one unit in 16 000 of a normal population.
 _WIDTH = 4.0
@@ -49,11 +48,10 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
         for drive in drives:
             log, _ = read_drive(root, drive)
             adaptation = Adaptation({corner: calibration}, memory, int)
-            pipeline = Pipeline(
-                np.full(4, to_parameters(calibration), PARAMETERS), (corner,), capacity=1, adaptation=adaptation
-            )
+            parameters = np.full(4, to_parameters(calibration), PARAMETERS)
+            adaptation.restore(parameters)
             before = memory.read(corner)
-            estimate(log.samples, pipeline.parameters, pipeline.states, adaptation)
+            estimate(log.samples, parameters, new_state(4), adaptation)
             after = memory.read(corner)
             if after and after != before:
                 # A file that is full drops its oldest entry for a new one.

@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.fleet.dataset import Drive, read_drive
 from emb_daemon.fleet.ingest import Job, ingest
 from emb_daemon.fleet.scores import Questions
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
 from emb_daemon.offline import estimate
-from emb_daemon.offline.log import CAPACITY, collect
-from emb_daemon.pipeline import Pipeline
+from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
 
 #: Each stage is run so often; the fastest counts, what else the machine does is none of the stage's.
@@ -43,12 +39,7 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
     corner = corners_in(frames, path)[0]
     parameters = to_parameters(calibration)
 
-    def samples_of() -> np.ndarray:
-        pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
-        pipeline.begin(int(frames["time_ns"][0]))
-        return collect(frames, pipeline)
-
-    samples = samples_of()
+    samples, _ = samples_in(frames, (corner,))
     seconds = 1e-9 * float(frames["time_ns"][-1] - frames["time_ns"][0])
     with tempfile.TemporaryDirectory() as folder:
         root, questions = Path(folder), Questions(calibration)
@@ -58,7 +49,7 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
             text = unpack_gzip(path, raw)
             work["parse"] = lambda: parse_candump(text)
         work |= {
-            "check and decode": samples_of,
+            "check and decode": lambda: samples_in(frames, (corner,)),
             "estimate": lambda: estimate(samples, parameters),
             "read columns": lambda: read_drive(root, drive),
             "ask for all causes": lambda: questions.ask(read_drive(root, drive)[0], drive),

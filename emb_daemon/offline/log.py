@@ -83,9 +83,14 @@ def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) 
     Raises:
         InputError: no resolver sample of that corner in it.
     """
-    pipeline = Pipeline(np.zeros(4, PARAMETERS), (corner,), capacity=CAPACITY)
+    return make_log(samples_in(frames, (corner,))[0], frames, corner, path)
+
+
+def samples_in(frames: np.ndarray, corners: tuple[str, ...]) -> tuple[np.ndarray, Pipeline]:
+    """SAMPLE rows of corners in frames, and the pipeline that found them."""
+    pipeline = Pipeline(np.zeros(4, PARAMETERS), corners, capacity=CAPACITY)
     pipeline.begin(int(frames["time_ns"][0]))
-    return make_log(collect(frames, pipeline), frames, corner, path)
+    return collect(frames, pipeline), pipeline
 
 
 def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
