@@ -1,16 +1,18 @@
 """What the demonstration remembers: the car's truth, and the daemon's broadcasts as they came from the bus."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
 
 from emb_daemon.logs.columns import Decoder
+from emb_daemon.monitor.listener import Listener
 from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
-from emb_daemon.wire.contract import INVALID, STATUS_DEGRADED, STATUS_NOT_AVAILABLE
+from emb_daemon.wire.contract import INVALID, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, PAD_TEMP, default_layout
+from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, PAD_TEMP, default_layout
 
 #: An answer that is this late belongs to a later sample with the same counter.
 _LATEST_CYCLES = COUNTER_MODULO - 1
@@ -58,11 +60,9 @@ class Recorder:
         #: Cycles that the car had sent when a frame came.
         self.frame_cycle = np.zeros(len(self.frames), np.int64)
         self.count = 0
-        layout = default_layout()[0]
-        self._ids = layout["sent_id"]
-        self._signals = layout["sent"].tolist()
-        #: Payload of each of the daemon's messages as last heard, by CAN id.
-        self.latest: dict[int, int] = {}
+        self._ids = default_layout()[0]["sent_id"]
+        #: What the live view knows of the frames, and how many of them.
+        self._listener, self._listened = Listener(), 0
 
     def sent(self, time_ns: int, truth: np.ndarray) -> None:
         """A cycle of the car has left at ``time_ns``, or was lost if that is 0."""
@@ -76,26 +76,14 @@ class Recorder:
         self.frames[self.count : self.count + room] = frames[:room]
         self.frame_cycle[self.count : self.count + room] = self.cycles
         self.count += room
-        for can_id, data in zip(frames["can_id"].tolist(), frames["data"].tolist(), strict=True):
-            self.latest[can_id] = data
 
-    def value(self, kind: int, row: int, column: int) -> float:
-        """An unsigned signal of the daemon's message ``kind`` for the corner in ``row`` as last heard, NaN before."""
-        corner = CORNERS.index(self.corners[row])
-        data = self.latest.get(int(self._ids[kind, corner]))
-        if data is None:
-            return np.nan
-        start, length, _signed, factor, offset, *_ = self._signals[kind][column]
-        return (data >> start & (1 << length) - 1) * factor + offset
-
-    def status(self, row: int) -> int:
-        """Status of the clamp force as last heard, not available before."""
-        data = self.latest.get(int(self._ids[CLAMP_FORCE, CORNERS.index(self.corners[row])]))
-        return STATUS_NOT_AVAILABLE if data is None else int(status_of(np.uint64(data)))
-
-    def progress(self, row: int) -> float:
-        """Progress of adaptation in percent while the daemon asks for training motion, NaN otherwise."""
-        return self.value(ADAPT_REQUEST, row, 1) if self.value(ADAPT_REQUEST, row, 0) == 1.0 else np.nan
+    def states(self) -> list[dict]:
+        """What the broadcasts say now, by corner (`monitor.listener.Corner.state`)."""
+        count = self.count
+        self._listener.hear(self.frames[self._listened : count])
+        self._listened = count
+        now = time.monotonic_ns()
+        return [self._listener.corners[CORNERS.index(corner)].state(now) for corner in self.corners]
 
     def recent_responses(self, row: int) -> np.ndarray:
         """Response times (s) of one corner's estimates of the last two seconds or so."""

@@ -94,7 +94,7 @@ class Session:
             with contextlib.suppress(KeyboardInterrupt):
                 while car.is_alive() and not self._failures:
                     car.join(period_s)
-                    if self.recorder.latest:
+                    if self.recorder.count:
                         show()
         finally:
             self._stop.set()

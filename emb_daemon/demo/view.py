@@ -1,7 +1,5 @@
 """Live view of the demonstration."""
 
-import math
-
 import numpy as np
 from rich.console import Group
 from rich.panel import Panel
@@ -9,9 +7,8 @@ from rich.table import Table
 from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.monitor.view import STATUS_COLOURS
-from emb_daemon.wire.contract import MODES, PARK_RELEASED, SOURCES, STATUSES, reason_words
-from emb_daemon.wire.layout import CLAMP_FORCE, ESTIMATOR_STATUS, PAD_TEMP
+from emb_daemon.monitor.view import STATUS_COLOURS, number
+from emb_daemon.wire.contract import PARK_RELEASED
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
 
@@ -43,9 +40,8 @@ def line(recorder: Recorder, daemon, live) -> str:
     """The view as one line, for output that is no terminal."""
     truth = recorder.truth[recorder.cycles - 1]
     corners = "  ".join(
-        f"{corner} {recorder.value(CLAMP_FORCE, row, 0):6.2f} ± {2.0 * recorder.value(CLAMP_FORCE, row, 1):4.2f} kN"
-        f" (true {1e-3 * truth[row]['force']:6.2f})"
-        for row, corner in enumerate(recorder.corners)
+        f"{corner} {number(state['clamp_force_kN'], 2):>6} ± {_two_sigma(state):>4} kN (true {1e-3 * true['force']:6.2f})"
+        for corner, state, true in zip(recorder.corners, recorder.states(), truth, strict=True)
     )
     time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
     return (
@@ -53,18 +49,20 @@ def line(recorder: Recorder, daemon, live) -> str:
     )
 
 
-def _bar(force_kN: float) -> Text:
-    filled = 0 if math.isnan(force_kN) else round(min(force_kN / _BAR_FULL_KN, 1.0) * _BAR_WIDTH)
+def _two_sigma(state: dict) -> str:
+    sigma_kN = state["clamp_force_sigma_kN"]
+    return number(None if sigma_kN is None else 2.0 * sigma_kN, 2)
+
+
+def _bar(force_kN: float | None) -> Text:
+    filled = round(min(max(force_kN or 0.0, 0.0) / _BAR_FULL_KN, 1.0) * _BAR_WIDTH)
     return Text("█" * filled, style="cyan") + Text("·" * (_BAR_WIDTH - filled), style="dim")
 
 
-def _remark(recorder: Recorder, row: int) -> str:
-    progress, reasons = recorder.progress(row), recorder.value(ESTIMATOR_STATUS, row, 3)
-    if not math.isnan(progress):
-        return f"adapting, {progress:.0f} %"
-    if math.isnan(reasons):
-        return ""
-    return ", ".join(reason_words(reasons))
+def _remark(state: dict) -> str:
+    if state["adaptation"]["request"] == "run":
+        return f"adapting, {state['adaptation']['progress_percent']} %"
+    return ", ".join(state["reasons"])
 
 
 def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
@@ -76,24 +74,20 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
     for heading in ("", "clamp force", "", "± 2σ", "true*", "source", "status", "mode", "surface", "mean", "true*", "remark"):
         justify = "left" if heading in ("", "source", "status", "mode", "remark") else "right"
         table.add_column(heading, justify=justify, no_wrap=True)
-    for row, corner in enumerate(recorder.corners):
-        force = recorder.value(CLAMP_FORCE, row, 0)
-        source, mode = recorder.value(CLAMP_FORCE, row, 3), recorder.value(ESTIMATOR_STATUS, row, 0)
-        status = recorder.status(row)
-        true = truth[row]
+    for corner, state, true in zip(recorder.corners, recorder.states(), truth, strict=True):
         table.add_row(
             Text(corner, style="bold"),
-            f"{force:.2f} kN",
-            _bar(force),
-            f"{2.0 * recorder.value(CLAMP_FORCE, row, 1):.2f}",
+            f"{number(state['clamp_force_kN'], 2)} kN",
+            _bar(state["clamp_force_kN"]),
+            _two_sigma(state),
             Text(f"{1e-3 * true['force']:.2f}", style="dim"),
-            "" if math.isnan(source) else SOURCES.get(int(source), "?"),
-            Text(word := STATUSES.get(status, "?"), style=STATUS_COLOURS.get(word, "red")),
-            "" if math.isnan(mode) else MODES[int(mode)],
-            f"{recorder.value(PAD_TEMP, row, 0):.0f} °C",
-            f"{recorder.value(PAD_TEMP, row, 1):.0f} °C",
+            state["source"] or "",
+            Text(state["status"], style=STATUS_COLOURS.get(state["status"], "red")),
+            state["mode"] or "",
+            f"{number(state['inner_surface_C'], 0)} °C",
+            f"{number(state['inner_mean_C'], 0)} °C",
             Text(f"{true['mean'][0]:.0f}", style="dim"),
-            _remark(recorder, row),
+            _remark(state),
         )
     time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
     head = Text(f"{time:5.1f} of {seconds:.0f} s   {phase(truth[0])}   {truth[0]['vehicle_speed']:.1f} m/s", style="bold")

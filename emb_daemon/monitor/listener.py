@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -169,7 +170,8 @@ class Listener:
         self._place = {int(layout["sent_id"][kind, row]): (kind, row) for kind in range(4) for row in range(len(CORNERS))}
         self._signals = [layout["sent"][kind, : layout["sent_count"][kind]].tolist() for kind in range(4)]
         # Loading compiled code takes long enough for a socket's buffer to overflow.
-        crc(0, np.uint64(0))
+        for compiled in (counter_of, status_of, partial(crc, 0)):
+            compiled(np.uint64(0))
         self.reset()
 
     @property

@@ -31,7 +31,7 @@ def sparkline(values: list[float], width: int, full: float) -> str:
     return text
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
     return _MISSING if value is None else f"{value:.{digits}f}"
 
 
@@ -68,8 +68,8 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     silent = corner.silent_s(now_ns)
 
     first = Text(f"{corner.name} ", style="bold")
-    first.append(f"{_number(state['clamp_force_kN'], 2):>6} kN", style="bold")
-    first.append(f" ± {_number(state['clamp_force_sigma_kN'], 2):<5}")
+    first.append(f"{number(state['clamp_force_kN'], 2):>6} kN", style="bold")
+    first.append(f" ± {number(state['clamp_force_sigma_kN'], 2):<5}")
     first.append(f"{state['source'] or '':<10}")
     mode = state["mode"] or ""
     first.append(f"{mode:<9}", style=_MODE_COLOURS.get(mode, ""))
@@ -83,8 +83,8 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
 
     second = Text("   ")
     for name, surface, mean in (("inner", "inner_surface_C", "inner_mean_C"), ("outer", "outer_surface_C", "outer_mean_C")):
-        second.append(f"{name} pad {_number(state[surface], 0):>3}/{_number(state[mean], 0):>3} °C  ")
-    factor, contact = _number(state["stiffness_factor"], 3), _number(state["contact_angle_rad"], 1)
+        second.append(f"{name} pad {number(state[surface], 0):>3}/{number(state[mean], 0):>3} °C  ")
+    factor, contact = number(state["stiffness_factor"], 3), number(state["contact_angle_rad"], 1)
     second.append(f"stiffness {factor}  contact {contact} rad", style="" if corner.streams[PAD_TEMP].usable else "dim")
 
     third = Text("   ")
@@ -137,8 +137,8 @@ def summary(listener: Listener, now_ns: int) -> list[str]:
     lines = []
     for corner in listener.heard:
         state = corner.state(now_ns)
-        force, sigma = _number(state["clamp_force_kN"], 3), _number(state["clamp_force_sigma_kN"], 3)
-        pads = f"pads {_number(state['inner_surface_C'], 0)} and {_number(state['outer_surface_C'], 0)} °C"
+        force, sigma = number(state["clamp_force_kN"], 3), number(state["clamp_force_sigma_kN"], 3)
+        pads = f"pads {number(state['inner_surface_C'], 0)} and {number(state['outer_surface_C'], 0)} °C"
         counts = f"{state['forces_per_s']:.0f}/s, {state['missing']} missing, {state['damaged']} damaged"
         reasons = f"; {', '.join(state['reasons'])}" if state["reasons"] else ""
         lines.append(f"{corner.name} {force} ± {sigma} kN {state['source']}, {state['mode']}, {pads}, {counts}{reasons}")
