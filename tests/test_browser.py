@@ -10,7 +10,8 @@ from browserkit import assert_is_drawn, opened, said_by
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.replay import Replay
-from emb_daemon.report import Page, Panel, Trace, time_figure
+from emb_daemon.report.figures import Panel, Trace, time_figure
+from emb_daemon.report.page import Page
 from emb_daemon.report.replay import replay_page
 from emb_daemon.resources import resource
 

@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.report import FAIL, Cell, Page, Panel, Trace, decimate, time_figure
+from emb_daemon.report.figures import Panel, Trace, decimate, time_figure
+from emb_daemon.report.page import FAIL, Cell, Page
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(10, 4000))

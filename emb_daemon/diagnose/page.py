@@ -7,7 +7,8 @@ from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
-from emb_daemon.report import ACCENT, MARKS, MODEL, PALE, Page, Panel, Trace, xy_figure
+from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, xy_figure
+from emb_daemon.report.page import Page
 
 _BINS = 40
 #: Fewest residuals that are worth a picture, and dependences listed.

@@ -12,7 +12,8 @@ from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.score import PATHS, force_figures
-from emb_daemon.report import BAND, MODEL, PALE, REFERENCE, Page, Panel, Trace, time_figure
+from emb_daemon.report.figures import BAND, MODEL, PALE, REFERENCE, Panel, Trace, time_figure
+from emb_daemon.report.page import Page
 
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 _NEED_INTEGRATED = "training and braking heat at full frame rate"

@@ -4,7 +4,7 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.identify import judge
 from emb_daemon.identify.run import Identification
 from emb_daemon.identify.steps import attribution, noise, stiffness, thermal, thickness, torque
-from emb_daemon.report import Page
+from emb_daemon.report.page import Page
 
 
 def build(result: Identification) -> Page:

@@ -24,7 +24,7 @@ from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS
 from emb_daemon.offline import Log
-from emb_daemon.report import Page
+from emb_daemon.report.page import Page
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ import numpy as np
 
 from emb_daemon.identify.campaign import DiscNominal
 from emb_daemon.identify.recording import Recording
-from emb_daemon.report import MARKS, MODEL, Panel, Section, Trace, xy_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import MARKS, MODEL, Panel, Style, Trace, xy_figure
+from emb_daemon.report.page import Section
 
 #: Density of grey cast iron (EN-GJL-250), kg/m^3, for the disc's volume.
 _CAST_IRON = 7200.0

@@ -11,8 +11,8 @@ from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.text import rounded
 from emb_daemon.offline.fit import left_out_covariance
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import Panel, Section, Trace, xy_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import Panel, Style, Trace, xy_figure
+from emb_daemon.report.page import Section
 
 #: Rows with less force or speed say more of the sensors' noise than of friction.
 _LEAST_FORCE_N = 500.0

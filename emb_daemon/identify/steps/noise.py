@@ -26,7 +26,7 @@ from emb_daemon.jit import njit
 from emb_daemon.offline import Log
 from emb_daemon.offline.levels import force_error_levels, integral_time
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import Page
+from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Resolver movement that still counts as standing, rad.

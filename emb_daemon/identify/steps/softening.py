@@ -15,8 +15,8 @@ from emb_daemon.offline import Log
 from emb_daemon.offline.fit import left_out_covariance
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import MODEL, Panel, Section, Trace, xy_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import MODEL, Panel, Style, Trace, xy_figure
+from emb_daemon.report.page import Section
 
 #: A burst is full-rate motor frames for at least this long, over at least this range of force.
 _SLOWEST_SAMPLE_S = 0.02

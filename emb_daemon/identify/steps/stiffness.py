@@ -24,8 +24,8 @@ from emb_daemon.identify.dynamics import (
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import Page, Panel, Section, Trace, shades, xy_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import Panel, Style, Trace, shades, xy_figure
+from emb_daemon.report.page import Page, Section
 
 #: Relaxation of an ordinary brake, s, and as much its standard deviation where no log shows it: between pads whose force
 #: follows at once and those that need the time of a hard application.

@@ -18,8 +18,8 @@ from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
 from emb_daemon.identify.text import rounded, with_sigma
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import MODEL, PALE, Page, Panel, Trace, shades, time_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import MODEL, PALE, Panel, Style, Trace, shades, time_figure
+from emb_daemon.report.page import Page
 
 #: Pads are not known better than their thermocouples, K.
 _LEAST_SIGMA_K = 0.3

@@ -10,8 +10,8 @@ from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, SLOW, Campaign
 from emb_daemon.identify.dynamics import TERMS, CurveFit, Pads, powers
 from emb_daemon.identify.steps import Step
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import Page, Panel, Trace, shades, xy_figure
-from emb_daemon.report.figures import Style
+from emb_daemon.report.figures import Panel, Style, Trace, shades, xy_figure
+from emb_daemon.report.page import Page
 
 _NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
 

@@ -26,7 +26,8 @@ from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.run import run_paths
 from emb_daemon.offline.score import rmse
-from emb_daemon.report import MODEL, REFERENCE, Page, Panel, Trace, time_figure
+from emb_daemon.report.figures import MODEL, REFERENCE, Panel, Trace, time_figure
+from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Parameters in the order of every covariance, with their least value that is physical.
