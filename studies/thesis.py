@@ -23,7 +23,6 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import Campaign, Datasheet, load_campaign
 from emb_daemon.identify.dynamics import EPISODE, RELAXATION, TERMS, Pads, clearance_guess, curve_keys, powers, simulate
-from emb_daemon.identify.judge import Judged, at_thickness, judge
 from emb_daemon.identify.recording import Recording, recording
 from emb_daemon.identify.run import Identification, identify
 from emb_daemon.identify.steps import noise
@@ -31,6 +30,7 @@ from emb_daemon.identify.steps.heat import thermal_parameters
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.softening import cold_bursts
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, TorqueStep, Unexplained
+from emb_daemon.identify.validation import Validation, at_thickness, validate
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.score import rmse
@@ -189,7 +189,7 @@ class Thesis:
         found = regress_torque([log for pads in others for log in pads.logs], self.sheet)
         stiffness = form.values(self.plain) | {RELAXATION: damping}
         errors: list[Errors] = []
-        for log in fold.judged:
+        for log in fold.held_out:
             known = np.isfinite(log.force_N)
             force = simulate(log, moved(self.plain, stiffness), form.thickness_mm, form.clearance)
             errors.append(((force - log.force_N)[known], log.force_N[known]))
@@ -197,10 +197,10 @@ class Thesis:
         return Fold(
             values=stiffness | here | found.physical(),
             pads=fold.pads,
-            judged=fold.judged,
+            held_out=fold.held_out,
             torque=found,
             errors=errors,
-            unexplained=[unexplained(log, found, self.sheet.actuator.gear_gain_m_per_rad) for log in fold.judged],
+            unexplained=[unexplained(log, found, self.sheet.actuator.gear_gain_m_per_rad) for log in fold.held_out],
         )
 
     def _noise(self, folds: list[Fold], thickness_mm: float):
@@ -220,22 +220,22 @@ class Thesis:
         others = [other for other in self.folds if other is not fold] or [fold]
         return moved(self.plain, self._noise(others, self.result.campaign.pad_thickness_mm).values | fold.values)
 
-    def judge(self) -> dict[str, Judged]:
+    def validate(self) -> dict[str, Validation]:
         """By name, the same logs as ours."""
         whole, gears = self.calibration(), dict(self.torque_step.gears)
-        ours = {one.name: one for one in self.result.judged}
+        ours = {one.name: one for one in self.result.validations}
         found = {}
         for fold in self.folds:
-            for log in fold.judged:
+            for log in fold.held_out:
                 name = f"random, {fold.pads.thickness_mm:g} mm"
-                found[name] = judge(name, "random", log, self.of_fold(fold))
+                found[name] = validate(name, "random", log, self.of_fold(fold))
         worn = {Path(entry.judge or "").name: entry.training for entry in self.result.campaign.file.gear_wear}
         for name, one in ours.items():
             if name not in found:
                 there = at_thickness(whole, self.result.thickness, one.calibration.pad_thickness_mm)
                 if one.kind == "gear":
                     there = moved(there, gears[worn[one.log.path.name]].friction())
-                found[name] = judge(name, one.kind, one.log, there)
+                found[name] = validate(name, one.kind, one.log, there)
         return found
 
 
@@ -344,7 +344,7 @@ def _span(values: list[float]) -> str:
     return ends[0] if len(set(ends)) == 1 else " – ".join(ends)
 
 
-def force_lines(ours: list[Judged], thesis: dict[str, Judged]) -> list[Line]:
+def force_lines(ours: list[Validation], thesis: dict[str, Validation]) -> list[Line]:
     """Forces, kN RMSE over every sample of logs that fitted nothing."""
     lines = []
 
@@ -431,8 +431,8 @@ def frequency_lines(result: Identification) -> list[str]:
 def compare(campaign: Campaign) -> tuple[list[Line], list[str]]:
     """(table, frequency response in lines)."""
     result = identify(campaign)
-    thesis = Thesis(result).judge()
-    return [*force_lines(result.judged, thesis), *thermal_lines(result)], frequency_lines(result)
+    thesis = Thesis(result).validate()
+    return [*force_lines(result.validations, thesis), *thermal_lines(result)], frequency_lines(result)
 
 
 def main() -> None:

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             build(result).write(arguments.report / "report.html")
     except OSError as error:
         raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
-    _print(result.judged, result.thermal.figures)
+    _print(result.validations, result.thermal.figures)
     print(words(result.attribution))
     missing = [fault for fault in campaign.faults if not fault.startswith("thermal")]
     also = f", without what {len(missing)} lines above say (exit status {INCOMPLETE})" if missing else ""
@@ -79,10 +79,10 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         raise InputError(f"{arguments.report}: is a file, expected a folder for the report")
 
 
-def _print(judged: list, temperatures: dict[str, float]) -> None:
-    from emb_daemon.identify.judge import COLUMNS, rows
+def _print(validations: list, temperatures: dict[str, float]) -> None:
+    from emb_daemon.identify.validation import COLUMNS, rows
 
-    lines = [["RMSE on logs that fitted nothing", *COLUMNS[1:]], *rows(judged)] if judged else []
+    lines = [["RMSE on logs that fitted nothing", *COLUMNS[1:]], *rows(validations)] if validations else []
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for name, *cells in lines:
         print("  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in zip(cells, widths[1:], strict=True))]))

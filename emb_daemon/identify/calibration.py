@@ -9,10 +9,10 @@ from emb_daemon.calibration.parameters import keys, moved, value_of
 from emb_daemon.calibration.types import Calibration, Contact, Curve, Friction, Motor, Noise, Provenance, Source, Stiffness
 from emb_daemon.identify.campaign import Campaign, Datasheet
 from emb_daemon.identify.dynamics import TERMS
-from emb_daemon.identify.judge import Judged
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.heat import nominal_thermal
 from emb_daemon.identify.text import rounded
+from emb_daemon.identify.validation import Validation
 from emb_daemon.offline.score import PATHS
 
 
@@ -62,13 +62,13 @@ def tidy(calibration: Calibration) -> Calibration:
 
 
 def provenance(
-    campaign: Campaign, steps: tuple[Step, ...], judged: list[Judged], temperatures: dict[str, float]
+    campaign: Campaign, steps: tuple[Step, ...], validations: list[Validation], temperatures: dict[str, float]
 ) -> Provenance:
     """Date (``SOURCE_DATE_EPOCH`` if it is set), logs, error figures and standard deviations."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     now = datetime.datetime.fromtimestamp(int(epoch), datetime.UTC) if epoch else datetime.datetime.now(datetime.UTC)
     figures = {}
-    for one in judged:
+    for one in validations:
         for path in PATHS:
             figures[f"{one.name}: {path} rmse_N"] = one.rmse_N(path)
         figures[f"{one.name}: inside_two_sigma"] = one.figures["inside_two_sigma"]

@@ -1,7 +1,7 @@
 """The report of an identification: what it is worth on logs that fitted nothing, then every step with its evidence."""
 
 from emb_daemon.calibration.files import calibration_hash
-from emb_daemon.identify import judge
+from emb_daemon.identify import validation
 from emb_daemon.identify.run import Identification
 from emb_daemon.identify.steps import attribution, noise, stiffness, thermal, thickness, torque
 from emb_daemon.report.page import Page
@@ -17,7 +17,7 @@ def build(result: Identification) -> Page:
         f"{provenance.tool} · calibration {calibration_hash(calibration)} · {result.seconds:.0f} s",
     )
     _summary(page, result)
-    judge.section(page, result.judged)
+    validation.section(page, result.validations)
     stiffness.section(page, result.stiffness)
     thickness.section(page, result.thickness, campaign.pad_thickness_mm)
     torque.section(page, result.torque)
@@ -29,7 +29,7 @@ def build(result: Identification) -> Page:
 
 
 def _summary(page: Page, result: Identification) -> None:
-    errors = [one.rmse_N() for one in result.judged]
+    errors = [one.rmse_N() for one in result.validations]
     headline = "Nothing could be judged"
     if errors:
         headline = f"Fused force {min(errors):.0f} to {max(errors):.0f} N RMSE on {len(errors)} logs that fitted nothing"

@@ -10,9 +10,9 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.judge import Judged, judge, judge_others
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
+from emb_daemon.identify.validation import Validation, validate, validate_others
 
 Progress = Callable[[float, str], None]
 
@@ -30,7 +30,7 @@ class Identification:
     noise: Step
     thermal: thermal.ThermalStep
     attribution: attribution.AttributionStep
-    judged: list[Judged]
+    validations: list[Validation]
     calibration: Calibration
     seconds: float
 
@@ -72,20 +72,20 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     heat = thermal.identify(campaign, known)
     known = moved(known, heat.values)
     found = attribution.identify(stiff, heat.hot, known, lambda text, share: progress(0.7 + 0.2 * share, text))
-    progress(0.9, "judging")
+    progress(0.9, "validating")
     folds = [fold.under(found.without(fold)) for fold in folds]
     levels = noise.identify(campaign, stiff, motor, folds, interpolation, found.hot)
     calibration = tidy(moved(found.calibration, levels.values))
-    heat = thermal.judged(campaign, heat, calibration)
-    judged = []
+    heat = thermal.validate(campaign, heat, calibration)
+    validations = []
     for fold in folds:
         others = [other for other in folds if other is not fold] or [fold]
         mine = noise.identify(campaign, stiff, motor, others, interpolation)
         there = moved(found.without(fold), mine.values)
-        judged += [judge(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.judged]
-    judged += judge_others(campaign, calibration, thick, motor)
+        validations += [validate(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.held_out]
+    validations += validate_others(campaign, calibration, thick, motor)
     steps = (stiff, motor, heat, found)
-    calibration = replace(calibration, provenance=provenance(campaign, steps, judged, heat.figures))
+    calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat.figures))
     progress(1.0, "done")
     seconds = time.monotonic() - begin
-    return Identification(campaign, stiff, motor, zero, folds, thick, levels, heat, found, judged, calibration, seconds)
+    return Identification(campaign, stiff, motor, zero, folds, thick, levels, heat, found, validations, calibration, seconds)

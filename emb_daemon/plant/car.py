@@ -48,7 +48,7 @@ REFERENCE_WIRES = np.dtype([("signal", SIGNAL, (3, 4)), ("id", "i8", (3, 4))], a
 
 class World(NamedTuple):
     """The car and what it sends with: CAR, shape (1,), records by corner, which corners they are, LAYOUT and REFERENCE_WIRES,
-    shape (1,), CAN ids by slot, and the source of all noise."""
+    shape (1,), CAN ids by slot. The source of noise stands beside: with it numba would take ms to recognise the tuple."""
 
     car: np.ndarray
     plants: np.ndarray
@@ -58,7 +58,6 @@ class World(NamedTuple):
     wires: np.ndarray
     reference: np.ndarray
     ids: np.ndarray
-    rng: np.random.Generator
 
 
 def _reference_wires() -> np.ndarray:
@@ -146,19 +145,19 @@ def _put(frames, count, time_ns, can_id, data):
 
 
 @njit
-def _say(w, slot, payload, frames, count, due_ns, least_late):
+def _say(w, rng, slot, payload, frames, count, due_ns, least_late):
     """A protected message of the car, which leaves later than ``due_ns`` by ``least_late`` to one more of the jitter."""
     car, can_id = w.car[0], w.ids[slot]
-    sent = due_ns + np.int64(1e9 * car.jitter * (least_late + w.rng.random()))
+    sent = due_ns + np.int64(1e9 * car.jitter * (least_late + rng.random()))
     counter = car.counter[slot]
     car.counter[slot] = (counter + 1) % COUNTER_MODULO
     return _put(frames, count, sent, can_id, protect(can_id, payload, counter, 0))
 
 
 @njit
-def _fast_frames(w, row, frames, count):
+def _fast_frames(w, rng, row, frames, count):
     """Resolver and current of one sample share their counter."""
-    car, p, s, received, rng = w.car[0], w.plants[row], w.states[row], w.wires[0].received, w.rng
+    car, p, s, received = w.car[0], w.plants[row], w.states[row], w.wires[0].received
     base = wire.CORNER_MESSAGES * w.corners[row]
     noisy = p.released_angle + delayed_angle(p, s) + p.angle_noise * rng.standard_normal()
     # Resolver-to-digital converters have hysteresis, so that a standing motor reads as standing.
@@ -166,19 +165,19 @@ def _fast_frames(w, row, frames, count):
         s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
     speed = s.speed + p.speed_noise * rng.standard_normal()
     payload = pack(s.angle_reading, received[base, 0]) | pack(speed, received[base, 1])
-    count = _say(w, base + wire.RESOLVER, payload, frames, count, car.time_ns, 0.0)
+    count = _say(w, rng, base + wire.RESOLVER, payload, frames, count, car.time_ns, 0.0)
     slot = base + wire.CURRENT
     mean = s.mean_current if p.effects.current_delay.delay_s == 0.0 else delayed_mean_current(p, s)
     current = mean + s.mean_current_error - p.effects.current_offset.offset_A
     payload = pack(current, received[slot, 0]) | pack(0.15 * rng.standard_normal(), received[slot, 1])
     payload |= pack(car.supply_voltage, received[slot, 2])
-    return _say(w, slot, payload, frames, count, car.time_ns, 0.5)
+    return _say(w, rng, slot, payload, frames, count, car.time_ns, 0.5)
 
 
 @njit
-def _slow_frames(w, drive, frames, count, due_ns):
+def _slow_frames(w, rng, drive, frames, count, due_ns):
     """Thermocouples, wheels and, ten times a second, the vehicle's status; sampled at ``due_ns``, within this cycle."""
-    car, received, rng = w.car[0], w.wires[0].received, w.rng
+    car, received = w.car[0], w.wires[0].received
     leaves_ns = due_ns + _AFTER_NS
     for row in range(len(w.corners)):
         p, s = w.plants[row], w.states[row]
@@ -186,7 +185,7 @@ def _slow_frames(w, drive, frames, count, due_ns):
         payload = pack(s.plate_reading[0] + p.temperature_noise * rng.standard_normal(), received[slot, 0])
         payload |= pack(s.plate_reading[1] + p.temperature_noise * rng.standard_normal(), received[slot, 1])
         payload |= pack(s.caliper + p.temperature_noise * rng.standard_normal(), received[slot, 2])
-        count = _say(w, slot, payload, frames, count, leaves_ns, 0.0)
+        count = _say(w, rng, slot, payload, frames, count, leaves_ns, 0.0)
     speeds, pulses = np.uint64(0), np.uint64(0)
     elapsed = 1e-9 * (due_ns - car.time_ns)
     for corner in range(4):
@@ -198,20 +197,20 @@ def _slow_frames(w, drive, frames, count, due_ns):
         angle += elapsed * car.wheel_speed
         pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % PULSE_MODULO
         pulses |= pack(float(pulse), received[wire.WHEEL_PULSE, corner])
-    count = _say(w, wire.WHEEL_SPEED, speeds, frames, count, leaves_ns, 0.0)
-    count = _say(w, wire.WHEEL_PULSE, pulses, frames, count, leaves_ns, 0.0)
+    count = _say(w, rng, wire.WHEEL_SPEED, speeds, frames, count, leaves_ns, 0.0)
+    count = _say(w, rng, wire.WHEEL_PULSE, pulses, frames, count, leaves_ns, 0.0)
     if due_ns % _STATUS_NS == 0:
         signals = received[wire.VEHICLE_STATUS]
         payload = pack(float(drive.park_brake), signals[0]) | pack(float(drive.brake_request), signals[1])
         payload |= pack(drive.ambient, signals[2]) | pack(car.speed, signals[3])
-        count = _say(w, wire.VEHICLE_STATUS, payload, frames, count, leaves_ns, 0.5)
+        count = _say(w, rng, wire.VEHICLE_STATUS, payload, frames, count, leaves_ns, 0.5)
     return count
 
 
 @njit
-def _reference_frames(w, row, frames, count, slow):
+def _reference_frames(w, rng, row, frames, count, slow):
     """What a rig's instruments add; they carry neither counter nor CRC."""
-    car, p, s, rng = w.car[0], w.plants[row], w.states[row], w.rng
+    car, p, s = w.car[0], w.plants[row], w.states[row]
     signal, can_id = w.reference[0].signal, w.reference[0].id[:, w.corners[row]]
     force = s.force + p.force_lead * s.force_rate + p.force_noise * rng.standard_normal()
     torque = s.brake_torque + p.brake_torque_noise * rng.standard_normal()
@@ -271,7 +270,7 @@ def _drive(car, states, drive):
 
 
 @njit
-def _tick(w, commands, drive, frames, truth):
+def _tick(w, rng, commands, drive, frames, truth):
     """Advance everything by one cycle and write its frames in order of time; returns their number."""
     car = w.car[0]
     wheel_speed = _drive(car, w.states, drive)
@@ -282,22 +281,22 @@ def _tick(w, commands, drive, frames, truth):
     for row in range(len(w.corners)):
         p, s, training, corner = w.plants[row], w.states[row], w.trainings[row], w.corners[row]
         mode, target, rate = _train(p, s, training, commands[row], drive, car.speed == 0.0)
-        _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, w.rng)
+        _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, rng)
         _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, training, truth[row])
-        count = _fast_frames(w, row, frames, count)
+        count = _fast_frames(w, rng, row, frames, count)
         if car.reference:
-            count = _reference_frames(w, row, frames, count, slow_reference)
+            count = _reference_frames(w, rng, row, frames, count, slow_reference)
     due = (car.time_ns + _SLOW_NS - 1) // _SLOW_NS * _SLOW_NS
     if due < car.time_ns + CYCLE_NS:
-        count = _slow_frames(w, drive, frames, count, due)
+        count = _slow_frames(w, rng, drive, frames, count, due)
     return count
 
 
 @njit
-def _run(w, commands, drives, frames, truth):
+def _run(w, rng, commands, drives, frames, truth):
     total = 0
     for tick in range(len(drives)):
-        total += _tick(w, commands[tick], drives[tick], frames[total:], truth[tick])
+        total += _tick(w, rng, commands[tick], drives[tick], frames[total:], truth[tick])
     return total
 
 
@@ -363,7 +362,7 @@ class Car:
         self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
         self.trainings = np.zeros(len(plants), TRAINING)
         self.truth = np.zeros(len(plants), TRUTH)
-        rng = np.random.default_rng(seed)
+        self._rng = rng = np.random.default_rng(seed)
         self.motion = np.zeros(1, CAR)
         motion = self.motion[0]
         # A middle-sized car; brakes that are not simulated carry their own quarter.
@@ -383,16 +382,14 @@ class Car:
         for can_id in np.flatnonzero(slots >= 0):
             ids[slots[can_id]] = can_id
         places = np.array([wire.CORNERS.index(corner) for corner in corners])
-        self._world = World(
-            self.motion, self.plants, self.states, self.trainings, places, layout, _reference_wires(), ids, rng
-        )
+        self._world = World(self.motion, self.plants, self.states, self.trainings, places, layout, _reference_wires(), ids)
         self._frames = np.zeros(FRAMES_PER_TICK, FRAME)
 
     def tick(self, commands: np.ndarray, drive: np.void) -> np.ndarray:
         """One 4 ms cycle under COMMAND rows (one per corner) and a DRIVE record.
 
         Returns the cycle's frames in order of time, as a FRAME array valid until the next call."""
-        count = _tick(self._world, commands, drive, self._frames, self.truth)
+        count = _tick(self._world, self._rng, commands, drive, self._frames, self.truth)
         return self._frames[:count]
 
     def run(self, commands: np.ndarray, drives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -401,7 +398,7 @@ class Car:
         Returns (FRAME array, TRUTH array of shape (cycles, corners))."""
         frames = np.zeros(len(drives) * FRAMES_PER_TICK, FRAME)
         truth = np.zeros((len(drives), len(self.corners)), TRUTH)
-        count = _run(self._world, commands, drives, frames, truth)
+        count = _run(self._world, self._rng, commands, drives, frames, truth)
         return frames[:count].copy(), truth
 
     def hear(self, frames: np.ndarray) -> None:

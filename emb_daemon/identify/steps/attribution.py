@@ -54,9 +54,9 @@ class AttributionStep(Step):
             applied |= refitted(selection, "torque", _others(bench, same))
             values = {key: value for key, value in values.items() if key not in KEYS}
         if "stiffness" in map(selection.channel_of, selection.accepted):
-            judged = [any(trial.log is log for log in fold.judged) for trial in bench.trials]
-            applied |= refitted(selection, "stiffness", _others(bench, judged))
-            slow = [value for c, value in applied.items() if c.name == CLEARANCE and same[c.log] and not judged[c.log]]
+            own = [any(trial.log is log for log in fold.held_out) for trial in bench.trials]
+            applied |= refitted(selection, "stiffness", _others(bench, own))
+            slow = [value for c, value in applied.items() if c.name == CLEARANCE and same[c.log] and not own[c.log]]
             fitted = set(by_key(applied, bench.middle))
             values = {key: value for key, value in values.items() if key not in fitted} | {CLEARANCE: float(np.mean(slow))}
         there = with_terms(bench.calibrated(applied), selection)

@@ -23,14 +23,14 @@ class Fold(Step):
     contact of its own slow log.
 
     Attributes:
-        judged: its random logs.
+        held_out: its random logs.
         torque: fit of the torque path to the other thicknesses' logs.
         errors: of the stiffness path on each of them.
         unexplained: of the torque path on each of them.
     """
 
     pads: Pads
-    judged: tuple[Log, ...]
+    held_out: tuple[Log, ...]
     torque: TorqueFit = field(repr=False)
     errors: list[Errors] = field(repr=False)
     unexplained: list[Unexplained] = field(repr=False)
@@ -41,8 +41,8 @@ class Fold(Step):
         clearance = value_of(calibration, CLEARANCE)
         return replace(
             self,
-            errors=[_errors(log, calibration, self.pads, clearance) for log in self.judged],
-            unexplained=[unexplained_current(log, found, calibration) for log in self.judged],
+            errors=[_errors(log, calibration, self.pads, clearance) for log in self.held_out],
+            unexplained=[unexplained_current(log, found, calibration) for log in self.held_out],
         )
 
 
@@ -63,7 +63,7 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
     return Fold(
         values=own.values() | torque.physical() | {"pad_thickness_mm": pads.thickness_mm, CLEARANCE: max(clearance, 0.0)},
         pads=pads,
-        judged=pads.random,
+        held_out=pads.random,
         torque=torque,
         errors=[_errors(log, own.calibration, pads, clearance) for log in pads.random],
         unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],

@@ -52,10 +52,10 @@ class ThermalStep(Step):
     """Thermal section.
 
     Attributes:
-        fitted, unseen: recordings that fitted, and logs that judge, by name.
+        fitted, unseen: recordings that fitted, and logs that validate, by name.
         hot: logs that fitted in which the brake works as in service: force over heat.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-        figures: RMSE on logs that fitted nothing, by name with unit, once `judged`.
+        figures: RMSE on logs that fitted nothing, by name with unit, once `validate`d.
         residuals: the same for what was fitted.
     """
 
@@ -87,7 +87,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         cold: what is known without it: softening is identified with its stiffness path, and pads are judged as in a car by the
             whole estimator, its own clamp force heating them.
     """
-    logs, judged = _logs(campaign)
+    logs, unseen = _logs(campaign)
     recordings = {name: found for name, log in logs.items() if (found := _attempt(campaign, _fitting, log)) is not None}
     if not recordings:
         campaign.fault(
@@ -114,7 +114,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         sigmas=_sigmas(heat, rubbed, softened),
         notes=_notes(heat, law, rubbed, softened),
         fitted=recordings,
-        unseen=judged,
+        unseen=unseen,
         hot=tuple(logs[name] for name in recordings if name == "tune" or name.startswith("integrated")),
         heat=heat,
         law=law,
@@ -123,11 +123,11 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     )
 
 
-def judged(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
+def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
     """The step with what a calibration achieves."""
     if step.heat is None:
         return step
-    temperatures, figures, residuals = _judge(campaign, step.fitted, step.unseen, calibration)
+    temperatures, figures, residuals = _validate(campaign, step.fitted, step.unseen, calibration)
     if step.softening:
         figures |= step.softening.figures()
     if step.friction:
@@ -138,9 +138,9 @@ def judged(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> T
 
 
 def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
-    """Logs that may fit and logs that judge, by name; those of a thermal rig that are not named become faults."""
-    part, fit, judged = campaign.file.thermal, {}, {}
-    for name, into in (("tune", fit), ("heat_flux_map", fit), ("pad_cooling", fit), ("validate", judged)) if part else ():
+    """Logs that may fit and logs that validate, by name; those of a thermal rig that are not named become faults."""
+    part, fit, unseen = campaign.file.thermal, {}, {}
+    for name, into in (("tune", fit), ("heat_flux_map", fit), ("pad_cooling", fit), ("validate", unseen)) if part else ():
         if getattr(part, name) is None:
             campaign.fault(f"thermal.{name}: missing; needed: {_NEEDED[name]}")
         into[name] = campaign.load(getattr(part, name), f"thermal.{name}", _NEEDED[name])
@@ -153,8 +153,8 @@ def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
     for number, pair in enumerate(pairs, 1):
         suffix = f" {number}" if len(pairs) > 1 else ""
         fit[f"integrated fit{suffix}"] = campaign.load(pair.fit, "integrated.fit", _NEEDED["integrated"])
-        judged[f"integrated{suffix}"] = campaign.load(pair.judge, "integrated.judge", _NEEDED["integrated"])
-    return tuple({name: log for name, log in logs.items() if log is not None} for logs in (fit, judged))
+        unseen[f"integrated{suffix}"] = campaign.load(pair.judge, "integrated.judge", _NEEDED["integrated"])
+    return tuple({name: log for name, log in logs.items() if log is not None} for logs in (fit, unseen))
 
 
 def _fitting(log: Log) -> Recording:
@@ -168,12 +168,12 @@ def _errors(parameters: np.ndarray, r: Recording, torque_known: bool = True) -> 
     return simulate(parameters, r, torque_known)[:, :9].T - r.measured
 
 
-def _judge(campaign, recordings, judged: dict[str, Log], calibration: Calibration):
+def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibration):
     """(temperatures to draw, figures on logs that fitted nothing, residuals of those that did)."""
     temperatures, figures, residuals, parameters = {}, {}, {}, thermal_parameters(calibration)
     if "tune" in recordings:
         temperatures["tune"] = _compare("tune", recordings["tune"], parameters, residuals)
-    for name, log in judged.items():
+    for name, log in unseen.items():
         r = _attempt(campaign, recording, log)
         if r is not None:
             temperatures[name] = _compare(name, r, parameters, figures)

@@ -1,4 +1,4 @@
-"""Calibrations judged on logs that fitted nothing, by the estimator as it runs."""
+"""Calibrations validated on logs that fitted nothing, by the estimator as it runs."""
 
 from dataclasses import dataclass, field
 
@@ -20,12 +20,12 @@ _NEED_INTEGRATED = "training and braking heat at full frame rate"
 
 
 @dataclass(frozen=True)
-class Judged:
+class Validation:
     """One log that fitted nothing.
 
     Attributes:
         kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it.
-        calibration: that was judged.
+        calibration: that was run.
         estimates: ESTIMATE rows.
         figures: `offline.score.force_figures`.
         innovation_ratio: mean squared normalised innovation; one where the filter's noise levels fit.
@@ -43,12 +43,12 @@ class Judged:
         return self.figures[path]["rmse"]
 
 
-def judge(name: str, kind: str, log: Log, calibration: Calibration) -> Judged:
+def validate(name: str, kind: str, log: Log, calibration: Calibration) -> Validation:
     """Run the estimator over a log, as the daemon would, and compare."""
     found = estimate(log.samples, to_parameters(calibration))
     ratio = (found["innovation"] / found["innovation_sigma"]) ** 2
     mean = float(np.nanmean(ratio)) if np.isfinite(ratio).any() else np.nan
-    return Judged(name, kind, log, calibration, found, force_figures(log.samples, found, log.force_N), mean)
+    return Validation(name, kind, log, calibration, found, force_figures(log.samples, found, log.force_N), mean)
 
 
 def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_mm: float) -> Calibration:
@@ -59,7 +59,7 @@ def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_m
     return moved(calibration, {"pad_thickness_mm": thickness_mm, "noise.stiffness_relative": relative})
 
 
-def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep, torque: TorqueStep) -> list[Judged]:
+def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep, torque: TorqueStep) -> list[Validation]:
     """Logs of the campaign that no step fitted, each with the curve that its thickness asks for."""
     found = []
 
@@ -67,9 +67,9 @@ def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep
         if log is None:
             return
         try:
-            found.append(judge(name, kind, log, at_thickness(calibration, thickness, campaign.thickness(entry))))
+            found.append(validate(name, kind, log, at_thickness(calibration, thickness, campaign.thickness(entry))))
         except InputError as error:
-            campaign.fault(f"{kind}: {log.path}: {error}; not judged")
+            campaign.fault(f"{kind}: {log.path}: {error}; not validated")
 
     for entry in campaign.file.adaptation:
         log = campaign.load_motion(entry.judge, "adaptation.judge", NEED_RANDOM, reversals=RANDOM)
@@ -87,7 +87,7 @@ def judge_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep
     for pair in campaign.file.integrated:
         log = campaign.load(pair.judge, "integrated.judge", _NEED_INTEGRATED)
         if log is not None:
-            found.append(judge(f"integrated, {_stem(pair.judge)}", "integrated", log, ours))
+            found.append(validate(f"integrated, {_stem(pair.judge)}", "integrated", log, ours))
     return found
 
 
@@ -96,10 +96,10 @@ def _stem(name: str) -> str:
 
 
 #: Columns of `rows`.
-COLUMNS = ("judged on", "stiffness / N", "torque / N", "max. likelihood / N", "fused / N", "fused bias / N", "inside 2 σ / %")
+COLUMNS = ("log", "stiffness / N", "torque / N", "max. likelihood / N", "fused / N", "fused bias / N", "inside 2 σ / %")
 
 
-def rows(judged: list[Judged]) -> list[list[str]]:
+def rows(validations: list[Validation]) -> list[list[str]]:
     """RMSE of each path, bias of the fused force and share inside two sigma, one row per log."""
     return [
         [
@@ -108,29 +108,29 @@ def rows(judged: list[Judged]) -> list[list[str]]:
             f"{one.figures['fused']['bias']:+.0f}",
             f"{100 * one.figures['inside_two_sigma']:.1f}",
         ]
-        for one in judged
+        for one in validations
     ]
 
 
-def section(page: Page, judged: list[Judged]) -> None:
-    """Figures of every judged log, and pictures of those that the estimator meets last."""
+def section(page: Page, validations: list[Validation]) -> None:
+    """Figures of every such log, and pictures of those that the estimator meets last."""
     part = page.section(
         "On logs that fitted nothing",
         "RMSE over every sample. A random log's dynamics and torque path come from the other pads, its curve from its own "
         "slow log; gears have the friction of their own training; everything else is as calibrated. Innovation ratio: mean "
         "squared normalised innovation, one where the noise levels fit.",
     )
-    ratios = [f"{one.innovation_ratio:.2f}" for one in judged]
-    part.table([*COLUMNS, "innovation ratio"], [[*row, ratio] for row, ratio in zip(rows(judged), ratios, strict=True)])
-    random = [one for one in judged if one.kind == "random"]
-    shown = random[len(random) // 2 :][:1] + [one for one in judged if one.kind in ("predicted", "integrated")]
+    ratios = [f"{one.innovation_ratio:.2f}" for one in validations]
+    part.table([*COLUMNS, "innovation ratio"], [[*row, ratio] for row, ratio in zip(rows(validations), ratios, strict=True)])
+    random = [one for one in validations if one.kind == "random"]
+    shown = random[len(random) // 2 :][:1] + [one for one in validations if one.kind in ("predicted", "integrated")]
     for one in shown:
         part.heading(one.name)
         part.figure(_figure(one))
 
 
-def _figure(judged: Judged):
-    log, found = judged.log, judged.estimates
+def _figure(one: Validation):
+    log, found = one.log, one.estimates
     time = log.time_s
     forces = [
         Trace("reference", time, 1e-3 * log.force_N, REFERENCE),
