@@ -28,18 +28,21 @@ _STATE = np.dtype([*((name, WHEEL[name]) for name in WHEEL.names), ("unseen", "f
 
 
 @njit
+def _amplitudes(p):
+    """Cosines and sines in µm, by order."""
+    cosines = p.order_1_cosine_um, p.order_2_cosine_um, p.order_3_cosine_um, p.order_4_cosine_um
+    return cosines, (p.order_1_sine_um, p.order_2_sine_um, p.order_3_sine_um, p.order_4_sine_um)
+
+
+@njit
 def term(p, s, m):
     """Disc thickness in m above its mean, where the pads stand."""
-    if (
-        p.order_1_cosine_um == 0.0
-        and p.order_1_sine_um == 0.0
-        and p.order_2_cosine_um == 0.0
-        and p.order_2_sine_um == 0.0
-        and p.order_3_cosine_um == 0.0
-        and p.order_3_sine_um == 0.0
-        and p.order_4_cosine_um == 0.0
-        and p.order_4_sine_um == 0.0
-    ):
+    cosines, sines = _amplitudes(p)
+    # Twice the mean square of the slope over the angle, µm²/rad².
+    square = 0.0
+    for k in range(ORDERS):
+        square += (k + 1) * (k + 1) * (cosines[k] * cosines[k] + sines[k] * sines[k])
+    if square == 0.0:
         return 0.0
     if m.has_wheel_pulse and s.unseen < _LOST_RAD:
         angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
@@ -53,24 +56,14 @@ def term(p, s, m):
         s.unseen, angle = _LOST_RAD, 0.0
     else:
         return 0.0
-    s.doubt = 0.0
-    if s.unseen > 0.0:
-        square = p.order_1_cosine_um**2 + p.order_1_sine_um**2 + 4.0 * (p.order_2_cosine_um**2 + p.order_2_sine_um**2)
-        square += 9.0 * (p.order_3_cosine_um**2 + p.order_3_sine_um**2)
-        square += 16.0 * (p.order_4_cosine_um**2 + p.order_4_sine_um**2)
-        s.doubt = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
+    s.doubt = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
     if s.unseen > _GUESSED_RAD:
         return 0.0
-    return 1e-6 * (
-        p.order_1_cosine_um * cos(angle)
-        + p.order_1_sine_um * sin(angle)
-        + p.order_2_cosine_um * cos(2.0 * angle)
-        + p.order_2_sine_um * sin(2.0 * angle)
-        + p.order_3_cosine_um * cos(3.0 * angle)
-        + p.order_3_sine_um * sin(3.0 * angle)
-        + p.order_4_cosine_um * cos(4.0 * angle)
-        + p.order_4_sine_um * sin(4.0 * angle)
-    )
+    thickness = 0.0
+    for k in range(ORDERS):
+        thickness += cosines[k] * cos((k + 1) * angle)
+        thickness += sines[k] * sin((k + 1) * angle)
+    return 1e-6 * thickness
 
 
 def _from_anywhere(samples, episode, random):

@@ -100,18 +100,14 @@ def grown(p, s):
     with the disc's temperature, less wear."""
     e = p.effects
     thickness = 1e-6 * e.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
-    variation, turn = e.disc_thickness_variation, s.wheel_angle
     if s.uneven_disc:
-        thickness += 1e-6 * (
-            variation.order_1_cosine_um * cos(turn)
-            + variation.order_1_sine_um * sin(turn)
-            + variation.order_2_cosine_um * cos(2.0 * turn)
-            + variation.order_2_sine_um * sin(2.0 * turn)
-            + variation.order_3_cosine_um * cos(3.0 * turn)
-            + variation.order_3_sine_um * sin(3.0 * turn)
-            + variation.order_4_cosine_um * cos(4.0 * turn)
-            + variation.order_4_sine_um * sin(4.0 * turn)
-        )
+        v, uneven = e.disc_thickness_variation, 0.0
+        cosines = v.order_1_cosine_um, v.order_2_cosine_um, v.order_3_cosine_um, v.order_4_cosine_um
+        sines = v.order_1_sine_um, v.order_2_sine_um, v.order_3_sine_um, v.order_4_sine_um
+        for k in range(4):
+            uneven += cosines[k] * cos((k + 1) * s.wheel_angle)
+            uneven += sines[k] * sin((k + 1) * s.wheel_angle)
+        thickness += 1e-6 * uneven
     return thickness / p.gear_gain
 
 
