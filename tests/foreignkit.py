@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 import emb_daemon
 from emb_daemon.calibration.files import save_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.identify.example import DATASHEET, MAPPING
+from emb_daemon.identify.example import FILES
 
 #: Step of the truth, s; every sampling rate is a whole part of it.
 FINE_S = 0.0005
@@ -49,6 +49,7 @@ BA_ "VFrameFormat" BO_ 2566844162 5;
 """
 
 #: The same of a table of the rig's columns, see `sampled`.
+MAPPING, DATASHEET = ((FILES / name).read_text() for name in ("mapping.yaml", "datasheet.yaml"))
 COLUMNS = re.sub(r"dbc: .*", "time: {signal: time_s}", MAPPING)
 for _signal, _column in (
     ("Drive.Position", "angle_rad, unit: rad"),

@@ -15,6 +15,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.fleet.population import (
     LEAST_UNITS,
     Directions,
+    Outlier,
     Readings,
     Shared,
     Unit,
@@ -274,38 +275,20 @@ class _Study:
             trends=self._trends([*groups][:3], over["day"], readings),
         )
 
-    def _finding(
-        self,
-        where: str,
-        units: int,
-        cause: int,
-        amount: float,
-        sigma: float,
-        chance: float,
-        rivals: Sequence[int],
-        action: Callable[[Cause], str],
-    ) -> Finding:
-        own, size = self.causes[cause], float(self.directions.size_N[cause])
+    def _finding(self, where: str, units: int, one: Shared | Outlier, action: Callable[[Cause], str]) -> Finding:
+        own, size = self.causes[one.cause], float(self.directions.size_N[one.cause])
         return Finding(
-            where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=amount, sigma=sigma, unit=own.unit,
-            size_N=amount * size, sigma_N=sigma * size, chance=chance, action=action(own),
-            rivals=tuple(dict.fromkeys(self.causes[r].name for r in rivals if self.causes[r].name != own.name)),
+            where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=one.amount, sigma=one.sigma,
+            unit=own.unit, size_N=one.amount * size, sigma_N=one.sigma * size, chance=one.chance, action=action(own),
+            rivals=tuple(dict.fromkeys(self.causes[r].name for r in one.rivals if self.causes[r].name != own.name)),
         )  # fmt: skip
 
     def _shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
-        found = [
-            self._finding(s.group, int(self.masks[s.group].sum()), s.cause, s.amount, s.sigma, s.chance, s.rivals, action)
-            for s in shared
-        ]
+        found = [self._finding(one.group, int(self.masks[one.group].sum()), one, action) for one in shared]
         return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
     def _outliers(self, deviations: np.ndarray, readings: Readings, action: Callable[[Cause], str]) -> list[Finding]:
-        found = [
-            self._finding(
-                " ".join(self.keys[o.row]), 1, o.cause, o.amount, abs(o.amount / o.deviation), o.q_value, o.rivals, action
-            )
-            for o in outliers(deviations, readings)
-        ]
+        found = [self._finding(" ".join(self.keys[one.row]), 1, one, action) for one in outliers(deviations, readings)]
         return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
 
     def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
@@ -331,10 +314,8 @@ class _Study:
         amounts, noise = readings.of(level), readings.noise()
         result = []
         for row, cause in enumerate(self.causes):
-            own, size = (
-                random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row]),
-                self.directions.size_N[row],
-            )
+            size = self.directions.size_N[row]
+            own = random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row])
             result.append(
                 Spread(
                     cause=str(cause), key=cause.key, unit=cause.unit, mean=own.mean, mean_sigma=own.sigma, spread=own.spread,
@@ -377,10 +358,8 @@ def _date(time_ns: int) -> str:
 
 def _manoeuvre(cause: Cause) -> str:
     """What makes a cause visible."""
-    effect = next((e for e in REGISTRY if e.name == cause.name), None)
-    return (
-        f"to see it: {effect.manoeuvre}" if effect and effect.manoeuvre else "to see it: slow and fast strokes over all forces"
-    )
+    told = next((effect.manoeuvre for effect in REGISTRY if effect.name == cause.name), "")
+    return f"to see it: {told or 'slow and fast strokes over all forces'}"
 
 
 _ACTIONS: dict[str, Callable[[Cause], str]] = {

@@ -88,21 +88,8 @@ def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndar
     return Unit(values, np.einsum("dia,dib->iab", moves, moves) * drives / max(drives - count, 1))
 
 
-@dataclass(frozen=True)
-class Scatter:
-    """How units differ that nothing sets apart.
-
-    Attributes:
-        mean: shape (q,).
-        covariance: shape (q, q), of one unit.
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
-
-
-def scatter_of(units: np.ndarray, noise: np.ndarray) -> Scatter:
-    """Mean and covariance of most of the rows, shape (N, q), whatever the others are.
+def scatter_of(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How units differ that nothing sets apart: mean (q,) and covariance (q, q) of most rows, (N, q), whatever the others are.
 
     Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
     then once more with all that are not outlying. The covariance is drawn towards ``noise``, that of one row by its own
@@ -121,8 +108,7 @@ def scatter_of(units: np.ndarray, noise: np.ndarray) -> Scatter:
         core = chosen
         mean, covariance = _moments(units[core], noise)
     ordinary = _ordinary(_distances(units - mean, covariance), units) | core
-    mean, covariance = _moments(units[ordinary], noise)
-    return Scatter(mean, covariance)
+    return _moments(units[ordinary], noise)
 
 
 def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -164,8 +150,8 @@ class Readings:
         fold = np.arange(len(units)) % min(_FOLDS, len(units))
         apart = units - centre
         others = [scatter_of(apart[fold != part], typical) for part in range(fold.max() + 1)]
-        self._inverse = np.array([np.linalg.inv(scatter.covariance) for scatter in others])
-        means = np.array([scatter.mean for scatter in others])
+        self._inverse = np.array([np.linalg.inv(covariance) for _, covariance in others])
+        means = np.array([mean for mean, _ in others])
         self.ordinary = _ordinary(
             np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
         )
@@ -293,14 +279,14 @@ def _together(
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit that is unlike its group: ``deviation`` in standard deviations, ``q_value`` over all units (Benjamini and
-    Hochberg): a unit is looked at in a workshop, and a known share of visits may be in vain."""
+    """A unit that is unlike its group, as `Shared`; ``sigma`` is by how much units differ, ``chance`` the q-value over all units
+    (Benjamini and Hochberg): a unit is looked at in a workshop, and a known share of visits may be in vain."""
 
     row: int
     cause: int
     amount: float
-    deviation: float
-    q_value: float
+    sigma: float
+    chance: float
     rivals: tuple[int, ...]
 
 
@@ -323,10 +309,9 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
         gains = readings.gain(deviations[row])
         cause = int(gains.argmax())
         rivals = tuple(int(c) for c in np.flatnonzero(gains >= _RIVAL * gains.max()) if c != cause)
-        found.append(
-            Outlier(int(row), cause, float(amounts[row, cause]), float(size[row, cause]), float(q_values[row]), rivals)
-        )
-    return sorted(found, key=lambda o: (o.q_value, -abs(o.deviation)))
+        amount = float(amounts[row, cause])
+        found.append(Outlier(int(row), cause, amount, abs(amount / float(size[row, cause])), float(q_values[row]), rivals))
+    return sorted(found, key=lambda one: (one.chance, -abs(one.amount / one.sigma)))
 
 
 def centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -347,13 +332,11 @@ class RandomEffects:
     Attributes:
         mean, sigma: of the population, and the mean's standard deviation.
         spread: standard deviation between units, noise taken out.
-        shrunk: each unit's value drawn towards the mean by its noise (best linear unbiased prediction).
     """
 
     mean: float
     sigma: float
     spread: float
-    shrunk: np.ndarray
 
 
 def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
@@ -369,5 +352,4 @@ def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
     spread_2 = brentq(excess, 1e-9, 10.0) * variance if len(values) > 1 and excess(1e-9) > 0.0 > excess(10.0) else 0.0
     weight = 1.0 / np.maximum(sigmas**2 + spread_2, 1e-300)
     mean = float(weight @ values / weight.sum())
-    share = spread_2 / np.maximum(spread_2 + sigmas**2, 1e-300)
-    return RandomEffects(mean, float(weight.sum() ** -0.5), float(np.sqrt(spread_2)), mean + share * (values - mean))
+    return RandomEffects(mean, float(weight.sum() ** -0.5), float(np.sqrt(spread_2)))
