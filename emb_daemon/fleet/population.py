@@ -279,7 +279,7 @@ def _together(
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit that is unlike its group, as `Shared`; ``sigma`` is by how much units differ, ``chance`` the q-value over all units
+    """A unit that is unlike its group, as `Shared`; ``sigma`` is by how much units differ, ``chance`` the q-value over all
     (Benjamini and Hochberg): a unit is looked at in a workshop, and a known share of visits may be in vain."""
 
     row: int

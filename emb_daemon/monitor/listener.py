@@ -1,6 +1,7 @@
 """Broadcasts off the bus: last values, gaps in the E2E counters, and the forces of the last minute."""
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -70,31 +71,27 @@ class Corner:
     def __init__(self, name: str, cycles_ns: list[int]):
         self.name = name
         self.streams = [Stream(cycle) for cycle in cycles_ns]
-        # Largest force in kN and number of forces of each second; `_second` says which second an entry is of.
-        self._largest = [math.nan] * (HISTORY_S + 1)
-        self._count = [0] * (HISTORY_S + 1)
-        self._second = [-1] * (HISTORY_S + 1)
+        #: [second, largest usable force in kN, number of forces], the newest last.
+        self._seconds: deque[list] = deque(maxlen=HISTORY_S + 1)
 
     def remember(self, force_kN: float, time_ns: int) -> None:
         second = time_ns // SECOND_NS
-        entry = second % len(self._second)
-        if self._second[entry] != second:
-            self._second[entry], self._largest[entry], self._count[entry] = second, math.nan, 0
-        self._count[entry] += 1
+        if not self._seconds or self._seconds[-1][0] != second:
+            self._seconds.append([second, math.nan, 0])
+        entry = self._seconds[-1]
+        entry[2] += 1
         if not math.isnan(force_kN):
-            self._largest[entry] = force_kN if math.isnan(self._largest[entry]) else max(self._largest[entry], force_kN)
+            entry[1] = force_kN if math.isnan(entry[1]) else max(entry[1], force_kN)
 
     def forces_kN(self, now_ns: int) -> list[float]:
         """Largest usable force of each of the last HISTORY_S whole seconds, oldest first; NaN where there was none."""
-        now = now_ns // SECOND_NS
-        entries = [(second, second % len(self._second)) for second in range(now - HISTORY_S, now)]
-        return [self._largest[entry] if self._second[entry] == second else math.nan for second, entry in entries]
+        now, largest = now_ns // SECOND_NS, {second: force for second, force, _ in self._seconds}
+        return [largest.get(second, math.nan) for second in range(now - HISTORY_S, now)]
 
     def rate_Hz(self, now_ns: int) -> float:
         """Clamp forces received in the last whole second."""
-        second = now_ns // SECOND_NS - 1
-        entry = second % len(self._second)
-        return float(self._count[entry]) if self._second[entry] == second else 0.0
+        last = now_ns // SECOND_NS - 1
+        return float(sum(count for second, _, count in self._seconds if second == last))
 
     @property
     def heard(self) -> bool:
