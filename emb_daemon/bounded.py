@@ -5,6 +5,8 @@ import os
 import stat
 from pathlib import Path
 
+from emb_daemon.errors import InputErrors
+
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Content of a regular file; nobody needs to write to it for the call to end.
@@ -22,3 +24,13 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     if len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return content
+
+
+def read_input(path: Path, most_bytes: int) -> bytes:
+    """`read_bounded` of a file that the user named; raises InputErrors for whatever is wrong with it."""
+    try:
+        return read_bounded(path, most_bytes)
+    except FileNotFoundError:
+        raise InputErrors([f"{path}: no such file"]) from None
+    except OSError as error:
+        raise InputErrors([f"{path}: {error.strerror}"]) from None

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from emb_daemon.bounded import read_bounded
+from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputErrors
 
 _T = typing.TypeVar("_T")
@@ -211,11 +211,7 @@ def load_yaml(path: Path, kind: type[_T], text: str | None = None) -> _T:
     """
     if text is None:
         try:
-            text = read_bounded(path, _MOST_BYTES).decode()
-        except FileNotFoundError:
-            raise InputErrors([f"{path}: no such file"]) from None
-        except OSError as error:
-            raise InputErrors([f"{path}: {error.strerror}"]) from None
+            text = read_input(path, _MOST_BYTES).decode()
         except UnicodeDecodeError as error:
             raise InputErrors([f"{path}: not a readable text file ({error})"]) from None
     reader = _Reader(str(path))

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.cli.progress import progress
 from emb_daemon.resources import resource
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="REGEX",
         help="finds (?P<unit>…), and (?P<day>…) if it has that, in a log's path; default: its folder",
     )
-    ingest.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
+    add_mapping_argument(ingest)
     for name in ("replay", "learn", "diagnose", "prior", "report"):
         parsers[name].add_argument("data", type=Path, metavar="DIR", help="data set of emb-daemon fleet ingest")
     parsers["bench"].add_argument("log", type=Path, metavar="LOG", help="a log of a minute or more")

@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import open_mapping
+from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
 
 EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
+    add_mapping_argument(parser)
     add_bus_arguments(parser)
 
 

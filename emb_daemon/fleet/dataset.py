@@ -148,8 +148,13 @@ def ingested(root: Path) -> list[dict]:
 
 def note(root: Path, known: dict) -> None:
     """Keep what became of a log file."""
-    path = folder_of(root, "ingested") / f"{known['sha256']}.json"
-    write_atomically(path, json.dumps(known, sort_keys=True, indent=1).encode())
+    write_json(Path(root, "ingested", f"{known['sha256']}.json"), known)
+
+
+def write_json(path: Path, content: dict) -> None:
+    """A file of the data set; the same content gives the same bytes."""
+    folder_of(path.parent)
+    write_atomically(path, json.dumps(content, sort_keys=True, indent=1).encode())
 
 
 def forget(root: Path, known: dict) -> None:

@@ -10,13 +10,12 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.atomic import write_atomically
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, moved, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS, new_state
-from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
+from emb_daemon.fleet.dataset import Drive, partition, read_drive, write_json
 from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
 from emb_daemon.offline import estimate
 
@@ -59,8 +58,7 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
                 trainings += [{"day": drive.day, **msgspec.to_builtins(entry)} for entry in new]
     told |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
     told["trainings"] = sum(bool(entry["values"]) for entry in trainings)
-    folder_of(path.parent)
-    write_atomically(path, json.dumps(told, sort_keys=True, indent=1).encode())
+    write_json(path, told)
     return told
 
 

@@ -3,10 +3,9 @@
 import json
 from pathlib import Path
 
-from emb_daemon.atomic import write_atomically
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.fleet.dataset import Drive, folder_of, read_drive
+from emb_daemon.fleet.dataset import Drive, folder_of, read_drive, write_json
 from emb_daemon.logs.write import table_columns, write_table
 from emb_daemon.offline import estimate
 from emb_daemon.replay import Result
@@ -37,7 +36,6 @@ def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict:
     write_table(folder / f"{drive.digest}.parquet", table_columns(estimates, 1e-9 * log.time_ns))
     figures = result.figures() | {"log": about.source, "refused": about.refused, "notes": about.notes}
     figures["calibration"] = calibration_hash(calibration)
-    folder_of(root, "figures", drive.partition)
     # After the estimates: who finds the figures finds those too.
-    write_atomically(figures_path(root, drive), json.dumps(figures, sort_keys=True).encode())
+    write_json(figures_path(root, drive), figures)
     return figures

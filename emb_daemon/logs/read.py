@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.bounded import read_bounded
+from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError
 from emb_daemon.logs.apart import frames_apart, frames_of
 from emb_daemon.logs.candump import parse_candump
@@ -49,12 +49,7 @@ def needs_extra(path: Path, error: ImportError) -> InputError:
 
 def read_file(path: Path) -> bytes:
     """The one place where a log file is read."""
-    try:
-        return read_bounded(path, _most_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
+    return read_input(path, _most_bytes())
 
 
 def unpack_gzip(path: Path, raw: bytes) -> bytes:

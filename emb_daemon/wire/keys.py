@@ -6,7 +6,7 @@ import stat
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from emb_daemon.bounded import read_bounded
+from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError, InputErrors
 
 _MOST_BYTES = 65_536
@@ -29,12 +29,7 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
         InputErrors: not readable, readable by others, or not such a file; every line that is wrong. No key is ever told.
     """
     try:
-        status = path.stat()
-        text = read_bounded(path, _MOST_BYTES).decode()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
+        text, status = read_input(path, _MOST_BYTES).decode(), path.stat()
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
     # systemd gives a credential to its service by an access list, whose mask shows as the group's right to read.
