@@ -276,8 +276,8 @@ def _complete(b, index, count):
     row.speed = corner.pending_speed
     # How wrong a value is whose sender calls it degraded, nobody says. The force has another source than the current; where
     # the resolver is degraded too, or any other signal, there is no choice.
-    doubted = b.receptions[base + wire.CURRENT].degraded and not b.receptions[base + wire.RESOLVER].degraded
-    row.has_current = _paired(b, index) and not doubted
+    degraded_alone = b.receptions[base + wire.CURRENT].degraded and not b.receptions[base + wire.RESOLVER].degraded
+    row.has_current = _paired(b, index) and not degraded_alone
     row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
     thermocouple = b.receptions[base + wire.THERMOCOUPLE]
     row.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
@@ -339,8 +339,8 @@ def _head(b, row, index, age):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
-        doubted = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < _SHOWN_NS
-        if doubted or now - b.receptions[slot].refused_ns < _SHOWN_NS:
+        degraded = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < _SHOWN_NS
+        if degraded or now - b.receptions[slot].refused_ns < _SHOWN_NS:
             reasons |= contract.E2E_ERROR
         if now - b.receptions[slot].range_ns < _SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE

@@ -22,9 +22,9 @@ _SPEED_ERROR, _SPEED_ERROR_RAD_PER_S = 0.01, 0.025
 #: counts before it begins anew, from where nothing tells its turn.
 _GUESSED_RAD, _LOST_RAD = 1.0, pi * PULSE_MODULO / PULSES_PER_TURN
 
-#: ``unseen``: phase (rad) by which the wheel may be off since the counter was last heard; ``doubt``: thickness (m, standard
+#: ``unseen``: phase (rad) by which the wheel may be off since the counter was last heard; ``sigma``: thickness (m, standard
 #: deviation) that this leaves open.
-_STATE = np.dtype([*((name, WHEEL[name]) for name in WHEEL.names), ("unseen", "f8"), ("doubt", "f8")], align=True)
+_STATE = np.dtype([*((name, WHEEL[name]) for name in WHEEL.names), ("unseen", "f8"), ("sigma", "f8")], align=True)
 
 
 @njit
@@ -56,7 +56,7 @@ def term(p, s, m):
         s.unseen, angle = _LOST_RAD, 0.0
     else:
         return 0.0
-    s.doubt = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
+    s.sigma = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
     if s.unseen > _GUESSED_RAD:
         return 0.0
     thickness = 0.0

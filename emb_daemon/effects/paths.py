@@ -79,6 +79,6 @@ def backplates(e, s, inner, outer, dt):
 
 
 @njit
-def thickness_doubt(s):
+def thickness_sigma(s):
     """Standard deviation (m) of the disc's thickness where its phase is not known."""
-    return s.disc_thickness_variation.doubt
+    return s.disc_thickness_variation.sigma

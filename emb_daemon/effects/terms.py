@@ -67,12 +67,12 @@ TERM = np.dtype(
     align=True,
 )
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` by port; ``doubt``: standard deviation (N) of the static force by what terms add outside their range.
+#: ``added`` by port; ``sigma``: standard deviation (N) of the static force by what terms add outside their range.
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
         ("added", "f8", (len(PORTS),)),
-        ("doubt", "f8"),
+        ("sigma", "f8"),
         ("begun", "i8", (MOST,)),
         ("memory", "f8", (MOST,)),
         ("before", "f8", (MOST,)),
@@ -168,7 +168,7 @@ def _value(q, t, k, dt, maximum_force):
 
 
 @njit
-def _doubt(q, x, added, s):
+def _outside_sigma(q, x, added, s):
     """Standard deviation (N) of the static force: of the coefficient, and the term's own size for each width of its range that
     the signal is outside."""
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
@@ -195,9 +195,9 @@ def look(e, s, p, m):
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
         if q.port <= _STATIC_FORCE:
-            doubt = _doubt(q, t.signal[q.signal], value, s)
-            variance += doubt * doubt
-    t.doubt = sqrt(variance)
+            sigma = _outside_sigma(q, t.signal[q.signal], value, s)
+            variance += sigma * sigma
+    t.sigma = sqrt(variance)
 
 
 @njit

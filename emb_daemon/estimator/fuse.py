@@ -119,8 +119,8 @@ def needed_torque(s, p, m, mean_force, leverage):
 def _spread(s, p):
     """Standard deviation (N) of what is fast in the stiffness path's error."""
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
-    relative = hypot(relative, s.effects.terms.doubt)
-    relative = hypot(relative, s.slope * effects.thickness_doubt(s.effects) / p.gear_gain)
+    relative = hypot(relative, s.effects.terms.sigma)
+    relative = hypot(relative, s.slope * effects.thickness_sigma(s.effects) / p.gear_gain)
     return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
 
 
