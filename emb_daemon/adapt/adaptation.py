@@ -50,11 +50,7 @@ class Adaptation:
     """
 
     def __init__(
-        self,
-        calibrations: dict[str, Calibration],
-        memory: Memory,
-        clock: Callable[[int], int],
-        threaded: bool = False,
+        self, calibrations: dict[str, Calibration], memory: Memory, clock: Callable[[int], int], threaded: bool = False
     ):
         self.adapters = np.zeros(4, r.ADAPTER)
         self.limits = np.zeros(4, r.LIMITS)

@@ -16,19 +16,13 @@ import numpy as np
 from emb_daemon.ahead import library
 from emb_daemon.bench import empty
 from emb_daemon.resources import resource
+from emb_daemon.runtime.rawcan import connected_sockets
 from emb_daemon.wire.layout import CORNERS
 
 #: The daemon's own; the car comes before it, as the senders on a bus do.
 _PRIORITY = 60
 _CAR_PRIORITY = 65
 _PATIENCE_S = 300.0
-
-
-def _buses(count: int) -> list[tuple[socket.socket, socket.socket]]:
-    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(count)]
-    for end in (end for pair in pairs for end in pair):
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-    return pairs
 
 
 class _Child:
@@ -93,7 +87,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
         where there is none), and ``ready``, the daemon's start in ``wall_s`` and ``cpu_s``.
     """
     daemons = max(1, corners // len(CORNERS))
-    pairs = _buses(daemons)
+    pairs = [connected_sockets() for _ in range(daemons)]
     each = corners // daemons
     car = _Child(
         "car", each, seconds, _CAR_PRIORITY, *(theirs.fileno() for _, theirs in pairs), inherited=[b for _, b in pairs]
@@ -133,7 +127,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
 
 def measure_start(corners: int = len(CORNERS), cold: bool = False) -> dict:
     """``wall_s`` and ``cpu_s`` from start to ready by numba, with the kernels that are in the cache or ``cold`` with none."""
-    [(ours, theirs)] = _buses(1)
+    ours, theirs = connected_sockets()
     with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
         served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)

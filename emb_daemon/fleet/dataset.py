@@ -10,6 +10,7 @@
 Files are whole at every moment and are never changed; who writes one twice writes the same bytes.
 """
 
+import datetime
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -57,6 +58,11 @@ class About:
     source: str
     refused: dict[str, int]
     notes: str
+
+
+def day_of(time_ns: int) -> str:
+    """ISO 8601, in universal time."""
+    return datetime.datetime.fromtimestamp(1e-9 * time_ns, datetime.UTC).date().isoformat()
 
 
 def partition(unit: str, corner: str) -> Path:

@@ -1,7 +1,6 @@
 """What the scores of a whole fleet say: batches, units, drift and season, each with its size in newtons and its chance."""
 
 import csv
-import datetime
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from emb_daemon.atomic import write_atomically
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError
+from emb_daemon.fleet.dataset import day_of
 from emb_daemon.fleet.population import (
     LEAST_UNITS,
     Directions,
@@ -258,8 +258,8 @@ class _Study:
         unlike = self._outliers(apart, readings, _ACTIONS["unit"])
         return Findings(
             calibration=calibration,
-            first_day=_date(self.start),
-            last_day=_date(max(score.drive.begin_ns for score in self.every)),
+            first_day=day_of(self.start),
+            last_day=day_of(max(score.drive.begin_ns for score in self.every)),
             drives=len(self.every),
             silent=silent,
             left_out=left_out,
@@ -350,10 +350,6 @@ class _Study:
                 sigmas.append(float(np.sqrt(reading @ pooled.noise[0] @ reading) * size))
             result.append(Trend(where=group, cause=names[cause], days=days, size_N=sizes, sigma_N=sigmas))
         return result
-
-
-def _date(time_ns: int) -> str:
-    return datetime.datetime.fromtimestamp(1e-9 * time_ns, datetime.UTC).date().isoformat()
 
 
 def _manoeuvre(cause: Cause) -> str:

@@ -1,7 +1,6 @@
 """Log files into the data set: each once, whatever its format; a damaged one is listed, and never ends the work."""
 
 import contextlib
-import datetime
 import hashlib
 import io
 import re
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.fleet.dataset import DIGEST, About, Drive, forget, ingested, note, write_drive
+from emb_daemon.fleet.dataset import DIGEST, About, Drive, day_of, forget, ingested, note, write_drive
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_with_digest
 from emb_daemon.offline import corner_index
@@ -135,12 +134,11 @@ def ingest_frames(
     corners = corners_in(frames, Path(source))
     begin_ns = int(frames["time_ns"][0])
     samples, pipeline = samples_in(frames, corners)
-    day = day or datetime.datetime.fromtimestamp(1e-9 * begin_ns, datetime.UTC).date().isoformat()
     result = []
     for corner in corners:
         index = corner_index(corner)
         log = make_log(samples[samples["corner"] == index], frames, corner, Path(source))
-        drive = Drive(unit, corner, day, begin_ns, digest)
+        drive = Drive(unit, corner, day or day_of(begin_ns), begin_ns, digest)
         write_drive(root, drive, About(source, _refused(pipeline, index), notes), log.samples, log.force_N)
         result.append(drive)
     return result

@@ -148,9 +148,6 @@ class Questions:
         return Score(drive, table.T @ table, int(loaded.sum()), float(np.median(heard)) if len(heard) else np.nan)
 
 
-# -- one file for each unit and corner --------------------------------------------------------------------------------
-
-
 def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
     """Ask every drive of one unit's corner and keep what they say; returns why some say nothing, by digest.
 

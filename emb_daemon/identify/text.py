@@ -1,4 +1,4 @@
-"""Numbers as reports write them."""
+"""Numbers and logs as reports write them."""
 
 import numpy as np
 
@@ -16,3 +16,8 @@ def with_sigma(value: float, sigma: float | None = None, factor: float = 1.0) ->
 def rounded(value: float, digits: int = 4) -> float:
     """To so many significant digits."""
     return float(f"{value:.{digits}g}")
+
+
+def stem(name: str) -> str:
+    """A log's name without folder and endings."""
+    return name.rsplit("/", 1)[-1].split(".log")[0]

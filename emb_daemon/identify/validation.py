@@ -10,6 +10,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, Campaign
 from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
+from emb_daemon.identify.text import stem
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.score import PATHS, force_figures
 from emb_daemon.report.figures import BAND, MODEL, PALE, REFERENCE, Panel, Trace, time_figure
@@ -79,7 +80,7 @@ def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessS
         if entry.judge is not None and entry.training in gears:
             log = campaign.load_motion(entry.judge, "gear_wear.judge", NEED_RANDOM, reversals=RANDOM)
             worn = moved(ours, gears[entry.training].friction())
-            add(entry, "gear", f"{_stem(entry.judge)}, curve predicted", log, worn)
+            add(entry, "gear", f"{stem(entry.judge)}, curve predicted", log, worn)
     for entry in campaign.file.frequency_response:
         bounds = (0.0, 4.0 * entry.frequency_Hz)
         log = campaign.load_motion(entry.log, "frequency_response", _NEED_SINE, reversals=bounds)
@@ -87,12 +88,8 @@ def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessS
     for pair in campaign.file.integrated:
         log = campaign.load(pair.judge, "integrated.judge", _NEED_INTEGRATED)
         if log is not None:
-            found.append(validate(f"integrated, {_stem(pair.judge)}", "integrated", log, ours))
+            found.append(validate(f"integrated, {stem(pair.judge)}", "integrated", log, ours))
     return found
-
-
-def _stem(name: str) -> str:
-    return name.rsplit("/", 1)[-1].split(".log")[0]
 
 
 #: Columns of `rows`.

@@ -88,13 +88,7 @@ class Fit:
         return self.covariance[np.ix_(rows, rows)]
 
 
-def fit(
-    blocks: Sequence[Block],
-    free: Mapping[Hashable, Free],
-    *,
-    tolerance: float = 1e-8,
-    evaluations: int = 100,
-) -> Fit:
+def fit(blocks: Sequence[Block], free: Mapping[Hashable, Free], *, tolerance: float = 1e-8, evaluations: int = 100) -> Fit:
     """Values that make the residuals small.
 
     Args:

@@ -29,11 +29,7 @@ PATHS = np.dtype(
 #: ``torque_constant`` N m/A with what effects make of it, friction ``power`` W, pads at 2, 4, 6, 8 mm (inner, then outer)
 #: and disc in degC.
 TRACE = np.dtype(
-    [
-        *fields("f8", "force torque leverage torque_constant power"),
-        ("temperature", "f8", (9,)),
-        ("temperature_known", "?"),
-    ],
+    [*fields("f8", "force torque leverage torque_constant power"), ("temperature", "f8", (9,)), ("temperature_known", "?")],
     align=True,
 )
 

@@ -236,23 +236,13 @@ COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=Tru
 
 #: What the driver (or the rig) does for one cycle. ``wheel_speed`` rad/s prescribes the discs' speed as a rig's drive does,
 #: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.
-DRIVE = np.dtype(
-    [
-        *fields("f8", "wheel_speed target_speed ambient"),
-        *fields("i8", "park_brake brake_request"),
-    ],
-    align=True,
-)
+DRIVE = np.dtype([*fields("f8", "wheel_speed target_speed ambient"), *fields("i8", "park_brake brake_request")], align=True)
 
 #: Training motion of a corner (thesis Fig. 3-9): slow clamp and release between two angles (rad past the released position)
 #: with a small fast sinusoid. ``start`` is where it set out from, ``tick`` cycles it has run, ``silent`` cycles since the
 #: request was last heard.
 TRAINING = np.dtype(
-    [
-        *fields("?", "requested running"),
-        *fields("f8", "low high amplitude frequency start"),
-        *fields("i8", "tick silent"),
-    ],
+    [*fields("?", "requested running"), *fields("f8", "low high amplitude frequency start"), *fields("i8", "tick silent")],
     align=True,
 )
 

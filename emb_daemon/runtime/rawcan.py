@@ -278,9 +278,15 @@ def _bound_socket(channel: str, ids: list[int], receive_buffer: int) -> socket.s
     return sock
 
 
-def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:
-    """A CAN bus with two ends inside one process."""
+def connected_sockets() -> tuple[socket.socket, socket.socket]:
+    """What carries the frames of a bus with two ends on one machine."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-    return RawCanSocket(ends[0], stamped=True), RawCanSocket(ends[1], stamped=True)
+    return ends
+
+
+def socket_pair() -> tuple[RawCanSocket, RawCanSocket]:
+    """A CAN bus with two ends inside one process."""
+    ours, theirs = connected_sockets()
+    return RawCanSocket(ours, stamped=True), RawCanSocket(theirs, stamped=True)

@@ -21,7 +21,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.campaign import Campaign, Datasheet
 from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.text import with_sigma
+from emb_daemon.identify.text import stem, with_sigma
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
 from emb_daemon.offline.run import run_paths
@@ -117,13 +117,7 @@ def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> Torq
         log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
         if log is not None:
             gears.append((entry.training, fit_torque([log], nominal, sheet)))
-    return TorqueStep(
-        values=found.physical(),
-        sigmas=found.sigmas,
-        fit=found,
-        log=pads[len(pads) // 2].logs[-1],
-        gears=gears,
-    )
+    return TorqueStep(values=found.physical(), sigmas=found.sigmas, fit=found, log=pads[len(pads) // 2].logs[-1], gears=gears)
 
 
 class _Regression:
@@ -295,7 +289,7 @@ def section(page: Page, step: TorqueStep) -> None:
         for key, (title, factor) in zip(KEYS, _ROWS, strict=True)
     ]
     rows.append(["unexplained current / A", *(f"{found.rms_A:.3f}" for found in fits)])
-    gears = [name.rsplit("/", 1)[-1].split(".log")[0] for name, _ in step.gears]
+    gears = [stem(name) for name, _ in step.gears]
     part.table(["parameter", "all pads", *gears], rows, "Gears: each state of wear identified from its own training log.")
     current, time = step.log.samples["current_q"], step.log.time_s
     rows_of, residual = step.fit.residuals[str(step.log.path)]
