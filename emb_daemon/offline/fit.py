@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from emb_daemon.offline.score import rmse
 
@@ -261,6 +261,15 @@ def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None 
     covariance *= scale
     covariance[~known, ~known] = np.inf
     return covariance
+
+
+def valley(cost: Callable[[float], float], grid: np.ndarray, **options) -> float:
+    """Where a cost is least: over a grid, which finds the valley, then between the neighbours of the best.
+
+    ``options``: of `scipy.optimize.minimize_scalar`."""
+    best = int(np.argmin([cost(value) for value in grid]))
+    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options=options).x)
 
 
 def left_out_covariance(estimates: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.offline import Log
-from emb_daemon.offline.fit import left_out_covariance
+from emb_daemon.offline.fit import left_out_covariance, valley
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import MODEL, Panel, Style, Trace, xy_figure
@@ -222,9 +222,7 @@ class _Law:
             terms = np.linalg.lstsq(columns, self.loss[rows], rcond=None)[0]
             return terms, rmse(columns @ terms - self.loss[rows])
 
-        best = int(np.argmin([solve(value)[1] for value in self.search]))
-        bounds = (self.search[max(best - 1, 0)], self.search[min(best + 1, len(self.search) - 1)])
-        time_constant = float(minimize_scalar(lambda value: solve(value)[1], bounds=bounds, method="bounded").x)
+        time_constant = valley(lambda value: solve(value)[1], self.search)
         return np.array([*solve(time_constant)[0], time_constant])
 
     def sigmas(self, x: np.ndarray, rows: np.ndarray, left_out: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ gamma is geometry, so that the first coefficient gives the torque constant. The 
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, moved
 from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
@@ -23,7 +22,7 @@ from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import stem, with_sigma
 from emb_daemon.offline import Log
-from emb_daemon.offline.fit import jackknife
+from emb_daemon.offline.fit import jackknife, valley
 from emb_daemon.offline.run import run_paths
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import MODEL, REFERENCE, Panel, Trace, time_figure
@@ -174,11 +173,8 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
         left_over = np.concatenate([*residuals, *(spread @ solution[2:] for *_, spread in matrices)])
         return float(left_over @ left_over + precision[4, 4] * (logarithm - np.log(_USUAL_PRESLIDING)) ** 2)
 
-    # The grid finds the valley; below a resolver count the angle says nothing.
-    grid = np.log(np.geomspace(1e-3, 1.0, 13))
-    best = int(np.argmin([cost(g) for g in grid]))
-    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    presliding = float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x))
+    # Below a resolver count the angle says nothing.
+    presliding = float(np.exp(valley(cost, np.log(np.geomspace(1e-3, 1.0, 13)), xatol=1e-3)))
     solution, matrices, residuals = solve(presliding)
     covariance = _covariance(parts, matrices, residuals, solution, presliding, precision)
     physical, covariance = _physical(solution, presliding, covariance, sheet)
