@@ -164,12 +164,6 @@ def _calibration(given: Calibration | str | Path | None) -> Calibration:
     return given if isinstance(given, Calibration) else load_calibration(Path(given))
 
 
-def _require_finite(**arguments: float) -> None:
-    for name, value in arguments.items():
-        if not isfinite(value):
-            raise ValueError(f"{name} = {value}: expected a finite number")
-
-
 def _finite(value: float | None) -> float | None:
     return None if value is None or not isfinite(value) else value
 
@@ -224,13 +218,10 @@ class Estimator:
         Raises:
             ValueError: another argument is no finite number, or ``dt_s`` is not above zero. Nothing has changed then.
         """
-        _require_finite(
-            angle_rad=angle_rad,
-            speed_rad_per_s=speed_rad_per_s,
-            dt_s=dt_s,
-            ambient_C=ambient_C,
-            vehicle_speed_m_per_s=vehicle_speed_m_per_s,
-        )
+        required = {"angle_rad": angle_rad, "speed_rad_per_s": speed_rad_per_s, "dt_s": dt_s, "ambient_C": ambient_C}
+        for name, value in (required | {"vehicle_speed_m_per_s": vehicle_speed_m_per_s}).items():
+            if not isfinite(value):
+                raise ValueError(f"{name} = {value}: expected a finite number")
         if dt_s <= 0.0:
             raise ValueError(f"dt_s = {dt_s}: expected a time above zero")
         current_A, caliper_C = _finite(current_A), _finite(caliper_C)

@@ -86,7 +86,6 @@ def shades(count: int) -> list[str]:
 
 
 def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
-    from plotly.graph_objects import Scatter
     from plotly.subplots import make_subplots
 
     heights = [panel.height for panel in panels]
@@ -99,39 +98,7 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
     shown: set[str] = set()
     detail = _Detail()
     for row, panel in enumerate(panels, start=1):
-        band_open = False
-        for trace in panel.traces:
-            x, y = np.asarray(trace.x), np.asarray(trace.y, dtype=float)
-            whole = None
-            if reduce and trace.style.mode == "lines":
-                whole = detail.kept(x, y)
-                x, y = decimate(x, y)
-            style, is_band = trace.style, trace.style is BAND
-            figure.add_trace(
-                Scatter(
-                    x=np.asarray(x, dtype=np.float64),
-                    # Single precision is beyond what an eye resolves and halves the file.
-                    y=y.astype(np.float32),
-                    name=trace.name,
-                    meta=whole,
-                    mode=style.mode,
-                    line={"color": style.colour, "width": style.width, "dash": style.dash},
-                    marker={"color": style.colour, "size": style.size},
-                    fill="tonexty" if is_band and band_open else None,
-                    fillcolor=style.colour if is_band else None,
-                    hoverinfo="skip" if is_band else None,
-                    error_y={"type": "data", "array": trace.sigma, "thickness": 1, "width": 3} if trace.sigma is not None
-                    else None,
-                    legendgroup=trace.name,
-                    showlegend=bool(trace.name) and trace.name not in shown and not (is_band and not band_open),
-                ),
-                row=row,
-                col=1,
-            )  # fmt: skip
-            if not (is_band and not band_open):
-                shown.add(trace.name)
-            band_open = is_band and not band_open
-        figure.update_yaxes(title_text=panel.unit, row=row, col=1)
+        _draw(figure, row, panel, shown, detail if reduce else None)
     figure.update_xaxes(title_text=x_title, row=len(panels), col=1)
     axis = {"gridcolor": GRID, "zeroline": False, "linecolor": "#b8c0ca", "ticks": "outside", "tickcolor": "#b8c0ca"}
     figure.update_xaxes(**axis)
@@ -150,6 +117,42 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
     for annotation in figure.layout.annotations:
         annotation.update(font={"size": 13, "color": MUTED}, x=0.0, xanchor="left")
     return figure
+
+
+def _draw(figure, row: int, panel: Panel, shown: set[str], detail: "_Detail | None") -> None:
+    """A panel's traces; ``shown`` are the names that the legend has already. With ``detail`` lines are decimated, and what the
+    page may zoom to is kept there."""
+    from plotly.graph_objects import Scatter
+
+    band_open = False
+    for trace in panel.traces:
+        x, y, whole = np.asarray(trace.x, dtype=np.float64), np.asarray(trace.y, dtype=float), None
+        if detail and trace.style.mode == "lines":
+            whole = detail.kept(x, y)
+            x, y = decimate(x, y)
+        style, is_band = trace.style, trace.style is BAND
+        opens_band = is_band and not band_open
+        scatter = Scatter(
+            x=x,
+            # Single precision is beyond what an eye resolves and halves the file.
+            y=y.astype(np.float32),
+            name=trace.name,
+            meta=whole,
+            mode=style.mode,
+            line={"color": style.colour, "width": style.width, "dash": style.dash},
+            marker={"color": style.colour, "size": style.size},
+            fill="tonexty" if is_band and band_open else None,
+            fillcolor=style.colour if is_band else None,
+            hoverinfo="skip" if is_band else None,
+            error_y=None if trace.sigma is None else {"type": "data", "array": trace.sigma, "thickness": 1, "width": 3},
+            legendgroup=trace.name,
+            showlegend=bool(trace.name) and trace.name not in shown and not opens_band,
+        )
+        figure.add_trace(scatter, row=row, col=1)
+        if not opens_band:
+            shown.add(trace.name)
+        band_open = opens_band
+    figure.update_yaxes(title_text=panel.unit, row=row, col=1)
 
 
 class _Detail:
