@@ -8,6 +8,8 @@ import msgspec
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.bounded import read_bounded
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration
 
 #: A hundred times what any file of ours has.
 _MOST_BYTES = 4_000_000
@@ -16,6 +18,22 @@ _MOST_BYTES = 4_000_000
 class _Sealed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sha256: str
     content: msgspec.Raw
+
+
+class Owned(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a corner's file begins with: whose it is."""
+
+    format: int
+    corner: str
+    actuator: str
+    #: Hash of the calibration.
+    calibration: str
+
+
+def owner(version: int, corner: str, calibration: Calibration) -> dict:
+    """Fields of `Owned`."""
+    mine = {"format": version, "corner": corner, "actuator": calibration.actuator}
+    return mine | {"calibration": calibration_hash(calibration)}
 
 
 def encode(content: msgspec.Struct) -> bytes:
@@ -47,10 +65,10 @@ def decode(data: bytes, kind: type, version: int):
     return content
 
 
-def read_own(path: Path, kind: type, ours: dict):
+def read_own(path: Path, kind: type[Owned], ours: dict):
     """A file's content of type ``kind``, or None, and a warning for the log, or None.
 
-    A damaged file is set aside; one that belongs to something else than ``ours`` (fields that both have) is not used.
+    A damaged file is set aside; one that does not belong to ``ours`` (`owner`) is not used.
     """
     try:
         found = decode(read(path), kind, ours["format"])

@@ -17,7 +17,6 @@ import numpy as np
 from emb_daemon.adapt import files
 from emb_daemon.adapt.learned import Evaluation, why_out_of_bounds
 from emb_daemon.adapt.records import ACCEPTED, OUTCOMES
-from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError, Unavailable
 
@@ -44,13 +43,9 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     evidence: dict[str, float | None]
 
 
-class Store(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Store(files.Owned, frozen=True, kw_only=True):
     """One corner's file."""
 
-    format: int
-    corner: str
-    actuator: str
-    calibration: str
     #: The last accepted training, whose values are in use.
     current: Entry | None
     history: tuple[Entry, ...]
@@ -131,9 +126,7 @@ class Memory:
         A file that is damaged, or holds values that this brake cannot have, is set aside; one of another actuator or
         calibration stays until something new is learned, but nothing of it is used.
         """
-        path = self.path(corner)
-        ours = {"format": FORMAT, "corner": corner, "actuator": calibration.actuator}
-        ours["calibration"] = calibration_hash(calibration)
+        path, ours = self.path(corner), files.owner(FORMAT, corner, calibration)
         self._sweep()
         store, warning = files.read_own(path, Store, ours)
         if store and store.current and (fault := why_out_of_bounds(calibration, store.current.values)):

@@ -7,24 +7,17 @@ time clock, and given back only to the same actuator with the same calibration, 
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from emb_daemon.adapt import files
-from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
 
 _FORMAT = 1
 
 
-class Snapshot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One corner's file."""
+class Snapshot(files.Owned, frozen=True, kw_only=True):
+    """One corner's file, of the calibration in use, learned values included."""
 
-    format: int
-    corner: str
-    actuator: str
-    #: Hash of the calibration in use, learned values included.
-    calibration: str
     #: CLOCK_REALTIME.
     time_ns: int
     #: By the dtype's field names; arrays as nested lists, null for NaN.
@@ -79,22 +72,17 @@ class Snapshots:
 
     def save(self, corner: str, calibration: Calibration, record: np.void, time_ns: int) -> None:
         """Keep a record of ``dtype``. Raises OSError; the old file is then untouched."""
-        files.write(self.path(corner), Snapshot(**_header(corner, calibration), time_ns=time_ns, state=to_fields(record)))
+        ours = files.owner(_FORMAT, corner, calibration)
+        files.write(self.path(corner), Snapshot(**ours, time_ns=time_ns, state=to_fields(record)))
 
     def load(self, corner: str, calibration: Calibration) -> tuple[np.void | None, int, str | None]:
         """What was kept of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
         the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
         path = self.path(corner)
-        found, warning = files.read_own(path, Snapshot, _header(corner, calibration))
+        found, warning = files.read_own(path, Snapshot, files.owner(_FORMAT, corner, calibration))
         if found is None:
             return None, 0, warning
         try:
             return from_fields(found.state, self._dtype), found.time_ns, None
         except ValueError as error:
             return None, 0, f"{path}: damaged ({error}), {files.set_aside(path)}"
-
-
-def _header(corner: str, calibration: Calibration) -> dict:
-    """What a file of a corner with this calibration in use begins with."""
-    ours = {"format": _FORMAT, "corner": corner, "actuator": calibration.actuator}
-    return ours | {"calibration": calibration_hash(calibration)}

@@ -60,8 +60,7 @@ class _Buses:
 class _Answers:
     """Time from a sample's last frame to its answer, matched by the InputCounter."""
 
-    def __init__(self, live: LiveCar):
-        self._live = live
+    def __init__(self):
         self._sent = np.zeros((4, 15), np.int64)
         self.latency_us: list[float] = []
         self.samples = 0
@@ -87,7 +86,7 @@ def main() -> None:
     plants = np.array([plant_from_calibration(calibration, seed) for seed in range(corners)])
     live = LiveCar(Car(plants, CORNERS[:corners], reference=False), bus, city_drive())
     live.warm_up()
-    answers = _Answers(live)
+    answers = _Answers()
     settle_memory()
     use_fifo(priority)
     print("ready", time.process_time(), flush=True)

@@ -24,6 +24,8 @@ from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
 
 _REPEATS = 7
+#: Length of the log.
+_SECONDS = 120.0
 _ONE_BY_ONE = 20_000
 #: Samples that plain Python steps through.
 _PLAIN = 2000
@@ -56,10 +58,10 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
     return largest
 
 
-def measure_logs(seconds: float = 120.0) -> dict:
-    """Figures by CPU time over a simulated single-corner log of ``seconds``, in the page cache and with kernels compiled."""
+def measure_logs() -> dict:
+    """Figures by CPU time over a simulated single-corner log, in the page cache and with kernels compiled."""
     calibration = load_calibration(resource("config/calibration.yaml"))
-    frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), seconds)
+    frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), _SECONDS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.log"
         write_frames(path, frames)
@@ -67,11 +69,11 @@ def measure_logs(seconds: float = 120.0) -> dict:
         read, replay = medians_s(lambda: read_frames(path), lambda: Replay(calibration).run(path))
     bulk, one_by_one = _decoders(frames)
     return {
-        "seconds": seconds,
+        "seconds": _SECONDS,
         "frames": len(frames),
         "read_frames_per_s": len(frames) / read,
         "replay_frames_per_s": len(frames) / replay,
-        "replay_times_real_time": seconds / replay,
+        "replay_times_real_time": _SECONDS / replay,
         "decode_frames_per_s": bulk,
         "cantools_decode_frames_per_s": one_by_one,
         "step": measure_step(log_of(frames).samples, np.atleast_1d(to_parameters(calibration))),

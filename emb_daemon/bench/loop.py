@@ -125,10 +125,10 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
     }
 
 
-def measure_start(corners: int = len(CORNERS), cold: bool = False) -> dict:
+def measure_start(cold: bool = False) -> dict:
     """``wall_s`` and ``cpu_s`` from start to ready by numba, with the kernels that are in the cache or ``cold`` with none."""
     ours, theirs = connected_sockets()
-    with ours, theirs, _configured(corners) as arguments, tempfile.TemporaryDirectory() as empty_cache:
+    with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
         served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
         try:
