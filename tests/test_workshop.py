@@ -34,7 +34,6 @@ from emb_daemon.workshop.trouble import (
     Frame,
     TroubleMemory,
     code_of,
-    name_of,
 )
 from emb_daemon.workshop.uds import Server
 
@@ -122,8 +121,8 @@ def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
 
 def test_codes_have_names_of_their_own():
     codes = {code_of(corner, reason) for corner in range(len(CORNERS)) for reason in range(len(REASONS))}
-    assert len(codes) == trouble.CODES == len({name_of(code) for code in codes})
-    assert (code_of(2, 5), name_of(code_of(2, 5))) == (0x520500, "C1205")
+    assert len(codes) == trouble.CODES
+    assert code_of(2, 5) == 0x520500
 
 
 # --- Requests -----------------------------------------------------------------------------------------------------------
