@@ -119,7 +119,7 @@ def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
             assert bool(s & CONFIRMED) == (entry.frame is not None) == (entry.occurrences > 0)
 
 
-def test_codes_have_names_of_their_own():
+def test_every_reason_of_every_corner_has_a_code_of_its_own():
     codes = {code_of(corner, reason) for corner in range(len(CORNERS)) for reason in range(len(REASONS))}
     assert len(codes) == trouble.CODES
     assert code_of(2, 5) == 0x520500
