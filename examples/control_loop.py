@@ -8,7 +8,7 @@ python examples/control_loop.py
 import math
 
 import emb_daemon
-from emb_daemon.calibration.types import curve_at
+from emb_daemon.calibration.curves import curve_at
 
 DT_S = 0.004
 SPEED_PER_ERROR = 0.02  # rad/s per N

@@ -7,9 +7,10 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.fields import Struct
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import Calibration, Struct, to_parameters
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.wire.keys import key_file, load_keys

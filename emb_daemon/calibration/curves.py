@@ -1,21 +1,33 @@
 """Characteristic curves over pad thickness: between and beyond the measured ones, and whether they rise."""
 
-from typing import TYPE_CHECKING
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from emb_daemon.errors import InputError
+from emb_daemon.calibration.fields import Positive, Struct, usual
+from emb_daemon.errors import InputError, InvalidValue
 from emb_daemon.estimator.records import CURVE_TERMS
-
-if TYPE_CHECKING:
-    from emb_daemon.calibration.types import Curve
 
 #: How far curves are carried on beyond the measured thicknesses, as a share of the nearest interval, and to what share of the
 #: nearest measured one a coefficient's compliance may fall there: a straight line would lead it through zero.
 _CARRIED_ON, _LEAST_COMPLIANCE = 0.5, 0.5
 
 
-def thickness_range(curves: "tuple[Curve, ...]") -> tuple[float, float]:
+class Curve(Struct, kw_only=True):
+    """Characteristic curve of one pad thickness: F = sum of coefficients[n] x^(n+1), x in rad past contact."""
+
+    #: Thickness of the pads, friction material alone.
+    pad_thickness_mm: Positive
+    #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
+    coefficients: Annotated[tuple[Annotated[float, usual(1e-3)], ...], Meta(min_length=1, max_length=CURVE_TERMS)]
+
+    def __post_init__(self):
+        if self.coefficients[0] <= 0.0:
+            raise InvalidValue("the first coefficient (N/rad) must be positive: force rises from contact")
+
+
+def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
     """Thinnest and thickest pads in mm that `curve_at` tells a curve of."""
     thicknesses = [curve.pad_thickness_mm for curve in curves]
     if len(curves) == 1:
@@ -38,7 +50,7 @@ def rising_force(coefficients: np.ndarray) -> float:
     return float(np.polyval([*coefficients[::-1], 0.0], turns.min()))
 
 
-def curve_at(curves: "tuple[Curve, ...]", pad_thickness_mm: float) -> np.ndarray:
+def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
     """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
 
     The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the

@@ -2,15 +2,13 @@
 
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.fields import Positive, Struct
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import GATES, MEMORIES, MOST, PORTS, SHAPES, SIGNALS
 from emb_daemon.errors import InvalidValue
-
-Positive = Annotated[float, Meta(gt=0.0)]
 
 #: Most that a term may do at a port: what would leave nothing of the quantity that it changes. Angles and thickness: a
 #: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Current: what no sensor is off by. Force: as
@@ -19,7 +17,7 @@ _MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.in
 _FACTOR = 0.9
 
 
-class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
+class Term(Struct, kw_only=True):
     """Coefficient × shape(memory(signal)) × gate, added at one port of the physics. u = (z − centre)/scale, where z is the
     signal through its memory."""
 

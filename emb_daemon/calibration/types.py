@@ -10,29 +10,17 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from emb_daemon.calibration.curves import curve_at, rising_force, thickness_range
+from emb_daemon.calibration.curves import Curve, curve_at, rising_force, thickness_range
+from emb_daemon.calibration.fields import NonNegative, Positive, Share, Struct, usual
 from emb_daemon.calibration.terms import Term, faults_of, fill_terms
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InvalidValue
-from emb_daemon.estimator.records import CURVE_TERMS, FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
+from emb_daemon.estimator.records import FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
 from emb_daemon.models.thermal import mesh
-
-Positive = Annotated[float, Meta(gt=0.0)]
-NonNegative = Annotated[float, Meta(ge=0.0)]
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 #: Training reaches the forces that hold a parked car: 18 kN, 60 % of what the brake of the shipped calibration can do, and on
 #: weaker brakes the same share.
 _TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
-
-
-def usual(size: float) -> Meta:
-    """Size that is usual of a number which may be zero; from there a relative step leads nowhere (`parameters`)."""
-    return Meta(extra={"usual": size})
-
-
-class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Base of everything that is read from YAML."""
 
 
 class Motor(Struct, kw_only=True):
@@ -57,19 +45,6 @@ class Friction(Struct, kw_only=True):
     offset_Nm: Annotated[NonNegative, usual(0.03)]
     #: Motor angle over which friction turns over after a reversal; near zero it is the thesis's sign function.
     presliding_angle_rad: Annotated[float, Meta(ge=1e-6), usual(0.03)]
-
-
-class Curve(Struct, kw_only=True):
-    """Characteristic curve of one pad thickness: F = sum of coefficients[n] x^(n+1), x in rad past contact."""
-
-    #: Thickness of the pads, friction material alone.
-    pad_thickness_mm: Positive
-    #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
-    coefficients: Annotated[tuple[Annotated[float, usual(1e-3)], ...], Meta(min_length=1, max_length=CURVE_TERMS)]
-
-    def __post_init__(self):
-        if self.coefficients[0] <= 0.0:
-            raise InvalidValue("the first coefficient (N/rad) must be positive: force rises from contact")
 
 
 class Stiffness(Struct, kw_only=True):
@@ -301,9 +276,9 @@ class Provenance(Struct, kw_only=True):
     #: Logs that were fitted.
     logs: tuple[Source, ...] = ()
     #: Error figures on logs that fitted nothing, by name.
-    figures: dict[str, float] = {}
+    figures: dict[str, float] = msgspec.field(default_factory=dict)
     #: Standard deviations of identified values, by key.
-    sigmas: dict[str, float] = {}
+    sigmas: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class Calibration(Struct, kw_only=True):
@@ -322,7 +297,7 @@ class Calibration(Struct, kw_only=True):
     noise: Noise
     thermal: Thermal
     #: Effects switched on, by name, with their parameters.
-    effects: dict[str, dict[str, float]] = {}
+    effects: dict[str, dict[str, float]] = msgspec.field(default_factory=dict)
     #: Terms that no catalogue holds, as `emb-daemon diagnose` makes them.
     terms: tuple[Term, ...] = ()
     #: Limits of park brake adaptation.

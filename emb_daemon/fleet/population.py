@@ -291,9 +291,8 @@ class Outlier:
 def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
     """Units unlike their group, shape (N, q) about its centre, the most unlike first; each by more than units differ, and by
     more than its own drives do."""
+    from scipy.stats import false_discovery_control
     from scipy.stats import t as student
-
-    from emb_daemon.diagnose.evidence import false_discovery
 
     amounts, rows = readings.of(deviations), readings.ordinary
     freedom = max(int(rows.sum()) - 1, 1)
@@ -301,7 +300,7 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
     size = amounts / np.maximum(np.maximum(spread, readings.noise()), 1e-300)
     # As many questions as causes were asked of each unit.
     chances = np.minimum(1.0, 2.0 * student.sf(np.abs(size), freedom).min(axis=1) * size.shape[1])
-    q_values = false_discovery(chances)
+    q_values = false_discovery_control(chances)
     found = []
     for row in np.flatnonzero(q_values <= FALSE_UNITS):
         gains = readings.gain(deviations[row])

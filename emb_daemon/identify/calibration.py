@@ -5,8 +5,9 @@ import os
 from collections.abc import Sequence
 
 from emb_daemon import __version__
+from emb_daemon.calibration.curves import Curve
 from emb_daemon.calibration.parameters import keys, moved, value_of
-from emb_daemon.calibration.types import Calibration, Contact, Curve, Friction, Motor, Noise, Provenance, Source, Stiffness
+from emb_daemon.calibration.types import Calibration, Contact, Friction, Motor, Noise, Provenance, Source, Stiffness
 from emb_daemon.identify.campaign import Campaign, Datasheet
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.steps import Step

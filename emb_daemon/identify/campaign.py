@@ -11,8 +11,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.fields import Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.jit import njit
 from emb_daemon.logs.read import read_with_digest

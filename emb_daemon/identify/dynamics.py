@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from msgspec import structs
 
+from emb_daemon.calibration.curves import Curve
 from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value_of
-from emb_daemon.calibration.types import Calibration, Curve, to_parameters
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
 from emb_daemon.offline import Log

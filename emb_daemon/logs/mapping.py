@@ -11,8 +11,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
+from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.calibration.types import NonNegative, Positive, Struct
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from emb_daemon.calibration.types import Calibration, curve_at
+from emb_daemon.calibration.curves import curve_at
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.plant.records import EFFECTS, PLANT
 
 #: Standard deviations between what a calibration says and what a unit is, relative where nothing else is said: a well

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_daemon.calibration.types import Curve, curve_at
+from emb_daemon.calibration.curves import Curve, curve_at
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, SLOW, Campaign
 from emb_daemon.identify.dynamics import TERMS, CurveFit, Pads, powers

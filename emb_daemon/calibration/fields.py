@@ -1,0 +1,19 @@
+"""What fields of a YAML file's structs are made of."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+def usual(size: float) -> Meta:
+    """Size that is usual of a number which may be zero; from there a relative step leads nowhere (`parameters`)."""
+    return Meta(extra={"usual": size})
+
+
+class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Base of everything that is read from YAML."""
