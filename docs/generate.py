@@ -16,7 +16,7 @@ import msgspec
 from emb_daemon.calibration import configuration, types
 from emb_daemon.effects import REGISTRY
 from emb_daemon.estimator import status
-from emb_daemon.identify import campaign
+from emb_daemon.identify import campaign_file
 from emb_daemon.logs import mapping
 from emb_daemon.wire import contract
 
@@ -179,8 +179,8 @@ def pages() -> dict[str, str]:
             "Campaign and datasheet",
             "What `emb-daemon identify` reads: which log plays which part, and what the supplier states. "
             "[What to record, and why](own_actuator.md).",
-            campaign.CampaignFile,
-        ) + "\n# Datasheet\n\n" + _structs("", "", campaign.Datasheet).split("\n", 4)[4],
+            campaign_file.CampaignFile,
+        ) + "\n# Datasheet\n\n" + _structs("", "", campaign_file.Datasheet).split("\n", 4)[4],
         "catalogue.md": _catalogue(),
         "safety.md": _safety(),
     }  # fmt: skip

@@ -21,7 +21,8 @@ from emb_daemon.calibration.parameters import CLEARANCE, INERTIA, LOAD_FRICTION,
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.identify.campaign import Campaign, Datasheet, load_campaign
+from emb_daemon.identify.campaign import Campaign, load_campaign
+from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import EPISODE, RELAXATION, TERMS, Pads, clearance_guess, curve_keys, powers, simulate
 from emb_daemon.identify.recording import Recording, recording
 from emb_daemon.identify.run import Identification, identify

@@ -12,7 +12,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.identify.calibration import nominal
-from emb_daemon.identify.campaign import Actuator, Datasheet, Resolver
+from emb_daemon.identify.campaign_file import Actuator, Datasheet, Resolver
 from emb_daemon.identify.dynamics import RELAXATION, Pads, curve_keys, simulate
 from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, PRESLIDING, TORQUE_CONSTANT

@@ -13,7 +13,8 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.identify.campaign import DiscCooling, load_campaign
+from emb_daemon.identify.campaign import load_campaign
+from emb_daemon.identify.campaign_file import DiscCooling
 from emb_daemon.logs import read
 
 

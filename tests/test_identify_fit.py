@@ -7,7 +7,8 @@ import pytest
 from synthetic_rig import datasheet, draw, pads
 
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
-from emb_daemon.identify.campaign import Campaign, CampaignFile, Datasheet
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
 from emb_daemon.identify.steps import noise, stiffness
 from emb_daemon.identify.steps.thickness import left_out_errors

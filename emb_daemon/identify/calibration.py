@@ -8,7 +8,8 @@ from emb_daemon import __version__
 from emb_daemon.calibration.curves import Curve
 from emb_daemon.calibration.parameters import keys, moved, value_of
 from emb_daemon.calibration.types import Calibration, Contact, Friction, Motor, Noise, Provenance, Source, Stiffness
-from emb_daemon.identify.campaign import Campaign, Datasheet
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.heat import nominal_thermal

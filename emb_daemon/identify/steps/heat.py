@@ -12,7 +12,7 @@ from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import Calibration, Disc, Pad, Softening, Thermal, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.identify.campaign import Datasheet
+from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.steps.friction import constant_friction
 from emb_daemon.identify.text import rounded

@@ -17,7 +17,8 @@ from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
 from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
 from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.identify.campaign import Campaign, Datasheet
+from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import stem, with_sigma
