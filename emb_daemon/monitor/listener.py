@@ -8,16 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from emb_daemon.wire.contract import (
-    MODES,
-    REQUESTS,
-    RESULTS,
-    SOURCES,
-    STATUS_DEGRADED,
-    STATUS_NOT_AVAILABLE,
-    STATUSES,
-    reason_words,
-)
+from emb_daemon.wire import contract
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
 from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP, default_layout
@@ -38,7 +29,7 @@ class Stream:
 
     cycle_ns: int
     values: list[float] = field(default_factory=list)
-    status: int = STATUS_NOT_AVAILABLE
+    status: int = contract.STATUS_NOT_AVAILABLE
     counter: int = -1
     time_ns: int = 0
     received: int = 0
@@ -48,7 +39,7 @@ class Stream:
     @property
     def usable(self) -> bool:
         """Whether the sender says that the values may be used."""
-        return self.status <= STATUS_DEGRADED
+        return self.status <= contract.STATUS_DEGRADED
 
     def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
         """Count a frame with a good CRC; returns whether its values are new."""
@@ -112,7 +103,7 @@ class Corner:
     def reasons(self) -> tuple[str, ...]:
         """Why the estimate is degraded, in words."""
         status = self.streams[ESTIMATOR_STATUS]
-        return reason_words(status.values[3]) if status.values else ()
+        return contract.reason_words(status.values[3]) if status.values else ()
 
     def state(self, now_ns: int) -> dict:
         """Everything known, for scripts. None: not heard yet, or the sender says not to use it."""
@@ -124,12 +115,12 @@ class Corner:
             return round(stream.values[column], digits) if stream.values and stream.usable else None
 
         return {
-            "status": STATUSES.get(force.status, "?"),
+            "status": contract.STATUSES.get(force.status, "?"),
             "clamp_force_kN": value(force, 0, 3),
             "clamp_force_sigma_kN": value(force, 1, 3),
-            "source": _word(SOURCES, force, 3),
+            "source": _word(contract.SOURCES, force, 3),
             "input_age_ms": int(force.values[4]) if force.values else None,
-            "mode": _word(MODES, status, 0),
+            "mode": _word(contract.MODES, status, 0),
             "reasons": list(self.reasons()),
             "stiffness_factor": value(status, 1, 4),
             "contact_angle_rad": value(status, 2, 1),
@@ -138,9 +129,9 @@ class Corner:
             "outer_surface_C": value(heat, 2, 2),
             "outer_mean_C": value(heat, 3, 2),
             "adaptation": {
-                "request": _word(REQUESTS, request, 0),
+                "request": _word(contract.REQUESTS, request, 0),
                 "progress_percent": int(request.values[1]) if request.values else None,
-                "result": _word(RESULTS, request, 2),
+                "result": _word(contract.RESULTS, request, 2),
             },
             "forces_per_s": self.rate_Hz(now_ns),
             "received": sum(stream.received for stream in self.streams),
