@@ -72,8 +72,7 @@ class Finding(msgspec.Struct, kw_only=True):
 
 
 class Placed(msgspec.Struct, kw_only=True):
-    """One unit on the fleet's map: how far it is from its group in its worst cause, in standard deviations and N, and what of
-    that is left when the unit's own noise is taken into account (``shrunk_N``)."""
+    """One unit on the fleet's map: how far it is from its group in its worst cause, in standard deviations and N."""
 
     unit: str
     corner: str
@@ -82,7 +81,6 @@ class Placed(msgspec.Struct, kw_only=True):
     cause: str
     deviation: float
     size_N: float
-    shrunk_N: float
     outlying: bool
 
 
@@ -94,7 +92,6 @@ class Spread(msgspec.Struct, kw_only=True):
     key: str
     unit: str
     mean: float
-    mean_sigma: float
     spread: float
     mean_N: float
     spread_N: float
@@ -294,18 +291,16 @@ class _Study:
     def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
         amounts, rows = readings.of(deviations), readings.ordinary
         spread = np.sqrt((amounts[rows] ** 2).mean(axis=0))
-        noise = readings.noise()
         worst = np.argmax(np.abs(amounts) / spread, axis=1)
         result = []
         for row, (unit, corner) in enumerate(self.keys):
             cause = int(worst[row])
             amount, size = amounts[row, cause], self.directions.size_N[cause]
-            kept = spread[cause] ** 2 / (spread[cause] ** 2 + noise[row, cause] ** 2)
             result.append(
                 Placed(
                     unit=unit, corner=corner, levels={name: str(levels[row]) for name, levels in self.levels.items()},
                     drives=len(self.scores[row]), cause=str(self.causes[cause]), deviation=float(amount / spread[cause]),
-                    size_N=float(amount * size), shrunk_N=float(kept * amount * size), outlying=f"{unit} {corner}" in named,
+                    size_N=float(amount * size), outlying=f"{unit} {corner}" in named,
                 )
             )  # fmt: skip
         return result
@@ -318,7 +313,7 @@ class _Study:
             own = random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row])
             result.append(
                 Spread(
-                    cause=str(cause), key=cause.key, unit=cause.unit, mean=own.mean, mean_sigma=own.sigma, spread=own.spread,
+                    cause=str(cause), key=cause.key, unit=cause.unit, mean=own.mean, spread=own.spread,
                     mean_N=float(own.mean * size), spread_N=float(own.spread * size),
                     noise_N=float(np.median(noise[:, row]) * size),
                 )
