@@ -8,8 +8,9 @@ READY = $(VENV)/.ready
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
 
+# As many processes as cores: threads of linear algebra beside them would only wait for each other.
 test: $(READY) lint
-	$(VENV)/bin/pytest -q -n auto --maxprocesses 4 --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -q -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -17,6 +17,14 @@ settings.load_profile("project")
 
 _ROOT = Path(__file__).parent.parent
 
+#: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache the
+#: first compiles the simulated car and a package with one effect more, the other the estimator: neither does it twice.
+_FIRST = (
+    "test_effects", "test_hypotheses", "test_diagnose", "test_ahead", "test_adapt", "test_fleet", "test_plant", "test_rig",
+    "test_identify_command", "test_foreign_rig_identify", "test_foreign_rig", "test_identify_fit", "test_formats",
+    "test_browser", "test_reload", "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
+)  # fmt: skip
+
 #: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
 _COMPILE = """
 import sys
@@ -28,6 +36,11 @@ from emb_daemon.ahead.library import TARGETS, installed_digest
 from emb_daemon.jit import ENTRIES
 build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.argv[2]))
 """
+
+
+def pytest_collection_modifyitems(items):
+    place = {name: row for row, name in enumerate(_FIRST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.fixture(scope="session")

@@ -102,6 +102,10 @@ def test_command_line_before_environment_before_configuration(monkeypatch):
 
 
 def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
-    monkeypatch.setattr(can, "rc", {"interface": "virtual", "channel": f"test_bus rc {os.getpid()}"})
+    there = {"interface": "virtual", "channel": f"test_bus rc {os.getpid()}"}
+    monkeypatch.setattr(can, "rc", there)
     bus = open_bus(**_options(""), ids=_OURS)
+    with can.Bus(**there) as theirs:
+        theirs.send(can.Message(arbitration_id=0x100, is_extended_id=False, data=bytes(8)))
+        assert _heard(bus, 1) == [(0x100, 0)]
     bus.close()

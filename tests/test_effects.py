@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -18,9 +19,12 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.gear_mesh_ripple import cycle_mean
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.models.wheel import wheel_angle
-from emb_daemon.offline import estimate
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import EFFECTS
+from emb_daemon.plant.scenarios import simulate_log
 from emb_daemon.resources import resource
+from studies.blind import campaign
 
 DT = 0.004
 
@@ -92,10 +96,11 @@ def test_an_effect_that_cannot_be_hooked_in_is_refused(changed, said):
         dataclasses.replace(viscous, **changed)
 
 
-#: A caliper that widens as it warms up, so that the motor angle for a clamp force grows: one file more in the package and
-#: one line in its list, then the log of a brake that does so.
+#: The log of a brake whose caliper widens as it warms up, so that the motor angle for a clamp force grows, for a package with
+#: one file more and one line more in its list.
 _ONE_MORE = """
-import dataclasses
+import pickle, sys
+from pathlib import Path
 import numpy as np
 from emb_daemon import offline
 from emb_daemon.calibration.files import load_calibration
@@ -103,33 +108,35 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.offline.run import held
-from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import simulate_log
 from emb_daemon.resources import resource
-from studies.blind import campaign
 
-calibration = load_calibration(resource("config/calibration.yaml"))
-plant, rng = plant_from_calibration(calibration, seed=5), np.random.default_rng(5)
-log = offline.log_of(simulate_log(plant, campaign(plant, rng, 7), seed=1)[0])
-samples = log.samples.copy()
-knots = np.arange(0.0, log.time_s[-1] + 8.0, 8.0)
-warmth = np.interp(log.time_s, knots, [0.0, *rng.uniform(0.0, 60.0, len(knots) - 1)])
-wider = 1e-6 * 0.8 * warmth / calibration.motor.gear_gain_m_per_rad
-samples["caliper"] += warmth
-samples["angle"] += wider
-samples["speed"] += np.gradient(wider, log.time_s)
+calibration, log = load_calibration(resource("config/calibration.yaml")), pickle.loads(Path(sys.argv[1]).read_bytes())
 for widening in (0.0, 0.8):
     own = moved(calibration, {"effects.own_effect.widening_um_per_K": widening}, checked=True)
-    error = offline.estimate(samples, held(to_parameters(own)))["stiffness_force"] - log.force_N
+    error = offline.estimate(log.samples, held(to_parameters(own)))["stiffness_force"] - log.force_N
     print(np.sqrt(np.nanmean(error**2)))
-result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
+result = diagnose([log], calibration)
 print([(f.effect.name, f.values["widening_um_per_K"]) for f in result.accepted])
 """
 
 
+def _of_a_widening_caliper():
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    plant, rng = plant_from_calibration(calibration, seed=5), np.random.default_rng(5)
+    log = log_of(simulate_log(plant, campaign(plant, rng, 7), seed=1)[0])
+    samples = log.samples.copy()
+    knots = np.arange(0.0, log.time_s[-1] + 8.0, 8.0)
+    warmth = np.interp(log.time_s, knots, [0.0, *rng.uniform(0.0, 60.0, len(knots) - 1)])
+    wider = 1e-6 * 0.8 * warmth / calibration.motor.gear_gain_m_per_rad
+    samples["caliper"] += warmth
+    samples["angle"] += wider
+    samples["speed"] += np.gradient(wider, log.time_s)
+    return dataclasses.replace(log, samples=samples)
+
+
 def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(tmp_path):
     root = Path(emb_daemon.__file__).parent.parent
-    for folder in ("emb_daemon", "studies", "config", "dbc"):
+    for folder in ("emb_daemon", "config", "dbc"):
         shutil.copytree(root / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
     effects = tmp_path / "emb_daemon" / "effects"
     text = (root / "examples" / "own_effect.py").read_text().replace("caliper_widening", "own_effect")
@@ -138,8 +145,9 @@ def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(tmp_pa
     registration.write_text(
         registration.read_text().replace('    "thermocouple_lag",\n', '    "thermocouple_lag",\n    "own_effect",\n')
     )
+    (tmp_path / "log").write_bytes(pickle.dumps(_of_a_widening_caliper()))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-c", _ONE_MORE]
+    command = [sys.executable, "-c", _ONE_MORE, str(tmp_path / "log")]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     without, with_, found = done.stdout.splitlines()

@@ -51,14 +51,13 @@ def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
 
 @pytest.mark.parametrize("name", ["cut.log", "cut.asc"])
 def test_every_format_keeps_payloads_beyond_eight_octets(bus, truth, name):
-    columns = {key: values[:40] for key, values in foreignkit.sampled(truth, 500.0).items()}
+    columns = {key: values[740:780] for key, values in foreignkit.sampled(truth, 500.0).items()}
     mapping = Mapping(bus.parent / "mapping.yaml")
     log = load_log(foreignkit.write_log(bus.parent / name, columns), read=mapping.read)
     expected = load_log(foreignkit.write_log(bus.parent / "cut.blf", columns), read=mapping.read)
     for key in ("angle", "speed", "current_q"):
-        assert (
-            np.abs(log.samples[key] - expected.samples[key]).max() < 0.03 < np.ptp(log.samples[key]) + 1.0 * (key == "angle")
-        )
+        assert np.ptp(log.samples[key]) > 1.0, "the brake stands still"
+        assert np.abs(log.samples[key] - expected.samples[key]).max() < 0.03
 
 
 def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):

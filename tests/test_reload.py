@@ -102,9 +102,9 @@ def test_reload_and_restart_give_the_same_estimates_for_every_key(daemon, drive)
         daemon._begin_anew("FL", calibration, daemon._adaptation.read("FL", calibration))
         _, count = pipeline.consume(after)
         reloaded, samples = pipeline.estimates[:count].copy(), pipeline.samples[:count].copy()
-        restarted, state = np.zeros(count, ESTIMATE), new_state()
+        restarted, state, parameters = np.zeros(count, ESTIMATE), new_state(), to_parameters(calibration)
         for row in range(count):
-            answer_row(samples[row], state[0], to_parameters(calibration), restarted[row])
+            answer_row(samples[row], state[0], parameters, restarted[row])
         different = [name for name in names if reloaded[name].tobytes() != restarted[name].tobytes()]
         assert count > 300 and not different, key
     assert not refused, "no value but its own"
