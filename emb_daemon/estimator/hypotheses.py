@@ -25,7 +25,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     stay_possible,
 )
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -47,7 +47,7 @@ from emb_daemon.models.fusion import (
     update_errors,
     variance_along,
 )
-from emb_daemon.models.stiffness import characteristic_curve, mean_slope
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 
 #: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall
 #: lower, or a later jump would have to make up for the past.
@@ -81,7 +81,8 @@ STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, DRIFT = range(ALTERNATIVES)
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
 #: One hypothesis beside the first. ``log_odds`` against it, and the ``share`` that it has by them; ``slope`` N/rad at
-#: its own contact angle; ``shift`` N: its force over the first one's.
+#: its own contact angle; ``shift`` N: its force over the first one's. What its contact angle, ``moved`` rad from the first
+#: one's, adds: ``drive`` N and ``drive_slope`` N/rad at rest, ``lagged`` and ``lagged_slope`` on the way there.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
@@ -90,6 +91,7 @@ ALTERNATIVE = np.dtype(
         ("share", "f8"),
         ("shift", "f8"),
         ("slope", "f8"),
+        *fields("f8", "moved drive drive_slope lagged lagged_slope"),
     ],
     align=True,
 )
@@ -110,6 +112,8 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.log_odds, a.shift = least_odds(kind), 0.0
+    a.moved = a.drive = a.lagged = 0.0
+    a.drive_slope, a.lagged_slope = s.drive_slope, s.slope
 
 
 @njit
@@ -193,8 +197,12 @@ def unproven(s):
 
 
 @njit
-def place(s, a, p, factor, warmth):
-    """Where an alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
+def place(s, a, p, factor, warmth, dt):
+    """Where an alternative's contact angle, stiffness and growth put the force ``dt`` s after the last sample: its ``shift``
+    and ``slope``.
+
+    Its force lags behind its own way as the first one's does: pads that open at full speed are several radians behind, and
+    a contact angle elsewhere counts with the slope that they have there."""
     x = s.past_contact
     moved = a.error[GROWTH] * warmth - a.error[CONTACT]
     here, _ = characteristic_curve(x, p.curve)
@@ -202,10 +210,14 @@ def place(s, a, p, factor, warmth):
     sigma = sqrt(max(a.covariance[CONTACT, CONTACT], 0.0))
     if sigma > DOUBTFUL_RAD:
         slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
-    # The lag is left out of the difference: it settles within a fraction of the time that a jump takes to be proven.
-    scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))
-    a.shift = max(scaled, 0.0) - s.force
-    a.slope = factor * (1.0 + a.error[SCALE]) * slope
+    # What has been learned of the contact angle since is no motion: it held before.
+    learned, drive = moved - a.moved, factor * (there - here)
+    before = a.drive + a.drive_slope * learned
+    a.lagged = first_order_lag(a.lagged + a.lagged_slope * learned, before, drive, dt, p.relaxation_time)
+    a.lagged_slope = first_order_lag(a.lagged_slope, a.drive_slope, factor * slope, dt, p.relaxation_time)
+    a.moved, a.drive, a.drive_slope = moved, drive, factor * slope
+    a.shift = max((1.0 + a.error[SCALE]) * (s.force + a.lagged), 0.0) - s.force
+    a.slope = (1.0 + a.error[SCALE]) * a.lagged_slope
 
 
 @njit
@@ -289,7 +301,7 @@ def settle(s, p, released, dt):
         if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
-            s.drive += a.shift
+            s.drive = (1.0 + a.error[SCALE]) * (s.drive + a.drive)
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
     if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
@@ -306,12 +318,16 @@ def fold(s, warmth, linear):
     s.contact_angle += contact
     s.scale = min(max(s.scale * (1.0 + scale), LEAST_SCALE), MOST_SCALE)
     s.growth += growth
-    s.past_contact += growth * warmth - contact
-    change = s.slope * (growth * warmth - contact) + s.force * scale if linear else 0.0
+    moved = growth * warmth - contact
+    s.past_contact += moved
+    followed = s.slope * moved if linear else 0.0
+    change = followed + s.force * scale if linear else 0.0
     s.force += change
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
         a.shift -= change
+        a.moved -= moved
+        a.lagged -= followed
         a.error[CONTACT] -= contact
         a.error[SCALE] = (1.0 + a.error[SCALE]) / (1.0 + scale) - 1.0
         a.error[GROWTH] -= growth
