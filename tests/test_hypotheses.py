@@ -28,7 +28,7 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import set_priors
-from emb_daemon.models.fusion import COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
+from emb_daemon.models.fusion import CONTACT, COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
 
@@ -309,6 +309,51 @@ def opened(p):
     state["scale"] = 1.0
     open_all(state[0], p)
     return state
+
+
+@pytest.mark.parametrize("elsewhere_rad", [-0.7, 0.7])
+def test_the_force_of_a_contact_angle_elsewhere_lags_behind_the_motor_too(p, elsewhere_rad):
+    """Closing and opening within 0.3 s: an alternative's force is that of a brake whose contact angle is there."""
+    path = brake.stops(p, 1)
+    rows, _ = brake.samples(p, path)
+    rows["has_current"] = False
+    true = p.copy()
+    true["clearance"] += elsewhere_rad
+    force = brake.samples(true, path)[1]
+    state = new_state()
+    estimate(rows[:300], p, state)
+    a = state["alternatives"][0, STIFFNESS_JUMP]
+    a["error"][CONTACT], a["covariance"][CONTACT] = elsewhere_rad, 0.0
+    a["covariance"][:, CONTACT] = 0.0
+    found = np.zeros(len(rows))
+    for i in range(300, len(rows)):
+        estimate(rows[i : i + 1], p, state)
+        found[i] = state["force"][0] + a["shift"]
+    moving = np.arange(len(rows)) >= 350
+    assert force[moving].max() > 8000.0 and np.abs(found - force)[moving].max() < 100.0
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_pads_that_jumped_after_the_last_stops_will_sooner_jump_again(p, opened, apart):
+    """One stop in eight is not one in four hundred; but pads that touch are not knocked back."""
+    s = opened[0]
+    for _ in range(3):
+        s["past_contact"] = 5.0
+        settle(s, p, False, 0.004)
+        s["past_contact"] = -5.0
+        s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 20.0
+        assert settle(s, p, True, 0.004)
+    s["past_contact"] = -5.0 if apart else 5.0
+    open_again(s, p)
+    knocked = s["alternatives"]["log_odds"][STIFFNESS_JUMP]
+    assert -1.5 < knocked < 0.0 if apart else knocked == PRIOR_ODDS
+    for _ in range(40):
+        s["past_contact"] = 5.0
+        settle(s, p, False, 0.004)
+        s["past_contact"] = -5.0
+        settle(s, p, True, 0.004)
+        open_again(s, p)
+    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] < -4.0
 
 
 def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):

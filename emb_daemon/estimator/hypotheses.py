@@ -52,6 +52,9 @@ from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, m
 #: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall
 #: lower, or a later jump would have to make up for the past.
 PRIOR_ODDS = -6.0
+#: Stops over which is remembered how often the contact or the stiffness jumped: run-out and cornering knock pads back at every
+#: stop or at none.
+_REMEMBERED_STOPS = 8.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
 #: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases that `studies.silent
@@ -112,6 +115,9 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.log_odds, a.shift = least_odds(kind), 0.0
+    if kind == STIFFNESS_JUMP and s.past_contact < 0.0 and s.jump_rate > 0.0:
+        # Only pads that are apart can be knocked back; and those of a brake that has shown it are, again and again.
+        a.log_odds = max(a.log_odds, log(s.jump_rate / (1.0 - s.jump_rate)))
     a.moved = a.drive = a.lagged = 0.0
     a.drive_slope, a.lagged_slope = s.drive_slope, s.slope
 
@@ -295,6 +301,11 @@ def settle(s, p, released, dt):
     While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
     them apart, so nothing is proven before. The mixture does not wait."""
     s.open_s += dt
+    if s.past_contact > 0.0:
+        s.touched = True
+    elif released and s.touched:
+        s.touched = False
+        s.jump_rate -= s.jump_rate / _REMEMBERED_STOPS
     for kind in range(DRIFT if released else 0):
         a = s.alternatives[kind]
         margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
@@ -302,6 +313,8 @@ def settle(s, p, released, dt):
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
             s.drive = (1.0 + a.error[SCALE]) * (s.drive + a.drive)
+            if kind == STIFFNESS_JUMP:
+                s.jump_rate += (1.0 - s.jump_rate) / _REMEMBERED_STOPS
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
     if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
