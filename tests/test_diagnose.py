@@ -15,7 +15,7 @@ from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.diagnose import confirmation, diagnosis, search
+from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.diagnosis import diagnose
@@ -366,6 +366,18 @@ def test_an_effect_is_not_hidden_by_a_calibration_that_is_off(calibration, visco
     # A parameter that is zero is found as well.
     assert load["before"] == 0.0 and load["gain_N"] > 100.0
     assert load["value"] == pytest.approx(calibration.friction.load_m_per_rad, rel=0.2)
+
+
+def test_what_has_a_name_is_called_by_it(viscous):
+    """A term that does what viscous friction does is made where that is taken away, and gives way to it again."""
+    selection, _, _ = viscous
+    channel = selection.candidates["viscous_friction"].channel
+    made = grammar._with_terms(selection.without("viscous_friction", "to see what comes in its place"), channel)
+    [term] = made.accepted
+    assert term.endswith(":motor_speed")
+    named = grammar._called_by_name(made, channel)
+    assert named.accepted == ["viscous_friction"]
+    assert named.candidates[term].reason == "an effect of the catalogue says the same"
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):

@@ -23,7 +23,7 @@ from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import UNITS, Bench, Probe
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import LASTING, Selection, one_round
+from emb_daemon.diagnose.selection import LASTING, Selection, best_known, one_round
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond, sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
@@ -105,6 +105,7 @@ def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
         if _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
+            selection = _called_by_name(_without_side_lobes(selection, channel), channel)
     return selection
 
 
@@ -132,6 +133,66 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     both = one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
     return both if gain > found.screening.floor(found.model, channel) ** 2 else found
+
+
+def _called_by_name(selection: Selection, channel: str) -> Selection:
+    """The same with an effect of the catalogue in the place of each term that it describes as shortly: what has a name is
+    called by it."""
+    for term in [n for n, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]:
+        bare = selection.without(term, "an effect of the catalogue says the same")
+        known = best_known(bare, channel)
+        if known is None:
+            continue
+        named, name = bare.entered([known]), known.effect.name
+        if name in named.accepted and _description(named, [name], channel) <= _description(selection, [term], channel):
+            selection = named
+    return selection
+
+
+def _without_side_lobes(selection: Selection, channel: str) -> Selection:
+    """The same with one ripple in the place of several at a port whose orders no single log resolves, if that is described as
+    shortly: where logs lie far apart, the first may have been a side lobe, which the others had to mend."""
+    trials = selection.model.bench.trials
+    resolved = 2.0 * np.pi / max(float(np.ptp(trial.log.samples["angle"])) for trial in trials)
+    terms = [t for t in selection.model.bench.calibrated(selection.model.values).terms if t.shape == "harmonic"]
+    for port in dict.fromkeys(term.port for term in terms):
+        orders = {t.name: 1.0 / t.scale for t in terms if t.port == port and t.name in selection.accepted}
+        mean = np.mean(list(orders.values())) if orders else 0.0
+        close = [name for name, order in orders.items() if abs(order - mean) < resolved]
+        if len(close) < 2 or selection.channel_of(close[0]) != channel:
+            continue
+        bare = selection
+        for name in close:
+            bare = bare.without(name, "one ripple in the place of several that these logs do not resolve")
+        single = _with_one_ripple(bare, selection.candidates[close[0]])
+        if single and _description(single, single.accepted, channel) <= _description(selection, selection.accepted, channel):
+            selection = single
+    return selection
+
+
+def _with_one_ripple(selection: Selection, like: Candidate) -> Selection | None:
+    """With the ripple that gains most at the port of another one, fitted; None without signals or a gain."""
+    model, channel, port = selection.model, like.channel, like.effect.hook
+    signals = _signals(model)
+    if signals is None:
+        return None
+    search = _Search(model, channel, signals)
+    forms = [form for form in _ripples(search) if form.port == port]
+    columns = [_probed(model, channel, form) for form in forms]
+    found = [model.evidence(channel, own, samples=LASTING[channel]) for own in columns]
+    if not found:
+        return None
+    best, form = max(zip(found, forms, strict=True), key=lambda pair: pair[0].gain)
+    effect = made_effect(form, _name(form, selection))
+    return _entered(selection, replace(like, effect=effect, evidence=best, gain=model.rms(best.gain, channel)), form)
+
+
+def _description(selection: Selection, names: Sequence[str], channel: str) -> float:
+    """Description length of what lasts of a channel's residual, with the numbers of some effects and terms."""
+    model, samples = selection.model, LASTING[channel]
+    left = float(np.square(Screen(model, channel, samples).residual).sum()) - _noise(model, channel, samples)
+    matters = model.counted(channel) * selection.screening.floor(model, channel) ** 2
+    return _nats(max(left, matters), sum(len(model.of_effect(name)) for name in names), model.bench.episodes)
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
@@ -234,7 +295,7 @@ class _Search:
         found = [Prospect(form, own, model.evidence(self.channel, own, samples=samples)) for form, own in pairs]
         moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
-        alone -= model.counted(self.channel) * sample_noise(model.residual[self.channel]) ** 2 / samples
+        alone -= _noise(model, self.channel, samples)
         kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
         return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
 
@@ -421,11 +482,21 @@ def _stays_in_bounds(prospect: Prospect) -> bool:
 
 
 def _length(prospect: Prospect, alone: float, episodes: int) -> float:
-    """What the term adds to the description length of what is left, in nats; an episode counts as one observation.
+    """What the term adds to the description length of what is left, in nats.
 
     ``alone``: squared error of left-out episodes without the term, less the noise that no term explains."""
     left = max(1.0 - prospect.evidence.gain / max(alone, 1e-300), 1e-3)
-    return 0.5 * episodes * np.log(left) + 0.5 * prospect.form.numbers * np.log(episodes)
+    return _nats(left, prospect.form.numbers, episodes)
+
+
+def _nats(left: float, numbers: int, episodes: int) -> float:
+    """Description length of a squared error and the numbers of what left it; an episode counts as one observation."""
+    return 0.5 * episodes * np.log(left) + 0.5 * numbers * np.log(episodes)
+
+
+def _noise(model: Model, channel: str, samples: int) -> float:
+    """Squared error that no term explains, of means over ``samples``."""
+    return model.counted(channel) * sample_noise(model.residual[channel]) ** 2 / samples
 
 
 def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:

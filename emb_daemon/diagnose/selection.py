@@ -96,7 +96,7 @@ class Selection:
         refused = replace(candidate, accepted=False, reason=reason)
         return replace(self.noted([refused]), model=model, dropped=self.dropped | {suspect})
 
-    def _entered(self, winners: list[Candidate]) -> "Selection":
+    def entered(self, winners: list[Candidate]) -> "Selection":
         """Effects accepted, one for each channel, and refitted; one that leaves its channel worse than before goes out."""
         before = self.model
         values, chosen, centre = {}, [], {}
@@ -172,7 +172,17 @@ def one_round(selection: Selection) -> Selection:
     confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
     selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
     selection = selection.noted(Candidate(effect, None, reason=why) for effect, why in apart.items())
-    return selection._entered(winners) if winners else _tried(selection, tested, rivals)
+    return selection.entered(winners) if winners else _tried(selection, tested, rivals)
+
+
+def best_known(selection: Selection, channel: str) -> Candidate | None:
+    """The effect that gains most in a channel, of all that are not in the model and that nothing speaks against; also of those
+    that were dropped."""
+    model, screening = selection.model, selection.screening
+    off = [e for e in REGISTRY if not model.of_effect(e.name) and not _why_not_asked(e, model)]
+    found = [c for c in screening.tested(model, off) if c.channel == channel]
+    passed = [c for c in (screening.judged(model, c, {}, found) for c in found) if not c.reason]
+    return max(passed, key=lambda c: c.evidence.gain, default=None)
 
 
 def _why_not_asked(effect: Effect, model: Model) -> str:
@@ -236,7 +246,7 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
         return selection
     candidate, winner = max(plausible, key=lambda pair: pair[0].gain ** 2 / model.noise(pair[0].channel))
     name, shapes = candidate.effect.name, candidate.p_value / max(candidate.evidence.p_value, 1e-300)
-    entered = selection._entered([winner])
+    entered = selection.entered([winner])
     if name not in entered.accepted:
         return entered
     amplitudes = [c for c in entered.model.of_effect(name) if not is_shape(c)]
