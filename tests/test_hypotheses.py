@@ -28,7 +28,7 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import set_priors
-from emb_daemon.models.fusion import CONTACT, COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
+from emb_daemon.models.fusion import COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
 
@@ -309,28 +309,6 @@ def opened(p):
     state["scale"] = 1.0
     open_all(state[0], p)
     return state
-
-
-@pytest.mark.parametrize("elsewhere_rad", [-0.7, 0.7])
-def test_the_force_of_a_contact_angle_elsewhere_lags_behind_the_motor_too(p, elsewhere_rad):
-    """Closing and opening within 0.3 s: an alternative's force is that of a brake whose contact angle is there."""
-    path = brake.stops(p, 1)
-    rows, _ = brake.samples(p, path)
-    rows["has_current"] = False
-    true = p.copy()
-    true["clearance"] += elsewhere_rad
-    force = brake.samples(true, path)[1]
-    state = new_state()
-    estimate(rows[:300], p, state)
-    a = state["alternatives"][0, STIFFNESS_JUMP]
-    a["error"][CONTACT], a["covariance"][CONTACT] = elsewhere_rad, 0.0
-    a["covariance"][:, CONTACT] = 0.0
-    found = np.zeros(len(rows))
-    for i in range(300, len(rows)):
-        estimate(rows[i : i + 1], p, state)
-        found[i] = state["force"][0] + a["shift"]
-    moving = np.arange(len(rows)) >= 350
-    assert force[moving].max() > 8000.0 and np.abs(found - force)[moving].max() < 100.0
 
 
 @pytest.mark.parametrize("apart", [True, False])

@@ -144,7 +144,7 @@ def _predict(s, p, m, spread, warmth, known):
         if kind == DRIFT and not known:
             add_drift_walks(walked, p, m.wheel_speed != 0.0, m.dt)
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
-        place(s, a, p, s.factor * s.scale, warmth, m.dt)
+        place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
         s.covariance[FAST, FAST] += (lag_error / spread) ** 2

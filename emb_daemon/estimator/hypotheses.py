@@ -25,7 +25,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     stay_possible,
 )
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import njit
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -47,20 +47,20 @@ from emb_daemon.models.fusion import (
     update_errors,
     variance_along,
 )
-from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
+from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 
 #: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall
 #: lower, or a later jump would have to make up for the past.
 PRIOR_ODDS = -6.0
-#: Stops over which is remembered how often the contact or the stiffness jumped: run-out and cornering knock pads back at every
-#: stop or at none.
-_REMEMBERED_STOPS = 8.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
 #: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases that `studies.silent
 #: grid` draws (--count 4 --pairs 24 --seed 11) 151 fail without this hypothesis and 126 with it; on the rig's random logs 98
 #: to 99 % of samples instead of 97 then lie within two sigma, so the odds are no higher.
 _DRIFT_ODDS = -2.0
+#: Stops over which is remembered how often the contact or the stiffness jumped: run-out and cornering knock pads back at every
+#: stop or at none.
+_REMEMBERED_STOPS = 8.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
@@ -84,8 +84,7 @@ STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, DRIFT = range(ALTERNATIVES)
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
 #: One hypothesis beside the first. ``log_odds`` against it, and the ``share`` that it has by them; ``slope`` N/rad at
-#: its own contact angle; ``shift`` N: its force over the first one's. What its contact angle, ``moved`` rad from the first
-#: one's, adds: ``drive`` N and ``drive_slope`` N/rad at rest, ``lagged`` and ``lagged_slope`` on the way there.
+#: its own contact angle; ``shift`` N: its force over the first one's.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
@@ -94,7 +93,6 @@ ALTERNATIVE = np.dtype(
         ("share", "f8"),
         ("shift", "f8"),
         ("slope", "f8"),
-        *fields("f8", "moved drive drive_slope lagged lagged_slope"),
     ],
     align=True,
 )
@@ -118,8 +116,6 @@ def _open(s, p, kind):
     if kind == STIFFNESS_JUMP and s.past_contact < 0.0 and s.jump_rate > 0.0:
         # Only pads that are apart can be knocked back; and those of a brake that has shown it are, again and again.
         a.log_odds = max(a.log_odds, log(s.jump_rate / (1.0 - s.jump_rate)))
-    a.moved = a.drive = a.lagged = 0.0
-    a.drive_slope, a.lagged_slope = s.drive_slope, s.slope
 
 
 @njit
@@ -203,12 +199,8 @@ def unproven(s):
 
 
 @njit
-def place(s, a, p, factor, warmth, dt):
-    """Where an alternative's contact angle, stiffness and growth put the force ``dt`` s after the last sample: its ``shift``
-    and ``slope``.
-
-    Its force lags behind its own way as the first one's does: pads that open at full speed are several radians behind, and
-    a contact angle elsewhere counts with the slope that they have there."""
+def place(s, a, p, factor, warmth):
+    """Where an alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
     x = s.past_contact
     moved = a.error[GROWTH] * warmth - a.error[CONTACT]
     here, _ = characteristic_curve(x, p.curve)
@@ -216,14 +208,10 @@ def place(s, a, p, factor, warmth, dt):
     sigma = sqrt(max(a.covariance[CONTACT, CONTACT], 0.0))
     if sigma > DOUBTFUL_RAD:
         slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
-    # What has been learned of the contact angle since is no motion: it held before.
-    learned, drive = moved - a.moved, factor * (there - here)
-    before = a.drive + a.drive_slope * learned
-    a.lagged = first_order_lag(a.lagged + a.lagged_slope * learned, before, drive, dt, p.relaxation_time)
-    a.lagged_slope = first_order_lag(a.lagged_slope, a.drive_slope, factor * slope, dt, p.relaxation_time)
-    a.moved, a.drive, a.drive_slope = moved, drive, factor * slope
-    a.shift = max((1.0 + a.error[SCALE]) * (s.force + a.lagged), 0.0) - s.force
-    a.slope = (1.0 + a.error[SCALE]) * a.lagged_slope
+    # The lag is left out of the difference: it settles within a fraction of the time that a jump takes to be proven.
+    scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))
+    a.shift = max(scaled, 0.0) - s.force
+    a.slope = factor * (1.0 + a.error[SCALE]) * slope
 
 
 @njit
@@ -312,7 +300,7 @@ def settle(s, p, released, dt):
         if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
-            s.drive = (1.0 + a.error[SCALE]) * (s.drive + a.drive)
+            s.drive += a.shift
             if kind == STIFFNESS_JUMP:
                 s.jump_rate += (1.0 - s.jump_rate) / _REMEMBERED_STOPS
             return True
@@ -331,16 +319,12 @@ def fold(s, warmth, linear):
     s.contact_angle += contact
     s.scale = min(max(s.scale * (1.0 + scale), LEAST_SCALE), MOST_SCALE)
     s.growth += growth
-    moved = growth * warmth - contact
-    s.past_contact += moved
-    followed = s.slope * moved if linear else 0.0
-    change = followed + s.force * scale if linear else 0.0
+    s.past_contact += growth * warmth - contact
+    change = s.slope * (growth * warmth - contact) + s.force * scale if linear else 0.0
     s.force += change
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
         a.shift -= change
-        a.moved -= moved
-        a.lagged -= followed
         a.error[CONTACT] -= contact
         a.error[SCALE] = (1.0 + a.error[SCALE]) / (1.0 + scale) - 1.0
         a.error[GROWTH] -= growth
