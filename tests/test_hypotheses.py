@@ -311,29 +311,6 @@ def opened(p):
     return state
 
 
-@pytest.mark.parametrize("apart", [True, False])
-def test_pads_that_jumped_after_the_last_stops_will_sooner_jump_again(p, opened, apart):
-    """One stop in eight is not one in four hundred; but pads that touch are not knocked back."""
-    s = opened[0]
-    for _ in range(3):
-        s["past_contact"] = 5.0
-        settle(s, p, False, 0.004)
-        s["past_contact"] = -5.0
-        s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 20.0
-        assert settle(s, p, True, 0.004)
-    s["past_contact"] = -5.0 if apart else 5.0
-    open_again(s, p)
-    knocked = s["alternatives"]["log_odds"][STIFFNESS_JUMP]
-    assert -1.5 < knocked < 0.0 if apart else knocked == PRIOR_ODDS
-    for _ in range(40):
-        s["past_contact"] = 5.0
-        settle(s, p, False, 0.004)
-        s["past_contact"] = -5.0
-        settle(s, p, True, 0.004)
-        open_again(s, p)
-    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] < -4.0
-
-
 def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
     """The stiffness path's only stiffness and contact, the torque path's only motor and friction."""
     s = opened[0]

@@ -58,9 +58,6 @@ _GROWTH_ODDS = -8.0
 #: grid` draws (--count 4 --pairs 24 --seed 11) 151 fail without this hypothesis and 126 with it; on the rig's random logs 98
 #: to 99 % of samples instead of 97 then lie within two sigma, so the odds are no higher.
 _DRIFT_ODDS = -2.0
-#: Stops over which is remembered how often the contact or the stiffness jumped: run-out and cornering knock pads back at every
-#: stop or at none.
-_REMEMBERED_STOPS = 8.0
 #: Log odds at which an alternative is proven against the first hypothesis, and against the others; and at which it is
 #: suspected enough to be told.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, -2.0
@@ -113,9 +110,6 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.log_odds, a.shift = least_odds(kind), 0.0
-    if kind == STIFFNESS_JUMP and s.past_contact < 0.0 and s.jump_rate > 0.0:
-        # Only pads that are apart can be knocked back; and those of a brake that has shown it are, again and again.
-        a.log_odds = max(a.log_odds, log(s.jump_rate / (1.0 - s.jump_rate)))
 
 
 @njit
@@ -289,11 +283,6 @@ def settle(s, p, released, dt):
     While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
     them apart, so nothing is proven before. The mixture does not wait."""
     s.open_s += dt
-    if s.past_contact > 0.0:
-        s.touched = True
-    elif released and s.touched:
-        s.touched = False
-        s.jump_rate -= s.jump_rate / _REMEMBERED_STOPS
     for kind in range(DRIFT if released else 0):
         a = s.alternatives[kind]
         margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
@@ -301,8 +290,6 @@ def settle(s, p, released, dt):
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
             s.drive += a.shift
-            if kind == STIFFNESS_JUMP:
-                s.jump_rate += (1.0 - s.jump_rate) / _REMEMBERED_STOPS
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
     if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):

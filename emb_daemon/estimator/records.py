@@ -100,9 +100,6 @@ STATE = np.dtype(
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
         ("open_s", "f8"),
-        # Share of the last stops after which contact or stiffness had jumped, and whether the pads touched since the last one.
-        ("jump_rate", "f8"),
-        ("touched", "?"),
         ("sensitivity", "f8", (2, STATES)),
         # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)
         # takes away, rad/K: learned.
