@@ -59,7 +59,7 @@ def _lose_counts(samples, share):
 
 @pytest.mark.parametrize("share", [0.03, 0.05])
 def test_counts_that_are_lost_on_the_way_show_when_the_motor_stands(share):
-    """A few millimetres of a turn in each sample are no jump; a stroke's are tens of micrometres of contact angle."""
+    """Some hundredths of a radian in each sample are no jump; those of a stroke are tens of micrometres at the pads."""
     estimates, force = city.changed(lambda samples: _lose_counts(samples, share))
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < city.BEFORE_RELEASE, "in the first hold"
