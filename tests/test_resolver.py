@@ -52,6 +52,35 @@ def test_a_zero_that_drifts_while_the_motor_stands_is_found_and_the_torque_goes_
     assert np.all(error < 4.0 * np.hypot(estimates["sigma"], 25.0))
 
 
+def _lose_counts(samples, share):
+    """A ``share`` of the way is not counted while the motor closes."""
+    samples["angle"] -= share * np.cumsum(np.maximum(np.diff(samples["angle"], prepend=samples["angle"][0]), 0.0))
+
+
+@pytest.mark.parametrize("share", [0.03, 0.05])
+def test_counts_that_are_lost_on_the_way_show_when_the_motor_stands(share):
+    """Some hundredths of a radian in each sample are no jump; those of a stroke are tens of micrometres at the pads."""
+    estimates, force = city.changed(lambda samples: _lose_counts(samples, share))
+    told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
+    assert len(told) and told[0] < city.BEFORE_RELEASE, "in the first hold"
+    assert np.all(estimates["source"][told[0] + 1 :] == r.TORQUE_ONLY)
+    error = np.abs(estimates["force"] - force)[told[0] :]
+    assert np.all(error < 4.0 * np.hypot(estimates["sigma"][told[0] :], 25.0))
+
+
+def test_an_angle_that_is_late_has_not_strayed_where_part_of_its_way_was_not_seen():
+    """Lost samples in the middle of a fast stroke: the way before them is unknown, and what is left of it ends late."""
+    samples, _ = city.drive()
+    samples = samples.copy()
+    samples["angle"][3:] = samples["angle"][:-3].copy()
+    middle = 1250 + int(np.argmax(samples["speed"][1250 : city.HOLDING]))
+    gap = slice(middle - 5, middle)
+    samples["dt"][middle] += samples["dt"][gap].sum()
+    assert samples["speed"][middle] * 3 * 0.004 > 0.5, "late by more than any noise"
+    samples = np.delete(samples, gap)
+    assert not np.any(city.estimated(samples)["reasons"] & r.OUT_OF_RANGE)
+
+
 def test_an_angle_that_stays_while_the_brake_opens_is_found_though_its_speed_flickers():
     """Slipped on its shaft from a hold of 7 kN: the noise of its speed goes on."""
     noise = np.random.default_rng(0).normal(0.0, 0.3, 4000)

@@ -397,7 +397,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
             PRESLIDING_ANGLE: float(sigmas[_PRESLIDING] * values[PRESLIDING_ANGLE]),
         },
         contact_angle=float(x[_CONTACT]),
-        contact_sigma=fit.contact_sigma,
+        contact_sigma=float(sigmas[_CONTACT]) if unchanged else fit.contact_sigma,
         torque_error=expm1(-x[_GAIN]),
         torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
         evidence={

@@ -32,6 +32,10 @@ SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: A motor stands below this speed; offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations
 #: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
 _STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
+#: From one standstill to the next angle and integrated speed must agree, whatever their delay: time for which the motor has to
+#: stand for that, and of which no more counts before the next way, s; and share of the way by which the speed's scale may be
+#: off (speeds that change within a cycle).
+_AT_REST_S, _STOOD_S, _SPEED_SCALE = 0.1, 1.0, 0.005
 #: Standard deviations of the contact angle, rad: known again below, and unknown.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Torque that a released brake may seem to need, share of what the largest force needs: the offset of an ordinary current
@@ -52,7 +56,8 @@ def follow_zero(s, p, m):
     contact angle goes with it.
 
     How far it went is known from the speed. Where the resolver had been repeating itself the motor may have turned on, and
-    what is no motion at all may be anything: then the contact angle becomes uncertain by as much.
+    what is no motion at all may be anything: then the contact angle becomes uncertain by as much. A resolver that loses counts
+    does so a little in each sample, which shows when the motor stands again; it will lose more, and is disbelieved.
     """
     jump = m.angle - s.angle
     frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
@@ -60,22 +65,38 @@ def follow_zero(s, p, m):
     reach = p.maximum_speed * (m.dt + frozen_s)
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
-    slip = jump - 0.5 * (m.speed + s.speed) * m.dt
+    turned = 0.5 * (m.speed + s.speed) * m.dt
+    slip = jump - turned
     unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
     if abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
         moved, sigma = jump, reach
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
         moved, sigma = slip, _ZERO_RAD
-    elif seen and max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
-        s.drifted = s.stood_s = 0.0
     elif seen:
-        s.drifted += slip
-        s.stood_s += m.dt
-        noise = p.speed_sigma * sqrt(CYCLE_S * s.stood_s)
-        if abs(s.drifted) > _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * s.stood_s + _CERTAIN * noise:
-            moved, sigma = s.drifted, abs(s.drifted)
+        s.strayed += slip
+        s.turned += turned
+        s.turned_s += m.dt
+        if max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
+            s.drifted = s.stood_s = 0.0
+        else:
+            s.drifted += slip
+            s.stood_s += m.dt
+        if abs(s.drifted) > _unaccounted(p, s.stood_s):
+            moved = s.drifted
+        elif s.stood_s > _AT_REST_S:
+            # Only where a way has just ended: at the beginning of the next, a late speed has not yet seen what the angle has.
+            ended = s.stood_s - m.dt <= _AT_REST_S
+            if ended and abs(s.strayed) > _unaccounted(p, s.turned_s) + _SPEED_SCALE * abs(s.turned):
+                moved = s.strayed
+            if ended or s.turned_s > _STOOD_S:
+                s.strayed = s.turned = s.turned_s = 0.0
+        if moved != 0.0:
+            sigma = abs(moved)
             s.drifting_s = _DRIFTING_S
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
+    if moved != 0.0 or not seen:
+        # Of a way that was not seen whole nothing can be said at its end.
+        s.strayed = np.nan
     if moved == 0.0:
         return False
     s.drifted = s.stood_s = 0.0
@@ -89,6 +110,12 @@ def follow_zero(s, p, m):
     open_again(s, p)
     s.contact.confirmed = False
     return True
+
+
+@njit
+def _unaccounted(p, seconds):
+    """Travel (rad) beyond the integrated speed of so many ``seconds`` that neither its noise nor its offset make."""
+    return _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * seconds + _CERTAIN * p.speed_sigma * sqrt(CYCLE_S * seconds)
 
 
 @njit

@@ -85,6 +85,9 @@ STATE = np.dtype(
         *fields("f8", "rested_s clearance clearance_sigma since_start_s still_s start_angle"),
         # Angle (rad) gone without speed since the motor stands, and for how long; time for which that still counts.
         *fields("f8", "drifted stood_s drifting_s"),
+        # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
+        # turned, s; the first is no number where part of the way was not seen.
+        *fields("f8", "strayed turned turned_s"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
