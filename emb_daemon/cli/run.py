@@ -14,6 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
+    parser.add_argument(
+        "--share", type=Path, metavar="FILE", help="file, in a folder kept in memory, for the estimates of every tick: xcp reads it"
+    )
     add_bus_arguments(parser)
 
 
@@ -61,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         bus, keyless = secure(bus, setup, state)
     daemon = Daemon(setup, bus, ServiceManager(), state)
     daemon.pipeline.distrust(keyless)
+    if arguments.share:
+        daemon.share(arguments.share)
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()
     if compiled_for_the_next_start():
