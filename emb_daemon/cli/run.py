@@ -15,7 +15,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="YAML that maps another rig's signals to ours")
     parser.add_argument(
-        "--share", type=Path, metavar="FILE", help="file, in a folder kept in memory, for the estimates of every tick: xcp reads it"
+        "--share",
+        type=Path,
+        metavar="FILE",
+        help="file in a folder kept in memory, for the estimates of every tick: xcp reads it",
     )
     add_bus_arguments(parser)
 

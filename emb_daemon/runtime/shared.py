@@ -78,7 +78,8 @@ class SharedEstimates:
             middle = min(end, start + ROWS - place)
             for ring, rows in self._copies:
                 ring[place : place + middle - start] = rows[start:middle]
-                ring[: end - middle] = rows[middle:end]
+                if middle < end:
+                    ring[: end - middle] = rows[middle:end]
             self._count += end - start
             # Last: what it counts is there.
             self._written[0] = self._count

@@ -1,4 +1,4 @@
-"""The A2L file (ASAM MCD-2 MC 1.61) of what `image` shows: signals from `interface.signals`, numbers from `interface.places`."""
+"""The A2L file (ASAM MCD-2 MC 1.61) of what `image` shows: signals of `interface.signals`, numbers of `interface.places`."""
 
 import hashlib
 import sys

@@ -56,12 +56,14 @@ class Image:
 
     def pages_of(self, samples: np.ndarray, estimates: np.ndarray) -> list[bytes]:
         """The page of signals that each row gives."""
+        if not len(samples):
+            return []
         halves = [np.ascontiguousarray(rows) for rows in (samples, estimates)]
         pages = np.zeros((len(samples), len(INPUTS) + len(OUTPUTS)), "<u4")
         for rows, (columns, words) in zip(halves, self._floats, strict=True):
             # A number that no float holds is infinite.
             with np.errstate(over="ignore", invalid="ignore"):
-                values = rows.view("f8").reshape(len(rows), rows.dtype.itemsize // 8)[:, words].astype("<f4")
+                values = rows.view("f8").reshape(len(rows), -1)[:, words].astype("<f4")
             pages[:, columns] = values.view("<u4")
         for column, out, kind, offset in self._others:
             rows = halves[out]
