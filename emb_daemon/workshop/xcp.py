@@ -37,11 +37,7 @@ _TEXT = 0xFF
 
 
 class Refusal(Exception):
-    """A command that is answered by an error code."""
-
-    def __init__(self, code: int):
-        super().__init__(code)
-        self.code = code
+    """A command that is answered by the error code that it has as its argument."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +145,12 @@ class Slave:
                 raise Refusal(SYNTAX)
             return bytes([_RESPONSE]) + action(*layout.unpack_from(packet, 1))
         except Refusal as refusal:
-            return bytes([_ERROR, refusal.code])
+            return bytes([_ERROR, *refusal.args])
 
     def end(self) -> None:
         """Forget the session."""
         self.connected = False
         self._reset()
-
-    # --- Session and memory -----------------------------------------------------------------------------------------------
 
     def _connect(self, _mode: int) -> bytes:
         self._reset()
@@ -187,25 +181,18 @@ class Slave:
 
     def _upload(self, count: int) -> bytes:
         extension, address = self._address
-        content = self._read(extension, address, count)
-        self._address = extension, address + count
-        return content
-
-    def _short_upload(self, count: int, extension: int, address: int) -> bytes:
-        content = self._read(extension, address, count)
-        self._address = extension, address + count
-        return content
-
-    def _read(self, extension: int, address: int, count: int) -> bytes:
         if not 0 < count < self._transport.max_cto:
             raise Refusal(OUT_OF_RANGE)
         offered = self._text[address : address + count]
         content = offered if extension == _TEXT else self._memory.read(extension, address, count)
         if content is None or len(content) < count:
             raise Refusal(ACCESS_DENIED)
+        self._address = extension, address + count
         return content
 
-    # --- Configuration of acquisition -------------------------------------------------------------------------------------
+    def _short_upload(self, count: int, extension: int, address: int) -> bytes:
+        self._address = extension, address
+        return self._upload(count)
 
     def _resolution(self) -> bytes:
         largest = min(self._transport.max_dto - 1, 0xFF)
@@ -292,8 +279,6 @@ class Slave:
         chosen = self._list(number)
         mode = _TIMESTAMP * chosen.timestamps | _SELECTED * chosen.selected | _RUNNING * chosen.running
         return struct.pack("<BxxHBB", mode, chosen.event or 0, chosen.prescaler, 0)
-
-    # --- Acquisition ------------------------------------------------------------------------------------------------------
 
     def _start_stop_list(self, mode: int, number: int) -> bytes:
         chosen = self._list(number)
