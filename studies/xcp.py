@@ -156,7 +156,7 @@ def _judge(port: int, share: Path, seconds: float) -> int:
     master.ask("B", 0xFE)
     master.close()
     came = sum(master.packets.values())
-    steps = np.concatenate([np.diff(np.array(stamps, np.uint32)).astype(np.int64) for stamps in master.stamps.values()])
+    steps = np.concatenate([np.diff(np.array(stamps, np.uint32)).astype(np.int32) for stamps in master.stamps.values()])
     print(f"{seconds:g} s: {rows} rows written, {came} packets came, {came / seconds / len(CORNERS):.2f} a second and corner")
     print(f"lost: {master.gaps} by the packet counter, {master.overloads} overloads")
     print(f"steps of the time stamps, ms: median {np.median(steps) / 1e3:.3f}, longest {steps.max() / 1e3:.1f}")

@@ -257,7 +257,7 @@ class _Served:
         self._file = make_a2l({"FL": setup.calibrations["FL"]}).encode()
         self.measurement = Measurement(path, transport, VERSION.encode(), NAME.encode(), self._file)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):
@@ -330,9 +330,11 @@ def _acquire(master, names, prescaler=1):
 def over_udp(tmp_path):
     pytest.importorskip("pyxcp", reason="NOT RUN: pyxcp is not installed")
     served = _Served(tmp_path / "estimates", Udp("127.0.0.1", 0))
-    with _master("Eth", host="127.0.0.1", port=served.transport.port, protocol="UDP") as (master, received):
-        yield served, master, received
-    served.stop()
+    try:
+        with _master("Eth", host="127.0.0.1", port=served.transport.port, protocol="UDP") as (master, received):
+            yield served, master, received
+    finally:
+        served.stop()
 
 
 def test_a_master_reads_the_version_signals_and_parameters(over_udp):
