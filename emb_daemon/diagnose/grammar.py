@@ -105,7 +105,7 @@ def made(selection: Selection, progress: Callable[[str], None]) -> Selection:
         if _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
-            selection = _called_by_name(_without_side_lobes(selection, channel), channel)
+            selection = _called_by_name(selection, channel)
     return selection
 
 
@@ -144,55 +144,17 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
         if known is None:
             continue
         named, name = bare.entered([known]), known.effect.name
-        if name in named.accepted and _description(named, [name], channel) <= _description(selection, [term], channel):
+        if name in named.accepted and _description(named, name, channel) <= _description(selection, term, channel):
             selection = named
     return selection
 
 
-def _without_side_lobes(selection: Selection, channel: str) -> Selection:
-    """The same with one ripple in the place of several at a port whose orders no single log resolves, if that is described as
-    shortly: where logs lie far apart, the first may have been a side lobe, which the others had to mend."""
-    trials = selection.model.bench.trials
-    resolved = 2.0 * np.pi / max(float(np.ptp(trial.log.samples["angle"])) for trial in trials)
-    terms = [t for t in selection.model.bench.calibrated(selection.model.values).terms if t.shape == "harmonic"]
-    for port in dict.fromkeys(term.port for term in terms):
-        orders = {t.name: 1.0 / t.scale for t in terms if t.port == port and t.name in selection.accepted}
-        mean = np.mean(list(orders.values())) if orders else 0.0
-        close = [name for name, order in orders.items() if abs(order - mean) < resolved]
-        if len(close) < 2 or selection.channel_of(close[0]) != channel:
-            continue
-        bare = selection
-        for name in close:
-            bare = bare.without(name, "one ripple in the place of several that these logs do not resolve")
-        single = _with_one_ripple(bare, selection.candidates[close[0]])
-        if single and _description(single, single.accepted, channel) <= _description(selection, selection.accepted, channel):
-            selection = single
-    return selection
-
-
-def _with_one_ripple(selection: Selection, like: Candidate) -> Selection | None:
-    """With the ripple that gains most at the port of another one, fitted; None without signals or a gain."""
-    model, channel, port = selection.model, like.channel, like.effect.hook
-    signals = _signals(model)
-    if signals is None:
-        return None
-    search = _Search(model, channel, signals)
-    forms = [form for form in _ripples(search) if form.port == port]
-    columns = [_probed(model, channel, form) for form in forms]
-    found = [model.evidence(channel, own, samples=LASTING[channel]) for own in columns]
-    if not found:
-        return None
-    best, form = max(zip(found, forms, strict=True), key=lambda pair: pair[0].gain)
-    effect = made_effect(form, _name(form, selection))
-    return _entered(selection, replace(like, effect=effect, evidence=best, gain=model.rms(best.gain, channel)), form)
-
-
-def _description(selection: Selection, names: Sequence[str], channel: str) -> float:
-    """Description length of what lasts of a channel's residual, with the numbers of some effects and terms."""
+def _description(selection: Selection, name: str, channel: str) -> float:
+    """Description length of what lasts of a channel's residual, with the numbers of one effect or term."""
     model, samples = selection.model, LASTING[channel]
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - _noise(model, channel, samples)
     matters = model.counted(channel) * selection.screening.floor(model, channel) ** 2
-    return _nats(max(left, matters), sum(len(model.of_effect(name)) for name in names), model.bench.episodes)
+    return _nats(max(left, matters), len(model.of_effect(name)), model.bench.episodes)
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
@@ -255,7 +217,13 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
         over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
     )  # fmt: skip
-    return selection.noted([candidate]) if against else _entered(selection, candidate, best.form)
+    if against:
+        return selection.noted([candidate])
+    # Side lobes that do as well here are told from the ripple itself by a fit with everything else.
+    lobes = [p for p in prospects if p.means == best.means and p.form.shape == best.form.shape == "harmonic"]
+    close = [p for p in lobes if p is not best and p.evidence.gain >= _AS_GOOD * best.evidence.gain]
+    fitted = [_entered(selection, replace(candidate, evidence=p.evidence), p.form) for p in (best, *close)]
+    return min(fitted, key=lambda s: s.model.noise(channel))
 
 
 def _signals(model: Model) -> list[np.ndarray] | None:
@@ -465,8 +433,26 @@ def _ripples(search: _Search) -> list[Form]:
             harmonic=Harmonic("o", "c", "s", grows_with="port"),
         )  # fmt: skip
         orders, _ = strongest_orders(search.model, effect, search.channel, {"port": search.sensitivities[port]}, _LOBES)
-        found += [harmonic(port, order, search.model.bench.middle, search.covered) for order in orders]
+        found += [harmonic(port, _order(search, port, o), search.model.bench.middle, search.covered) for o in orders]
     return found
+
+
+def _order(search: _Search, port: str, order: float) -> float:
+    """A ripple's order where it explains most, within half a lobe of one found by its spectrum."""
+    screen, (low, high) = search.screen, search.covered["motor_angle"]
+    angle = np.concatenate(search.signals)[:, list(SIGNALS).index("motor_angle")] - search.model.bench.middle
+    does = search.sensitivities[port] * screen.keep
+
+    def gain(tried: float) -> float:
+        both = np.column_stack([does * np.cos(tried * angle), does * np.sin(tried * angle)])
+        columns = screen.beside_nuisances(screen.means.of(both))
+        u = columns.T @ screen.residual[:, 0]
+        return float(u @ np.linalg.pinv(columns.T @ columns, hermitian=True) @ u)
+
+    # Of all places together a lobe is as wide as this.
+    lobe = 2.0 * np.pi / max(high - low, 1.0)
+    tried = (order + lobe * np.linspace(-0.5, 0.5, 2 * _TRIES + 1)).tolist()
+    return max((o for o in tried if o > 0.0), key=gain)
 
 
 # -- judging ----------------------------------------------------------------------------------------------------------
