@@ -248,7 +248,8 @@ def test_a_running_list_is_not_changed():
 def test_a_list_that_no_frame_carries_is_not_started():
     slave = _slave(ON_CAN)
     for command in ("ff 00", "d6", "d5 00 01 00", "d4 00 00 00 01", "d3 00 00 00 00 02", "e2 00 00 00 00 00",
-                    "e1 ff 04 00 00 00 00 00", "e0 10 00 00 00 00 01 00", "de 02 00 00", "e1 ff 04 00 00 00 00 00"):  # fmt: skip
+                    "e1 ff 04 00 00 00 00 00",
+                    "e0 10 00 00 00 00 01 00", "de 02 00 00", "e1 ff 04 00 00 00 00 00"):  # fmt: skip
         assert slave.answer(bytes.fromhex(command))[0] == 0xFF, command
     for command in ("dd 01", "de 01 00 00"):
         assert slave.answer(bytes.fromhex(command)) == bytes([0xFE, xcp.DAQ_CONFIG]), command
