@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit fleet
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit fleet measurement
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -85,6 +85,11 @@ audit: $(SUPPLY)/pip-audit
 FLEET_SEED ?= 1
 fleet: $(READY)
 	$(VENV)/bin/python -m studies.fleet --seed $(FLEET_SEED)
+
+# Ten minutes of four corners at 250 Hz over XCP; fails if one packet is missing.
+MEASUREMENT_SECONDS ?= 600
+measurement: $(READY)
+	$(VENV)/bin/python -m studies.xcp $(MEASUREMENT_SECONDS)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

@@ -3,7 +3,7 @@ _emb_daemon() {
     local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} options=
     COMPREPLY=()
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose fleet effect simulate monitor files compile export uds bench adaptation --help --version" -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W "demo run check replay convert identify diagnose fleet effect simulate monitor files compile export uds xcp a2l bench adaptation --help --version" -- "$word")
         return
     fi
     case $before in
@@ -13,7 +13,7 @@ _emb_daemon() {
     esac
     case ${COMP_WORDS[1]} in
         demo) options="--corners --seconds --picture" ;;
-        run) options="--config --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        run) options="--config --mapping --share -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         check) options="--config --mapping" ;;
         replay) options="--calibration --mapping --corner --from --to --pad-thickness --measured-torque --state --keys --output --report --json" ;;
         convert) options="--mapping --output" ;;
@@ -27,6 +27,8 @@ _emb_daemon() {
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;
         uds) options="--config --state --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        xcp) options="--config --share --udp --can --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        a2l) options="--config --output" ;;
         bench) options="--seconds --corners --json" ;;
         adaptation) options="--state --corner --yes" ;;
     esac

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from collections.abc import Collection
 
 from emb_daemon.errors import InputError
 
@@ -14,6 +15,28 @@ def add_bus_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("-b", "--bitrate", type=int, help="bit/s, for interfaces that set it")
     group.add_argument("--fd", action="store_true", help="open a CAN FD bus; only classic frames are used")
     group.add_argument("--bus-kwargs", nargs="+", metavar="KEY=VALUE", default=[], help="further arguments of the interface")
+
+
+def add_id_arguments(parser: argparse.ArgumentParser, request_id: int, response_id: int) -> None:
+    """--request-id and --response-id of a server on the bus."""
+    for name, default in (("request", request_id), ("response", response_id)):
+        parser.add_argument(
+            f"--{name}-id", type=_can_id, default=default, metavar="ID", help=f"11-bit CAN id of {name}s ({default:#x})"
+        )
+
+
+def _can_id(text: str) -> int:
+    value = int(text, 0)
+    if not 0 <= value <= 0x7FF:
+        raise ValueError
+    return value
+
+
+def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
+    """Raises InputError if an id of `add_id_arguments` is not the server's alone."""
+    for name in ("request_id", "response_id"):
+        if getattr(arguments, name) in taken or arguments.request_id == arguments.response_id:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(arguments, name):#x}: expected an id that nobody else has")
 
 
 def bus_options(arguments: argparse.Namespace, defaults=None) -> dict:

@@ -26,6 +26,8 @@ COMMANDS = {
     "compile": "the kernels as one library, for a daemon without a compiler",
     "export": "the estimator for C programs and simulators: a header, or an FMU",
     "uds": "trouble codes and data for a workshop's tester, over UDS",
+    "xcp": "measured on a test bench: the estimator's signals and parameters, over XCP",
+    "a2l": "the description of those signals and parameters for a measurement tool",
     "bench": "whether this machine can hold the loop",
     "adaptation": "show, reset or list what park brake adaptation has learned",
 }
@@ -40,7 +42,7 @@ _EXTRAS = dict.fromkeys(("matplotlib", "plotly", "pyarrow", "scipy"), "offline")
 #: Commands that end in one of them and begin with long work.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly"), "fleet": ("distributed",)}
 #: Commands of a box without a compiler; all others need numba.
-_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "adaptation")
+_WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "xcp", "a2l", "adaptation")
 
 
 def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:

@@ -15,6 +15,12 @@ EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
     add_mapping_argument(parser)
+    parser.add_argument(
+        "--share",
+        type=Path,
+        metavar="FILE",
+        help="file in a folder kept in memory, for the estimates of every tick: xcp reads it",
+    )
     add_bus_arguments(parser)
 
 
@@ -60,6 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
         bus, keyless = secure(bus, setup, state)
     daemon = Daemon(setup, bus, ServiceManager(), state)
     daemon.pipeline.distrust(keyless)
+    if arguments.share:
+        daemon.share(arguments.share)
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()
     if compiled_for_the_next_start():

@@ -5,17 +5,9 @@ import signal
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.errors import InputError
+from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids
 
 EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
-
-
-def _can_id(text: str) -> int:
-    value = int(text, 0)
-    if not 0 <= value <= 0x7FF:
-        raise ValueError
-    return value
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,8 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--state", type=Path, metavar="DIR", help="the daemon's state directory; trouble codes are kept there too "
         "(default: $STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon)"
     )  # fmt: skip
-    parser.add_argument("--request-id", type=_can_id, default=0x710, metavar="ID", help="11-bit CAN id of requests (0x710)")
-    parser.add_argument("--response-id", type=_can_id, default=0x718, metavar="ID", help="11-bit CAN id of responses (0x718)")
+    add_id_arguments(parser, 0x710, 0x718)
     add_bus_arguments(parser)
 
 
@@ -38,9 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     configuration = Setup(arguments.config).configuration
     listened = Listener().ids
-    for name in ("request_id", "response_id"):
-        if getattr(arguments, name) in listened or arguments.request_id == arguments.response_id:
-            raise InputError(f"--{name.replace('_', '-')} {getattr(arguments, name):#x}: expected an id that nobody else has")
+    check_ids(arguments, listened)
     state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
     stopped = []

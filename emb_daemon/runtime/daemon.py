@@ -24,6 +24,7 @@ from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.shared import SharedEstimates
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire import contract
 from emb_daemon.wire.contract import CYCLE_NS
@@ -132,6 +133,7 @@ class Daemon:
         self._adaptation = Adaptation(setup.calibrations, Memory(state), _real_time, threaded=True) if state else None
         corners = tuple(setup.configuration.corners)
         self.pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
+        self._shared: SharedEstimates | None = None
         self.ticks = self.missed = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)
         #: Since the watchdog was last thought of: ticks run and missed until then, corners estimated, and lost.
@@ -157,6 +159,10 @@ class Daemon:
     def reload(self) -> None:
         """Ask for the calibrations to be read again; safe in a signal handler."""
         self._reload_wanted = True
+
+    def share(self, path: Path) -> None:
+        """Let other processes read the estimates of every tick in a file. Raises OSError if it cannot be written."""
+        self._shared = SharedEstimates(path, self.pipeline)
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
@@ -215,6 +221,8 @@ class Daemon:
         self._manager.notify("STOPPING=1")
         if self._adaptation:
             self._adaptation.close(self.pipeline.states, self.pipeline.parameters)
+        if self._shared:
+            self._shared.close()
         log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
 
     def tick(self, now_ns: int, pacer: Pacer) -> None:
@@ -227,6 +235,8 @@ class Daemon:
                 count = pipeline.overdue(heard_ns, count)
             pipeline.answer(count)
             self._bus.send(pipeline.broadcast(count))
+            if self._shared:
+                self._shared.write(count)
             self._follow(count, pacer)
             if start >= len(frames):
                 break

@@ -1,0 +1,152 @@
+"""The estimates of every tick in memory that another process reads: a ring of rows, and the parameters in use.
+
+The loop copies and waits for nobody; who reads too late loses rows, and is told how many.
+"""
+
+import hashlib
+import mmap
+import os
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
+from emb_daemon.wire.layout import CORNERS
+
+#: Rows in the ring: two seconds of four corners at 250 Hz, for a reader that runs when nobody else wants to.
+ROWS = 2048
+#: The newest of them are read, so that none is written over meanwhile; more are not written before they are counted.
+_READABLE, _AT_ONCE = ROWS // 2, ROWS // 4
+#: Ticks after which the parameters of the next corner are told: what adaptation learns is at most a second old.
+_PARAMETERS_TICKS = 50
+
+#: The whole file. ``written`` counts rows since the daemon's start; row ``n`` stands at ``n % ROWS``.
+SHARED = np.dtype(
+    [
+        ("layout", "S16"),
+        ("written", "i8"),
+        ("parameters", PARAMETERS, (len(CORNERS),)),
+        ("samples", SAMPLE, (ROWS,)),
+        ("estimates", ESTIMATE, (ROWS,)),
+    ],
+    align=True,
+)
+#: Of the records above, which writer and reader must agree on.
+LAYOUT_DIGEST = hashlib.sha256(repr((SHARED.descr, SHARED.itemsize)).encode()).hexdigest()[:16].encode()
+
+
+def _field(memory, name: str) -> np.ndarray:
+    kind, offset = SHARED.fields[name][:2]
+    return np.frombuffer(memory, kind.base, int(np.prod(kind.shape)), offset)
+
+
+def _bytes_of(rows: np.ndarray) -> np.ndarray:
+    """Rows as bytes, shape (rows, size): copied as they are, not field by field."""
+    return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
+
+
+class SharedEstimates:
+    """The loop's side.
+
+    Args:
+        path: the file, in a folder that is kept in memory, such as /run: on a disk, the loop would wait for it.
+        pipeline: whose rows and parameters are told.
+    """
+
+    def __init__(self, path: Path, pipeline):
+        """Raises OSError if the file cannot be written."""
+        content = np.zeros((), SHARED)
+        content["layout"], content["parameters"] = LAYOUT_DIGEST, pipeline.parameters
+        self.path = path
+        # Under its name only when it is whole; who reads the file of an earlier start keeps that one.
+        write_atomically(path, content.tobytes())
+        with open(path, "r+b") as file:
+            memory = mmap.mmap(file.fileno(), SHARED.itemsize)
+        self._written = _field(memory, "written")
+        self._copies = [
+            (_bytes_of(_field(memory, name)), _bytes_of(rows))
+            for name, rows in (("samples", pipeline.samples), ("estimates", pipeline.estimates))
+        ]
+        self._parameters = _bytes_of(_field(memory, "parameters")), _bytes_of(pipeline.parameters)
+        self._count = self._ticks = 0
+
+    def write(self, count: int) -> None:
+        """Tell the pipeline's first ``count`` rows."""
+        for start in range(0, count, _AT_ONCE):
+            end, place = min(start + _AT_ONCE, count), self._count % ROWS
+            middle = min(end, start + ROWS - place)
+            for ring, rows in self._copies:
+                ring[place : place + middle - start] = rows[start:middle]
+                if middle < end:
+                    ring[: end - middle] = rows[middle:end]
+            self._count += end - start
+            # Last: what it counts is there.
+            self._written[0] = self._count
+        self._ticks += 1
+        if self._ticks % _PARAMETERS_TICKS == 0:
+            corner, (shared, used) = self._ticks // _PARAMETERS_TICKS % len(CORNERS), self._parameters
+            shared[corner] = used[corner]
+
+    def close(self) -> None:
+        """Take the file away."""
+        self.path.unlink(missing_ok=True)
+
+
+class EstimatesReader:
+    """The other side, which may start before the daemon and outlive it.
+
+    Attributes:
+        connected: whether a daemon's file is read.
+        trouble: why the file that is there is not read; empty if it is, or there is none.
+        parameters: PARAMETERS array, shape (4,), as the daemon uses them; zeros before it was heard.
+    """
+
+    def __init__(self, path: Path):
+        self.path, self.trouble = path, ""
+        self.parameters = np.zeros(len(CORNERS), PARAMETERS)
+        self._inode = self._taken = self._seen = 0
+        self._memory: mmap.mmap | None = None
+
+    @property
+    def connected(self) -> bool:
+        return self._memory is not None
+
+    def look(self) -> None:
+        """Find the file of a daemon that has started or started anew; costs a system call."""
+        try:
+            with open(self.path, "rb") as file:
+                status = os.fstat(file.fileno())
+                if status.st_ino == self._inode:
+                    return
+                self._inode, self._memory = status.st_ino, None
+                if status.st_size != SHARED.itemsize or file.read(len(LAYOUT_DIGEST)) != LAYOUT_DIGEST:
+                    self.trouble = f"{self.path}: written by another version of the daemon"
+                    return
+                self._memory = mmap.mmap(file.fileno(), SHARED.itemsize, access=mmap.ACCESS_READ)
+        except FileNotFoundError:
+            self._inode, self._memory, self.trouble = 0, None, ""
+            return
+        except OSError as error:
+            self.trouble = f"{self.path}: {error.strerror}"
+            return
+        self.trouble = ""
+        self.parameters = _field(self._memory, "parameters")
+        self._written = _field(self._memory, "written")
+        self._rings = [_field(self._memory, name) for name in ("samples", "estimates")]
+        self._taken = self._seen = int(self._written[0])
+
+    def take(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """SAMPLE and ESTIMATE rows since the last call, and how many others were lost."""
+        if self._memory is None:
+            return np.zeros(0, SAMPLE), np.zeros(0, ESTIMATE), 0
+        # A row is taken one look after it was counted: on some machines the count may be seen before what it counts.
+        until, self._seen = self._seen, int(self._written[0])
+        start = max(self._taken, self._seen - _READABLE)
+        places = np.arange(start, max(until, start)) % ROWS
+        samples, estimates = (ring[places] for ring in self._rings)
+        # What the loop may have written over meanwhile is no row.
+        torn = min(max(int(self._written[0]) - (ROWS - _AT_ONCE) - start, 0), len(places))
+        lost = start - self._taken + torn
+        self._taken = start + len(places)
+        return samples[torn:], estimates[torn:], lost

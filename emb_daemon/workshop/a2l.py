@@ -1,0 +1,126 @@
+"""The A2L file (ASAM MCD-2 MC 1.61) of what `image` shows: signals of `interface.signals`, numbers of `interface.places`."""
+
+import hashlib
+import sys
+from collections.abc import Mapping
+
+from emb_daemon import __version__
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.interface.places import places
+from emb_daemon.interface.signals import INPUTS, OUTPUTS, Signal
+from emb_daemon.runtime.shared import LAYOUT_DIGEST
+from emb_daemon.wire.contract import MODES, REASONS, SOURCES
+from emb_daemon.wire.layout import CORNERS
+from emb_daemon.workshop.image import CORNER_ADDRESS, PARAMETERS_ADDRESS, VERSION_ADDRESS, address_of, is_float
+
+#: Which the slave tells, and the file's name.
+NAME = "emb_daemon"
+#: The text at VERSION_ADDRESS, by which a tool knows that file and slave belong together.
+VERSION = f"emb_daemon {__version__} " + hashlib.sha256(
+    LAYOUT_DIGEST + repr([signal.name for signal in INPUTS + OUTPUTS]).encode()
+).hexdigest()[:12]  # fmt: skip
+
+#: A little below the largest that the formats hold, so that no reader rounds them to infinity.
+_FLOAT32_MAX, _FLOAT64_MAX, _ULONG_MAX = 3.4e38, 1.79e308, 0xFFFFFFFF
+#: Units in the letters that every tool reads.
+_ASCII = str.maketrans({"·": ".", "²": "^2", "³": "^3", "√": "sqrt ", "°": "deg"})
+_CODES = {"mode": dict(enumerate(MODES)), "source": SOURCES}
+
+_FRAME = """\
+ASAP2_VERSION 1 61
+/begin PROJECT {name} "Virtual clamp force sensor"
+  /begin MODULE {name} "{about}"
+    /begin MOD_COMMON ""
+      BYTE_ORDER MSB_LAST
+      ALIGNMENT_LONG 4
+      ALIGNMENT_FLOAT32_IEEE 4
+      ALIGNMENT_FLOAT64_IEEE 8
+    /end MOD_COMMON
+    /begin MOD_PAR "read only"
+      VERSION "{version}"
+      ADDR_EPK 0x{address:X}
+      EPK "{epk}"
+    /end MOD_PAR
+    /begin RECORD_LAYOUT RL.FLOAT64
+      FNC_VALUES 1 FLOAT64_IEEE COLUMN_DIR DIRECT
+    /end RECORD_LAYOUT
+{content}
+  /end MODULE
+/end PROJECT
+"""
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.translate(_ASCII).replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _block(keyword: str, head: str, *lines: str) -> str:
+    body = "".join(f"      {line}\n" for line in lines)
+    return f"    /begin {keyword} {head}\n{body}    /end {keyword}"
+
+
+def _limit(bound: float) -> str:
+    # What lies below the smallest normal number is a bound "greater than zero".
+    bound = min(max(bound, -_FLOAT64_MAX), _FLOAT64_MAX)
+    return repr(bound if abs(bound) >= sys.float_info.min else 0.0)
+
+
+class _Methods:
+    """Conversions, one for each unit and each list of words."""
+
+    def __init__(self):
+        self.blocks: dict[str, str] = {}
+
+    def of_unit(self, unit: str) -> str:
+        unit = "" if unit == "1" else unit.translate(_ASCII)
+        name = "CM." + ("".join(letter if letter.isalnum() else "_" for letter in unit) or "NONE")
+        self.blocks[name] = _block("COMPU_METHOD", f'{name} "" IDENTICAL "%12.6" {_quoted(unit)}')
+        return name
+
+    def of_words(self, name: str, words: Mapping[int, str]) -> str:
+        rows = [f"{code} {_quoted(word)}" for code, word in sorted(words.items())]
+        self.blocks[f"CT.{name}"] = _block("COMPU_VTAB", f'CT.{name} "" TAB_VERB {len(rows)}', *rows)
+        self.blocks[f"CM.{name}"] = _block("COMPU_METHOD", f'CM.{name} "" TAB_VERB "%3.0" ""', f"COMPU_TAB_REF CT.{name}")
+        return f"CM.{name}"
+
+
+def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> str:
+    if is_float(index):
+        kind, method = "FLOAT32_IEEE", methods.of_unit(signal.unit)
+        limits = f"{-_FLOAT32_MAX!r} {_FLOAT32_MAX!r}"
+    else:
+        words = _CODES.get(signal.name)
+        kind, method = "ULONG", methods.of_words(signal.name, words) if words else methods.of_unit("")
+        limits = f"0 {_ULONG_MAX}"
+    meaning = signal.meaning
+    if signal.name == "reasons":
+        meaning += ", from the lowest: " + ", ".join(REASONS)
+    head = f"{CORNERS[corner]}.{signal.name} {_quoted(meaning)} {kind} {method} 0 0 {limits}"
+    return _block("MEASUREMENT", head, f"ECU_ADDRESS 0x{address_of(corner, index):X}")
+
+
+def make_a2l(calibrations: Mapping[str, Calibration]) -> str:
+    """The file for a daemon that estimates the corners of ``calibrations``: ASCII."""
+    methods, blocks = _Methods(), []
+    for name, calibration in calibrations.items():
+        corner, numbers = CORNERS.index(name), places(calibration)
+        blocks += [_measurement(corner, index, signal, methods) for index, signal in enumerate(INPUTS + OUTPUTS)]
+        base = CORNER_ADDRESS * corner + PARAMETERS_ADDRESS
+        for place in numbers:
+            kind = f"VALUE 0x{base + place.offset:X} RL.FLOAT64 0 {methods.of_unit(place.unit)}"
+            head = f'{name}.{place.key} "" {kind} {_limit(place.low)} {_limit(place.high)}'
+            blocks.append(_block("CHARACTERISTIC", head, "READ_ONLY"))
+        blocks += [
+            _group(f"{name}.signals", f"inputs and estimates of {name}", "REF_MEASUREMENT",
+                   [f"{name}.{signal.name}" for signal in INPUTS + OUTPUTS]),
+            _group(f"{name}.calibration", calibration.actuator, "REF_CHARACTERISTIC",
+                   [f"{name}.{place.key}" for place in numbers]),
+        ]  # fmt: skip
+    return _FRAME.format(
+        name=NAME, about=f"{', '.join(calibrations)}", version=__version__, address=VERSION_ADDRESS, epk=VERSION,
+        content="\n".join([*methods.blocks.values(), *blocks]),
+    )  # fmt: skip
+
+
+def _group(name: str, about: str, keyword: str, members: list[str]) -> str:
+    return _block("GROUP", f"{name} {_quoted(about)}", "ROOT", f"/begin {keyword}", *members, f"/end {keyword}")

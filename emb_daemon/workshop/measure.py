@@ -1,0 +1,186 @@
+"""XCP's server: estimates in, out of the daemon's shared memory, commands in and responses and data out, over UDP or CAN.
+
+It shares nothing with the daemon but memory that it only reads and, over CAN, the bus; it may be killed at any moment.
+"""
+
+import select
+import socket
+import struct
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.errors import Unavailable
+from emb_daemon.runtime.shared import EstimatesReader
+from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.workshop.image import Image
+from emb_daemon.workshop.xcp import CONNECT, ON_CAN, ON_UDP, Slave
+
+#: Estimates are fetched this often, and the daemon's file is looked for that often.
+_FETCH_S, _LOOK_S = 0.004, 0.25
+#: Commands answered at once; a master waits for each answer.
+_COMMANDS = 32
+#: Datagrams are kept below what Ethernet carries whole.
+_DATAGRAM = 1440
+_IP_RECVERR = 11
+_HEADER = struct.Struct("<HH")
+
+
+class Udp:
+    """XCP on UDP (ASAM MCD-1 XCP, transport layer Ethernet): packets with length and counter, several to a datagram.
+
+    Who sent the last CONNECT is the master; nobody else is heard or answered.
+
+    Attributes:
+        gone: the master's machine said that nobody listens there.
+    """
+
+    layer = ON_UDP
+
+    def __init__(self, host: str, port: int):
+        """Raises Unavailable for an address that cannot be had."""
+        try:
+            [(family, kind, *_, address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+            self._socket = socket.socket(family, kind)
+            self._socket.bind(address)
+        except OSError as error:
+            raise Unavailable(f"--udp {host}:{port}: {error.strerror}") from None
+        if family == socket.AF_INET:
+            # Else a socket that is not connected never hears of a master that has ended.
+            self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
+        self._socket.setblocking(False)
+        self.port = self._socket.getsockname()[1]
+        self._master = None
+        self._counter = 0
+        self.gone = False
+
+    def wait(self, timeout_s: float) -> None:
+        select.select([self._socket], [], [], timeout_s)
+
+    def receive(self) -> list[bytes]:
+        packets: list[bytes] = []
+        for _ in range(_COMMANDS):
+            try:
+                datagram, sender = self._socket.recvfrom(65536)
+            except ConnectionRefusedError:
+                self.gone = True
+                continue
+            except OSError:
+                break
+            while len(datagram) >= _HEADER.size:
+                length, _ = _HEADER.unpack_from(datagram)
+                packet, datagram = datagram[_HEADER.size : _HEADER.size + length], datagram[_HEADER.size + length :]
+                if packet[:1] == bytes([CONNECT]):
+                    self._master, self.gone = sender, False
+                if len(packet) == length and sender == self._master:
+                    packets.append(packet)
+        return packets
+
+    def send(self, packets: Iterable[bytes]) -> int:
+        """Returns how many packets could not be sent."""
+        datagram, held, unsent = bytearray(), 0, 0
+        for packet in packets:
+            if len(datagram) + _HEADER.size + len(packet) > _DATAGRAM:
+                unsent += held * (not self._sent(datagram))
+                datagram, held = bytearray(), 0
+            datagram += _HEADER.pack(len(packet), self._counter) + packet
+            self._counter = (self._counter + 1) & 0xFFFF
+            held += 1
+        return unsent + held * (not self._sent(datagram))
+
+    def _sent(self, datagram: bytearray) -> bool:
+        if datagram and self._master is not None:
+            try:
+                self._socket.sendto(datagram, self._master)
+            except ConnectionRefusedError:
+                self.gone = True
+            except OSError:
+                return False
+        return True
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Can:
+    """XCP on CAN: a packet is a frame of eight bytes.
+
+    Args:
+        bus: that receives ``request_id``.
+        request_id, response_id: 11-bit CAN ids.
+    """
+
+    layer = ON_CAN
+    #: Nobody says on a bus that he has left it.
+    gone = False
+
+    def __init__(self, bus, request_id: int, response_id: int):
+        self._bus, self._request_id, self._response_id = bus, request_id, response_id
+
+    def wait(self, timeout_s: float) -> None:
+        self._bus.wait(timeout_s)
+
+    def receive(self) -> list[bytes]:
+        frames = self._bus.drain()
+        mine = frames[(frames["can_id"] == self._request_id) & (frames["flags"] & (EXTENDED | REMOTE | FD) == 0)]
+        return [int(frame["data"]).to_bytes(8, "little")[: frame["length"]] for frame in mine]
+
+    def send(self, packets: Iterable[bytes]) -> int:
+        """Returns how many packets could not be sent."""
+        contents = [int.from_bytes(packet.ljust(8, b"\0"), "little") for packet in packets]
+        if not contents:
+            return 0
+        frames = np.zeros(len(contents), FRAME)
+        frames["can_id"], frames["length"], frames["data"] = self._response_id, 8, contents
+        before = self._bus.unsent
+        self._bus.send(frames)
+        return self._bus.unsent - before
+
+    def close(self) -> None:
+        self._bus.close()
+
+
+class Measurement:
+    """A slave on a transport, fed by a daemon.
+
+    Args:
+        estimates: the daemon's file (`runtime.shared`), which need not be there yet.
+        transport: `Udp` or `Can`.
+        version: the text by which the A2L file knows its memory.
+        name, file: of the A2L file, without ending, and its content.
+    """
+
+    def __init__(self, estimates: Path, transport, version: bytes, name: bytes, file: bytes):
+        self.reader, self.transport, self._image = EstimatesReader(estimates), transport, Image(version)
+        self._slave = Slave(self._image, transport.layer, time.monotonic_ns, name, file)
+        self._looked = -_LOOK_S
+        self._overloaded = False
+
+    @property
+    def trouble(self) -> str:
+        """Why no estimates come; empty if they do, or no daemon runs."""
+        return self.reader.trouble
+
+    def step(self) -> None:
+        """Answer what is asked and hand out the estimates of a moment."""
+        self.transport.wait(_FETCH_S)
+        now = time.monotonic()
+        if now - self._looked >= _LOOK_S:
+            self._looked = now
+            self.reader.look()
+            self._image.parameters = self.reader.parameters
+        self.transport.send(filter(None, map(self._slave.answer, self.transport.receive())))
+        samples, estimates, lost = self.reader.take()
+        data: list[bytes] = []
+        for page, corner, time_ns in zip(
+            self._image.pages_of(samples, estimates), estimates["corner"].tolist(), estimates["time_ns"].tolist(), strict=True
+        ):
+            self._image.show(corner, page)
+            data += self._slave.data(corner, time_ns)
+        if self._slave.acquiring:
+            lost += self.transport.send([self._slave.overload()] * self._overloaded + data)
+            self._overloaded = lost > 0
+        if self.transport.gone:
+            self._slave.end()

@@ -1,0 +1,349 @@
+"""The slave's side of XCP (ASAM MCD-1 XCP 1.x): reading and data acquisition, as packets to packets. Nothing is ever written.
+
+Whatever a packet holds, it gets one response; without a session none but CONNECT is answered.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from emb_daemon.wire.contract import CYCLE_NS
+from emb_daemon.wire.layout import CORNERS
+from emb_daemon.workshop.image import Image
+
+CONNECT = 0xFF
+_RESPONSE, _ERROR, _EVENT = 0xFF, 0xFE, 0xFD
+#: Error codes.
+SYNCH, DAQ_ACTIVE, UNKNOWN, SYNTAX, OUT_OF_RANGE, ACCESS_DENIED = 0x00, 0x11, 0x20, 0x21, 0x22, 0x24
+MODE_NOT_VALID, SEQUENCE, DAQ_CONFIG, MEMORY_OVERFLOW = 0x27, 0x29, 0x2A, 0x30
+#: Event code of what the master was not sent.
+_OVERLOAD = 0x06
+
+#: CONNECT: data acquisition, no page to write; little-endian, byte addresses, GET_COMM_MODE_INFO is there.
+_RESOURCE, _MODE, _VERSION = 0x04, 0x80, 0x01
+_DAQ_RUNNING = 0x40
+#: GET_DAQ_PROCESSOR_INFO: dynamic lists, prescaler, time stamps; overload is told by an event.
+_DAQ_PROPERTIES = 0x01 | 0x02 | 0x10 | 0x80
+#: Bits of SET_DAQ_LIST_MODE that are understood, and of START_STOP_DAQ_LIST's answer to it.
+_TIMESTAMP, _SELECTED, _RUNNING = 0x10, 0x01, 0x40
+#: GET_DAQ_EVENT_INFO: for acquisition, data of one event are of one moment; cycle in ms.
+_EVENT_PROPERTIES, _MILLISECONDS = 0x04 | 0x80, 6
+#: No entry has bits of its own.
+_WHOLE = 0xFF
+#: Most lists, entries in all, and ODTs, whose number is a byte below the codes of responses.
+_LISTS, _ENTRIES, _ODTS = 16, 4096, 0xFC
+#: Address extension of a text that the slave offers to be uploaded.
+_TEXT = 0xFF
+
+
+class Refusal(Exception):
+    """A command that is answered by the error code that it has as its argument."""
+
+
+@dataclass(frozen=True)
+class Transport:
+    """What a transport layer carries: bytes of a command and of data, bytes of a time stamp, its unit's code and length in ns,
+    and most ODTs."""
+
+    max_cto: int
+    max_dto: int
+    timestamp_bytes: int
+    unit: int
+    unit_ns: int
+    odts: int = _ODTS
+
+
+#: A data frame of an 8-byte bus has room for one signal beside a time stamp of two bytes, in 0.1 ms; 16 a cycle are half of a
+#: bus at 1 Mbit/s.
+ON_CAN = Transport(8, 8, 2, 5, 100_000, 16)
+ON_UDP = Transport(252, 1400, 4, 3, 1000)
+
+
+@dataclass
+class _List:
+    """A DAQ list: per ODT its entries (extension, address, size), size 0 for one that was not written."""
+
+    odts: list[list[tuple[int, int, int]]] = field(default_factory=list)
+    event: int | None = None
+    timestamps: bool = False
+    prescaler: int = 1
+    selected: bool = False
+    running: bool = False
+    waited: int = 0
+
+
+class Slave:
+    """One session, begun anew by each CONNECT.
+
+    Args:
+        memory: what is read.
+        transport: ON_CAN or ON_UDP.
+        clock: monotonic time now, ns.
+        name: of the A2L file, without its ending.
+        file: the A2L file.
+
+    Attributes:
+        connected: whether there is a session.
+    """
+
+    def __init__(self, memory: Image, transport: Transport, clock: Callable[[], int], name: bytes, file: bytes):
+        self._memory, self._transport, self._clock = memory, transport, clock
+        self._texts = {0: name, 1: name, 4: file}
+        self.connected = False
+        self._reset()
+        self._commands: dict[int, tuple[struct.Struct, Callable[..., bytes]]] = {
+            code: (struct.Struct("<" + layout), action)
+            for code, layout, action in (
+                (CONNECT, "B", self._connect),
+                (0xFE, "", self._disconnect),
+                (0xFD, "", self._status),
+                (0xFC, "", self._synch),
+                (0xFB, "", lambda: bytes(7)),
+                (0xFA, "B", self._identify),
+                (0xF6, "2xBI", self._set_address),
+                (0xF5, "B", self._upload),
+                (0xF4, "BxBI", self._short_upload),
+                (0xE2, "xHBB", self._set_pointer),
+                (0xE1, "BBBI", self._write_entry),
+                (0xE0, "BHHBB", self._set_mode),
+                (0xDF, "xH", self._mode),
+                (0xDE, "BH", self._start_stop_list),
+                (0xDD, "B", self._start_stop),
+                (0xDC, "", lambda: struct.pack("<xHI", 0, self._ticks(self._clock()) & 0xFFFFFFFF)),
+                (0xDA, "", lambda: struct.pack("<BHHBB", _DAQ_PROPERTIES, _LISTS, len(CORNERS), 0, 0)),
+                (0xD9, "", self._resolution),
+                (0xD7, "xH", self._event_information),
+                (0xD6, "", self._free),
+                (0xD5, "xH", self._allocate_lists),
+                (0xD4, "xHB", self._allocate_odts),
+                (0xD3, "xHBB", self._allocate_entries),
+            )
+        }
+
+    def _reset(self) -> None:
+        self._lists: list[_List] = []
+        #: What was allocated last: nothing, freed, lists, ODTs or entries; each may follow the one before and itself.
+        self._allocated = 0
+        self._pointer: tuple[int, int, int] | None = None
+        self._address, self._text = (0, 0), b""
+
+    @property
+    def acquiring(self) -> bool:
+        """Whether a list is running."""
+        return any(chosen.running for chosen in self._lists)
+
+    def answer(self, packet: bytes) -> bytes:
+        """The response to a packet; empty where there is none."""
+        if not packet or not (self.connected or packet[0] == CONNECT):
+            return b""
+        layout, action = self._commands.get(packet[0], (None, None))
+        try:
+            if layout is None or action is None:
+                raise Refusal(UNKNOWN)
+            # Longer ones are filled up to the frame's size.
+            if len(packet) <= layout.size:
+                raise Refusal(SYNTAX)
+            return bytes([_RESPONSE]) + action(*layout.unpack_from(packet, 1))
+        except Refusal as refusal:
+            return bytes([_ERROR, *refusal.args])
+
+    def end(self) -> None:
+        """Forget the session."""
+        self.connected = False
+        self._reset()
+
+    def _connect(self, _mode: int) -> bytes:
+        self._reset()
+        self.connected = True
+        return struct.pack("<BBBHBB", _RESOURCE, _MODE, self._transport.max_cto, self._transport.max_dto, _VERSION, _VERSION)
+
+    def _disconnect(self) -> bytes:
+        self.end()
+        return b""
+
+    def _status(self) -> bytes:
+        return struct.pack("<BBxH", _DAQ_RUNNING * self.acquiring, 0, 0)
+
+    def _synch(self) -> bytes:
+        raise Refusal(SYNCH)
+
+    def _identify(self, kind: int) -> bytes:
+        """0 and 1: name; 4: the file itself. Of any other kind there is a text of length 0."""
+        self._offer(self._texts.get(kind, b""))
+        return struct.pack("<BHI", 0, 0, len(self._text))
+
+    def _offer(self, text: bytes) -> None:
+        self._address, self._text = (_TEXT, 0), text
+
+    def _set_address(self, extension: int, address: int) -> bytes:
+        self._address = extension, address
+        return b""
+
+    def _upload(self, count: int) -> bytes:
+        extension, address = self._address
+        if not 0 < count < self._transport.max_cto:
+            raise Refusal(OUT_OF_RANGE)
+        offered = self._text[address : address + count]
+        content = offered if extension == _TEXT else self._memory.read(extension, address, count)
+        if content is None or len(content) < count:
+            raise Refusal(ACCESS_DENIED)
+        self._address = extension, address + count
+        return content
+
+    def _short_upload(self, count: int, extension: int, address: int) -> bytes:
+        self._address = extension, address
+        return self._upload(count)
+
+    def _resolution(self) -> bytes:
+        largest = min(self._transport.max_dto - 1, 0xFF)
+        mode = self._transport.timestamp_bytes | self._transport.unit << 4
+        return struct.pack("<BBBBBH", 1, largest, 1, 0, mode, 1)
+
+    def _event_information(self, event: int) -> bytes:
+        if event >= len(CORNERS):
+            raise Refusal(OUT_OF_RANGE)
+        self._offer(CORNERS[event].encode())
+        return struct.pack("<6B", _EVENT_PROPERTIES, _LISTS, len(self._text), CYCLE_NS // 1_000_000, _MILLISECONDS, 0)
+
+    def _list(self, number: int, idle: bool = False) -> _List:
+        if number >= len(self._lists):
+            raise Refusal(OUT_OF_RANGE)
+        if idle and self._lists[number].running:
+            raise Refusal(DAQ_ACTIVE)
+        return self._lists[number]
+
+    def _allocate(self, stage: int) -> None:
+        if self._allocated not in (stage - 1, stage):
+            raise Refusal(SEQUENCE)
+
+    def _free(self) -> bytes:
+        self._lists, self._allocated, self._pointer = [], 1, None
+        return b""
+
+    def _allocate_lists(self, count: int) -> bytes:
+        if self._allocated != 1:
+            raise Refusal(SEQUENCE)
+        if count > _LISTS:
+            raise Refusal(MEMORY_OVERFLOW)
+        self._lists, self._allocated = [_List() for _ in range(count)], 2
+        return b""
+
+    def _allocate_odts(self, number: int, count: int) -> bytes:
+        self._allocate(3)
+        chosen = self._list(number, idle=True)
+        if sum(len(other.odts) for other in self._lists if other is not chosen) + count > self._transport.odts:
+            raise Refusal(MEMORY_OVERFLOW)
+        chosen.odts, self._allocated = [[] for _ in range(count)], 3
+        return b""
+
+    def _allocate_entries(self, number: int, odt: int, count: int) -> bytes:
+        self._allocate(4)
+        chosen = self._list(number, idle=True)
+        if odt >= len(chosen.odts):
+            raise Refusal(OUT_OF_RANGE)
+        if sum(len(entries) for other in self._lists for entries in other.odts) + count > _ENTRIES:
+            raise Refusal(MEMORY_OVERFLOW)
+        chosen.odts[odt], self._allocated = [(0, 0, 0)] * count, 4
+        return b""
+
+    def _set_pointer(self, number: int, odt: int, entry: int) -> bytes:
+        chosen = self._list(number, idle=True)
+        if odt >= len(chosen.odts) or entry >= len(chosen.odts[odt]):
+            raise Refusal(OUT_OF_RANGE)
+        self._pointer = number, odt, entry
+        return b""
+
+    def _write_entry(self, bit: int, size: int, extension: int, address: int) -> bytes:
+        if self._pointer is None:
+            raise Refusal(SEQUENCE)
+        number, odt, entry = self._pointer
+        entries = self._list(number, idle=True).odts[odt]
+        if entry >= len(entries) or bit != _WHOLE or not 0 < size < self._transport.max_dto:
+            raise Refusal(OUT_OF_RANGE)
+        if self._memory.read(extension, address, size) is None:
+            raise Refusal(ACCESS_DENIED)
+        entries[entry] = extension, address, size
+        self._pointer = number, odt, entry + 1
+        return b""
+
+    def _set_mode(self, mode: int, number: int, event: int, prescaler: int, priority: int) -> bytes:
+        chosen = self._list(number, idle=True)
+        if mode & ~_TIMESTAMP:
+            raise Refusal(MODE_NOT_VALID)
+        if event >= len(CORNERS) or not prescaler or priority:
+            raise Refusal(OUT_OF_RANGE)
+        chosen.event, chosen.timestamps, chosen.prescaler = event, bool(mode), prescaler
+        return b""
+
+    def _mode(self, number: int) -> bytes:
+        chosen = self._list(number)
+        mode = _TIMESTAMP * chosen.timestamps | _SELECTED * chosen.selected | _RUNNING * chosen.running
+        return struct.pack("<BxxHBB", mode, chosen.event or 0, chosen.prescaler, 0)
+
+    def _start_stop_list(self, mode: int, number: int) -> bytes:
+        chosen = self._list(number)
+        if mode > 2:
+            raise Refusal(MODE_NOT_VALID)
+        if mode:
+            self._check(chosen)
+        if mode == 2:
+            chosen.selected = True
+        else:
+            self._run(chosen, bool(mode))
+        return bytes([self._first_odt(number)])
+
+    def _start_stop(self, mode: int) -> bytes:
+        """0: stop all; 1, 2: start, stop those that are selected."""
+        if mode > 2:
+            raise Refusal(MODE_NOT_VALID)
+        concerned = [chosen for chosen in self._lists if mode == 0 or chosen.selected]
+        for chosen in concerned:
+            if mode == 1:
+                # It may have changed since it was selected.
+                self._check(chosen)
+        for chosen in concerned:
+            self._run(chosen, mode == 1)
+            chosen.selected = False
+        return b""
+
+    @staticmethod
+    def _run(chosen: _List, running: bool) -> None:
+        chosen.running, chosen.waited = running, 0
+
+    def _check(self, chosen: _List) -> None:
+        """Refuse a list that no frame can carry, or that has no event."""
+        for number, entries in enumerate(chosen.odts):
+            stamp = self._transport.timestamp_bytes * (chosen.timestamps and number == 0)
+            if 1 + stamp + sum(size for *_, size in entries) > self._transport.max_dto:
+                raise Refusal(DAQ_CONFIG)
+        if chosen.event is None or not any(size for entries in chosen.odts for *_, size in entries):
+            raise Refusal(DAQ_CONFIG)
+
+    def _first_odt(self, number: int) -> int:
+        return sum(len(earlier.odts) for earlier in self._lists[:number])
+
+    def _ticks(self, time_ns: int) -> int:
+        return time_ns // self._transport.unit_ns
+
+    def data(self, corner: int, time_ns: int) -> Iterator[bytes]:
+        """What an estimate of a corner at ``time_ns`` has the running lists send."""
+        for number, chosen in enumerate(self._lists):
+            if not chosen.running or chosen.event != corner:
+                continue
+            chosen.waited += 1
+            if chosen.waited < chosen.prescaler:
+                continue
+            chosen.waited = 0
+            first = self._first_odt(number)
+            for odt, entries in enumerate(chosen.odts):
+                parts = [bytes([first + odt])]
+                if chosen.timestamps and odt == 0:
+                    width = self._transport.timestamp_bytes
+                    parts.append((self._ticks(time_ns) & (1 << 8 * width) - 1).to_bytes(width, "little"))
+                # What could be read when it was written can be read now.
+                parts += [self._memory.read(*entry) or b"" for entry in entries if entry[2]]
+                yield b"".join(parts)
+
+    def overload(self) -> bytes:
+        """Tell the master that data were lost."""
+        return bytes([_EVENT, _OVERLOAD])
