@@ -30,7 +30,7 @@ from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.text import verdict
-from emb_daemon.diagnose.unexplained import Left
+from emb_daemon.diagnose.unexplained import Left, achieved
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
@@ -382,7 +382,7 @@ def test_what_has_a_name_is_called_by_it(viscous):
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):
     """Whatever the residual says: an effect with which left-out episodes get worse is not written."""
-    judge_left_out = confirmation.left_out
+    judge_left_out = confirmation.left_out_errors
 
     def worse_with_it(selection, without=""):
         errors = judge_left_out(selection, without)
@@ -390,7 +390,7 @@ def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monke
             errors.sums[errors.paths.index("fused")] *= 4.0
         return errors
 
-    monkeypatch.setattr(confirmation, "left_out", worse_with_it)
+    monkeypatch.setattr(confirmation, "left_out_errors", worse_with_it)
     result = judged()
     finding = next(f for f in result.findings if f.effect.name == "viscous_friction")
     assert not finding.accepted
@@ -420,8 +420,8 @@ def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_
         start = Model.of(Bench([of], calibration))
         model = start.refined(["stiffness"])
         screening = Screening(model.bench, start)
-        tested = screening.tested(model, [uneven])
-        reasons.append(screening.judged(model, tested[0], {}, tested).reason)
+        tested = screening.test(model, [uneven])
+        reasons.append(screening.judge(model, tested[0], {}, tested).reason)
     assert not reasons[0] and reasons[1]
 
 
@@ -446,7 +446,7 @@ def coupled(calibration):
 
 
 def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration, coupled, monkeypatch):
-    monkeypatch.setattr(search, "made", lambda selection, progress: selection)
+    monkeypatch.setattr(search, "make_terms", lambda selection, progress: selection)
     result = diagnose(coupled[1:2], calibration)
     assert all(finding.in_calibration for finding in result.accepted)
     assert result.unexplained.strongest.signal in ("brake_torque", "disc_speed")
@@ -622,6 +622,15 @@ def test_a_log_with_nothing_to_judge_by_is_refused(calibration):
 @pytest.mark.parametrize(("rms", "present"), [(50.0, False), (70.0, True)])
 def test_what_is_left_is_held_against_what_the_calibration_achieved(rms, present):
     assert Left("stiffness", rms, 41.0, 0.3, ()).present is present
+
+
+def test_what_the_calibration_achieved_is_its_figure_unless_its_noise_is_more(calibration):
+    force, none = np.full(100, 5000.0), np.zeros(0)
+    noise = achieved(msgspec.structs.replace(calibration, provenance=None), "stiffness", force, none)
+    for figure, expected in ((2.0 * noise, 2.0 * noise), (0.5 * noise, noise)):
+        provenance = msgspec.structs.replace(calibration.provenance, achieved={"stiffness_N": figure, "torque_N": 9e3})
+        found = achieved(msgspec.structs.replace(calibration, provenance=provenance), "stiffness", force, none)
+        assert found == pytest.approx(expected)
 
 
 # -- unusable input ---------------------------------------------------------------------------------------------------

@@ -277,6 +277,8 @@ class Provenance(Struct, kw_only=True):
     logs: tuple[Source, ...] = ()
     #: Error figures on logs that fitted nothing, by name.
     figures: dict[str, float] = msgspec.field(default_factory=dict)
+    #: Worst RMSE on such logs, what `diagnose` need not go below: stiffness_N and torque_N of the paths, temperature_K.
+    achieved: dict[str, float] = msgspec.field(default_factory=dict)
     #: Standard deviations of identified values, by key.
     sigmas: dict[str, float] = msgspec.field(default_factory=dict)
 

@@ -27,7 +27,7 @@ _HARM = 1.05
 _KEPT = 0.99
 
 
-def confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
+def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
     """What is left of a search when everything that makes the running estimator worse is taken out again.
 
     Returns it with the errors on left-out episodes. ``judges``: the validation logs.
@@ -35,10 +35,10 @@ def confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, Ep
     bench = selection.model.bench
     before, main = errors(bench, bench.calibration), whole(bench)
     while True:
-        after = left_out(selection)
+        after = left_out_errors(selection)
         worse = harm(before, after, main, {selection.channel_of(suspect) for suspect in selection.suspects})
         if worse and selection.suspects:
-            rest = {suspect: left_out(selection, suspect).rmse(main) for suspect in selection.suspects}
+            rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
             selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
         elif veto := judges and _veto(selection, judges):
             selection = selection.without(*veto)
@@ -46,7 +46,7 @@ def confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, Ep
             return selection, after
 
 
-def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
+def left_out_errors(selection: Selection, without: str = "") -> EpisodeErrors:
     """Errors of each quarter of the episodes with parameters that the other quarters gave; ``without`` one suspect."""
     bench = selection.model.bench
     fold = np.arange(bench.episodes) % _FOLDS
@@ -54,7 +54,7 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     for number in range(_FOLDS):
         values = selection.applied(without)
         for channel in bench.channels:
-            values |= refitted(selection, channel, fold != number, without)
+            values |= refit(selection, channel, fold != number, without)
         # A log with pads of its own has its own contact, too.
         own = [bench.calibrated(values, trial.index if trial.mounted else None) for trial in bench.trials]
         parts.append(EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, own, strict=True)]))
@@ -65,7 +65,7 @@ def left_out(selection: Selection, without: str = "") -> EpisodeErrors:
     return result
 
 
-def refitted(selection: Selection, channel: str, kept: np.ndarray, without: str = "") -> dict[Coordinate, float]:
+def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "") -> dict[Coordinate, float]:
     """A channel's coordinates from the episodes that are ``kept``, shape (episodes,), ``without`` one suspect; shapes, which
     are not linear, stand as fitted."""
     model = selection.model

@@ -16,7 +16,7 @@ from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.parameters import parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source
 from emb_daemon.diagnose.comparison import comparison, errors, whole
-from emb_daemon.diagnose.confirmation import confirmed, validation_gains
+from emb_daemon.diagnose.confirmation import confirm, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model
@@ -137,16 +137,16 @@ def diagnose(
     if bench.episodes < EPISODES:
         told = f"only {bench.episodes} episodes, expected at least {EPISODES} to tell effect from chance"
         raise InputError(f"{fit_logs[0].path}: {told}")
-    result = diagnosed(bench, Bench(validate, calibration) if validate else None, progress)
+    result = diagnose_bench(bench, Bench(validate, calibration) if validate else None, progress)
     return replace(result, seconds=time.monotonic() - begin)
 
 
-def diagnosed(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
+def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
     """The same of logs that are cut into episodes already; ``judges``: the validation logs."""
     begin, calibration = time.monotonic(), bench.calibration
     selection = select(bench, progress)
     progress("confirming with the running estimator", 0.8)
-    selection, left_out = confirmed(selection, judges)
+    selection, left_out = confirm(selection, judges)
     applied = selection.applied()
     augmented = (
         with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
@@ -166,7 +166,7 @@ def diagnosed(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnos
         judged_on="validate" if judges else "left_out_episodes",
         selection=selection,
         findings=findings(selection),
-        recalibrated=_recalibrated(selection),
+        recalibrated=_list_recalibrated(selection),
         signals=selection.screening.signals,
         initial=selection.screening.initial,
         residual=selection.model.residual,
@@ -195,11 +195,11 @@ def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:
 def findings(selection: Selection) -> tuple[Candidate, ...]:
     """What became of every effect and term, with values as they are applied; accepted ones first, each group by share
     explained."""
-    described = [_described(selection, candidate) for candidate in selection.candidates.values()]
+    described = [_describe(selection, candidate) for candidate in selection.candidates.values()]
     return tuple(sorted(described, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained)))
 
 
-def _described(selection: Selection, candidate: Candidate) -> Candidate:
+def _describe(selection: Selection, candidate: Candidate) -> Candidate:
     model, effect = selection.model, candidate.effect
     own = model.of_effect(effect.name)
     if not own or not (candidate.accepted or candidate.in_calibration):
@@ -261,7 +261,7 @@ def _tradeoffs(model: Model, effect: Effect, own: Sequence[Coordinate]) -> str:
     return text
 
 
-def _recalibrated(selection: Selection) -> dict[str, Recalibrated]:
+def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
     """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together."""
     model, calibration = selection.model, selection.model.bench.calibration
     base = [c for c in selection.applied() if not c.effect]
@@ -384,6 +384,7 @@ def _with_provenance(
         campaign=old.campaign if old else "",
         logs=(old.logs if old else ()) + sources,
         figures={name: value for name, value in figures.items() if np.isfinite(value)},
+        achieved=old.achieved if old else {},
         sigmas=sigmas,
     )
     return msgspec.structs.replace(calibration, provenance=provenance)

@@ -122,7 +122,7 @@ class Screening:
 
     # -- tests --------------------------------------------------------------------------------------------------------
 
-    def tested(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
+    def test(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
         """Each effect in the shape that does best, with its chance corrected for all that were tried."""
         shapes = {effect.name: self._shapes(model, effect) for effect in effects}
         probes = [
@@ -181,7 +181,7 @@ class Screening:
 
     # -- objections ---------------------------------------------------------------------------------------------------
 
-    def judged(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate]) -> Candidate:
+    def judge(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate]) -> Candidate:
         """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked. ``tested``: all
         that were tested with it."""
         effect, evidence = candidate.effect, candidate.evidence

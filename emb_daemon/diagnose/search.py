@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from emb_daemon.diagnose.grammar import made
+from emb_daemon.diagnose.grammar import make_terms
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
 from emb_daemon.diagnose.screening import Screening
-from emb_daemon.diagnose.selection import Progress, Selection, changes, one_round, recalibrated, revised, settled_heat
+from emb_daemon.diagnose.selection import Progress, Selection, find_changes, find_recalibrated, one_round, revise, settle_heat
 from emb_daemon.diagnose.unexplained import dependences, is_beyond
 from emb_daemon.effects import REGISTRY
 
@@ -35,18 +35,18 @@ def select(bench: Bench, progress: Progress) -> Selection:
         if channel in FORCE_CHANNELS
     }
     selection = Selection(model, screening, at_first=at_first)
-    selection = replace(selection, recalibrated=recalibrated(selection, start))
+    selection = replace(selection, recalibrated=find_recalibrated(selection, start))
     if bench.own_data and not _anything_left(selection):
-        return changes(settled_heat(selection))
+        return find_changes(settle_heat(selection))
     for number in range(len(REGISTRY)):
         progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
         before = selection.accepted
         selection = one_round(selection)
         if selection.accepted == before:
             break
-    selection = made(selection, lambda text: progress(text, 0.72))
+    selection = make_terms(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
-    return changes(revised(settled_heat(selection)))
+    return find_changes(revise(settle_heat(selection)))
 
 
 def _anything_left(selection: Selection) -> bool:

@@ -122,7 +122,7 @@ class Selection:
         return result
 
 
-def settled_heat(selection: Selection) -> Selection:
+def settle_heat(selection: Selection) -> Selection:
     """Heat that is not applied goes back to the calibration, and what is applied is fitted to that.
 
     While searching, a friction or a heat capacity that is a little off must not pass for an effect; but growth and softening
@@ -133,7 +133,7 @@ def settled_heat(selection: Selection) -> Selection:
     return replace(selection, model=model.entered(start, chosen=idle).refined(selection.touched))
 
 
-def recalibrated(selection: Selection, start: Model) -> dict[str, float]:
+def find_recalibrated(selection: Selection, start: Model) -> dict[str, float]:
     """Channels in which refitting the base parameters gains on left-out episodes what matters."""
     model, result = selection.model, {}
     for channel in model.bench.channels:
@@ -157,13 +157,13 @@ def one_round(selection: Selection) -> Selection:
     apart = {e: why for e in left if (why := _why_not_asked(e, model))}
     left = [e for e in left if e not in apart]
     rivals: dict = {}
-    found = screening.tested(model, left)
-    tested = [screening.judged(model, c, rivals, found) for c in found]
+    found = screening.test(model, left)
+    tested = [screening.judge(model, c, rivals, found) for c in found]
     winners, losers = [], []
     for channel in model.bench.channels:
         passed = [c for c in tested if c.channel == channel and not c.reason]
         if passed:
-            winner, beaten = _settled(model, passed)
+            winner, beaten = _settle(model, passed)
             winners.append(winner)
             losers += beaten
     if not winners:
@@ -172,16 +172,16 @@ def one_round(selection: Selection) -> Selection:
     confounded = {name for name, c in selection.candidates.items() if c.confounded_with}
     selection = selection.noted(c for c in tested if not (c.reason and c.effect.name in confounded)).noted(losers)
     selection = selection.noted(Candidate(effect, None, reason=why) for effect, why in apart.items())
-    return selection.entered(winners) if winners else _tried(selection, tested, rivals)
+    return selection.entered(winners) if winners else _try_unsure(selection, tested, rivals)
 
 
-def best_known(selection: Selection, channel: str) -> Candidate | None:
+def find_known(selection: Selection, channel: str) -> Candidate | None:
     """The effect that gains most in a channel, of all that are not in the model and that nothing speaks against; also of those
     that were dropped."""
     model, screening = selection.model, selection.screening
     off = [e for e in REGISTRY if not model.of_effect(e.name) and not _why_not_asked(e, model)]
-    found = [c for c in screening.tested(model, off) if c.channel == channel]
-    passed = [c for c in (screening.judged(model, c, {}, found) for c in found) if not c.reason]
+    found = [c for c in screening.test(model, off) if c.channel == channel]
+    passed = [c for c in (screening.judge(model, c, {}, found) for c in found) if not c.reason]
     return max(passed, key=lambda c: c.evidence.gain, default=None)
 
 
@@ -193,7 +193,7 @@ def _why_not_asked(effect: Effect, model: Model) -> str:
     return ""
 
 
-def _settled(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
+def _settle(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
     """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not.
 
     Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
@@ -226,7 +226,7 @@ def _settled(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Can
     return winner, beaten
 
 
-def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selection:
+def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> Selection:
     """With a candidate that would explain much, is not sure in the linear test, but is once it has been fitted.
 
     Far from the solution the rest of a strong effect, whose shape was only guessed, is what makes it unsure. The fitted
@@ -259,7 +259,7 @@ def _tried(selection: Selection, tested: list[Candidate], rivals: dict) -> Selec
     return entered.noted([sure])
 
 
-def revised(selection: Selection) -> Selection:
+def revise(selection: Selection) -> Selection:
     """Each accepted effect tested once more with all others in place; what, or which order, no longer holds goes."""
     for name in selection.accepted:
         model, candidate = selection.model, selection.candidates[name]
@@ -277,7 +277,7 @@ def revised(selection: Selection) -> Selection:
     return selection
 
 
-def changes(selection: Selection) -> Selection:
+def find_changes(selection: Selection) -> Selection:
     """With what became of the effects that the calibration has already: one that is not as calibrated counts as found."""
     model, found = selection.model, []
     for effect in REGISTRY:

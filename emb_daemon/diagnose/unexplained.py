@@ -108,7 +108,7 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
         force_N: clamp forces of the judging logs.
         rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
     """
-    figures = calibration.provenance.figures if calibration.provenance else {}
+    figures = calibration.provenance.achieved if calibration.provenance else {}
     noise, motor = calibration.noise, calibration.motor
     # Without a reference the current is held against the stiffness path: its error comes on top.
     paths = {"stiffness": ("stiffness",), "torque": ("torque",), "innovation": ("stiffness", "torque")}.get(channel, ())
@@ -122,10 +122,8 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
     }
     total = 0.0
     for path in paths:
-        stated = [value for name, value in figures.items() if name.endswith(f"{path} rmse_N")]
-        total += max([*stated, rmse(own[path])]) ** 2
+        total += max(figures.get(f"{path}_N", 0.0), rmse(own[path])) ** 2
     if channel == "temperature":
-        stated = [value for name, value in figures.items() if name.endswith(" K") and "thesis" not in name]
         heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0
-        total = max([*stated, calibration.thermal.sigma_K]) ** 2 + heated**2
+        total = max(figures.get("temperature_K", 0.0), calibration.thermal.sigma_K) ** 2 + heated**2
     return float(np.sqrt(total)) if total else float("nan")

@@ -13,6 +13,7 @@ from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.heat import nominal_thermal
+from emb_daemon.identify.steps.thermal import ThermalStep
 from emb_daemon.identify.text import rounded
 from emb_daemon.identify.validation import Validation
 from emb_daemon.offline.score import PATHS
@@ -63,9 +64,7 @@ def tidy(calibration: Calibration) -> Calibration:
     return moved(calibration, {key: rounded(v, 7) for key, v in values.items() if rounded(v, 7) != v}, checked=True)
 
 
-def provenance(
-    campaign: Campaign, steps: tuple[Step, ...], validations: list[Validation], temperatures: dict[str, float]
-) -> Provenance:
+def provenance(campaign: Campaign, steps: tuple[Step, ...], validations: list[Validation], heat: ThermalStep) -> Provenance:
     """Date (``SOURCE_DATE_EPOCH`` if it is set), logs, error figures and standard deviations."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     now = datetime.datetime.fromtimestamp(int(epoch), datetime.UTC) if epoch else datetime.datetime.now(datetime.UTC)
@@ -74,12 +73,21 @@ def provenance(
         for path in PATHS:
             figures[f"{one.name}: {path} rmse_N"] = one.rmse_N(path)
         figures[f"{one.name}: inside_two_sigma"] = one.figures["inside_two_sigma"]
+    figures |= heat.figures
+    achieved = {f"{path}_N": max(one.rmse_N(path) for one in validations) for path in ("stiffness", "torque") if validations}
+    if heat.achieved_K is not None:
+        achieved["temperature_K"] = heat.achieved_K
     sigmas = {key: sigma for step in steps for key, sigma in step.sigmas.items()}
     return Provenance(
         date=now.strftime("%Y-%m-%d"),
         tool=f"emb-daemon {__version__}",
         campaign=campaign.path.name,
         logs=tuple(Source(log=name, sha256=digest) for name, digest in sorted(campaign.sources.items())),
-        figures={name: rounded(value) for name, value in (figures | temperatures).items() if abs(value) < float("inf")},
-        sigmas={name: rounded(value) for name, value in sigmas.items() if abs(value) < float("inf")},
+        figures=_finite(figures),
+        achieved=_finite(achieved),
+        sigmas=_finite(sigmas),
     )
+
+
+def _finite(numbers: dict[str, float]) -> dict[str, float]:
+    return {name: rounded(value) for name, value in numbers.items() if abs(value) < float("inf")}

@@ -85,7 +85,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
         validations += [validate(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
     steps = (stiff, motor, heat, found)
-    calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat.figures))
+    calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat))
     progress(1.0, "done")
     seconds = time.monotonic() - begin
     return Identification(campaign, stiff, motor, zero, folds, thick, levels, heat, found, validations, calibration, seconds)

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 
 from emb_daemon.calibration.parameters import CLEARANCE, moved
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.diagnose.confirmation import refitted
+from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
-from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnosed, with_terms
+from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, with_terms
 from emb_daemon.diagnose.page import sections
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.selection import Progress
@@ -51,11 +51,11 @@ class AttributionStep(Step):
         bench, applied = selection.model.bench, selection.applied()
         same = [trial.mounted.get("pad_thickness_mm") == fold.pads.thickness_mm for trial in bench.trials]
         if "torque" in selection.touched:
-            applied |= refitted(selection, "torque", _others(bench, same))
+            applied |= refit(selection, "torque", _others(bench, same))
             values = {key: value for key, value in values.items() if key not in KEYS}
         if "stiffness" in map(selection.channel_of, selection.accepted):
             own = [any(trial.log is log for log in fold.held_out) for trial in bench.trials]
-            applied |= refitted(selection, "stiffness", _others(bench, own))
+            applied |= refit(selection, "stiffness", _others(bench, own))
             slow = [value for c, value in applied.items() if c.name == CLEARANCE and same[c.log] and not own[c.log]]
             fitted = set(by_key(applied, bench.middle))
             values = {key: value for key, value in values.items() if key not in fitted} | {CLEARANCE: float(np.mean(slow))}
@@ -84,7 +84,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
     bench = Bench([*logs, *hot], known, [*mounted, *({} for _ in hot)], own_data=True)
     if bench.episodes < EPISODES:
         return AttributionStep(calibration=known)
-    found = diagnosed(bench, None, progress)
+    found = diagnose_bench(bench, None, progress)
     calibration = replace(found.calibration, contact=known.contact, noise=known.noise, provenance=None)
     return AttributionStep(
         sigmas=found.calibration.provenance.sigmas,

@@ -56,6 +56,7 @@ class ThermalStep(Step):
         hot: logs that fitted in which the brake works as in service: force over heat.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
         figures: RMSE on logs that fitted nothing, by name with unit, once `validate`d.
+        achieved_K: the worst of these temperatures; None without one.
         residuals: the same for what was fitted.
     """
 
@@ -68,6 +69,7 @@ class ThermalStep(Step):
     softening: SofteningFit | None = None
     temperatures: dict[str, Temperatures] = field(default_factory=dict)
     figures: dict[str, float] = field(default_factory=dict)
+    achieved_K: float | None = None
     residuals: dict[str, float] = field(default_factory=dict)
 
 
@@ -128,13 +130,14 @@ def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) ->
     if step.heat is None:
         return step
     temperatures, figures, residuals = _validate(campaign, step.fitted, step.unseen, calibration)
+    achieved_K = max(figures.values(), default=None)
     if step.softening:
         figures |= step.softening.figures()
     if step.friction:
         residuals["friction coefficient, weighted by force"] = step.friction.rms
     if law := step.law:
         residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
-    return replace(step, temperatures=temperatures, figures=figures, residuals=residuals)
+    return replace(step, temperatures=temperatures, figures=figures, achieved_K=achieved_K, residuals=residuals)
 
 
 def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:

@@ -1,0 +1,337 @@
+"""Which forms of the grammar are worth a fit: screened on episodes left out of it, beside all that a path's own parameters can
+do, and the best few run through the estimator."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from emb_daemon.calibration.terms import Term, fill_terms
+from emb_daemon.diagnose.coordinates import Coordinate, Move
+from emb_daemon.diagnose.evidence import Averaging, Evidence, leave_out
+from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, rippling
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.orders import strongest_orders
+from emb_daemon.diagnose.residuals import Bench, Probe
+from emb_daemon.diagnose.selection import LASTING
+from emb_daemon.diagnose.unexplained import sample_noise
+from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
+from emb_daemon.effects.terms import PARAMETERS, PORTS, SIGNALS, evaluate
+from emb_daemon.errors import InvalidValue
+
+#: Samples that are averaged for chance, which asks all forms a hundred times, and for whether anything slow is left.
+COARSE = 32
+#: Forms that are run through the estimator.
+_SHORTLIST = 10
+#: Forms whose sizes are fitted before that, and tries for each size: exponents and times as enumerated are a factor of two and
+#: more apart, and between two signals that resemble each other the better guess of an exponent would decide.
+_SHARPENED, _TRIES = 24, 8
+#: Shifts of all signals in time, and of the chosen one's.
+_CHANCES, _SHIFTS = 99, 5
+#: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
+_ORDERS, _LOBES = (0.05, 100.0), 4
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What left-out episodes say of forms, one row each: with ``u`` = xᵀr and ``a`` = xᵀx of each episode, nuisances projected
+    out of the regressor x."""
+
+    u: np.ndarray
+    a: np.ndarray
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Fall of the squared error summed over left-out episodes."""
+        rest = self.a.sum(axis=1, keepdims=True) - self.a
+        without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=rest > 0.0)
+        return np.sum(2.0 * without * self.u - without**2 * self.a, axis=1)
+
+
+class Screen:
+    """One channel's residual, averaged, with its nuisances, against which forms are held."""
+
+    def __init__(self, model: Model, channel: str, samples: int):
+        self.model, self.channel, bench = model, channel, model.bench
+        self.means = Averaging(bench.episode[channel], samples)
+        self._of_episode = (self.means.episode == np.arange(bench.episodes)[:, None]).astype(float)
+        own = model.own(channel)
+        penalty = model.penalty(own, channel) + 1e-12
+        table = np.column_stack([*(model.columns[c] for c in own), model.residual[channel]])
+        averaged = self.means.of(table)
+        self.nuisances = averaged[:, :-1]
+        self._inverse = np.linalg.pinv(self.nuisances.T @ self.nuisances + np.diag(penalty), rcond=1e-12, hermitian=True)
+        self.residual = self.beside_nuisances(averaged[:, -1:])
+        self._residual_of_episode = self._of_episode * self.residual[:, 0]
+        self.keep = model.residual[channel] != 0.0
+
+    def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
+        """What of averaged columns the nuisances cannot take."""
+        return averaged - self.nuisances @ (self._inverse @ (self.nuisances.T @ averaged))
+
+    def scores(self, columns: np.ndarray) -> Scores:
+        """Of regressors (N, k)."""
+        return self.scores_of(self.means.of(columns * self.keep[:, None]))
+
+    def scores_of(self, averaged: np.ndarray) -> Scores:
+        """Of regressors that are averaged already."""
+        averaged = self.beside_nuisances(averaged)
+        u = self._residual_of_episode @ averaged
+        np.square(averaged, out=averaged)
+        return Scores(u.T, (self._of_episode @ averaged).T)
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """A form with its regressors, by the estimator itself, and what left-out episodes say of them."""
+
+    form: Form
+    columns: list[np.ndarray]
+    evidence: Evidence
+
+    @property
+    def means(self) -> tuple[str, str]:
+        """What it says: port and signal."""
+        return self.form.port, self.form.signal
+
+
+class Search:
+    """All forms at the ports of one channel."""
+
+    def __init__(self, model: Model, channel: str, signals: list[np.ndarray]):
+        self.model, self.channel, self.signals = model, channel, signals
+        self.random = np.random.default_rng(0)
+        self.covered = _covered(np.concatenate(signals))
+        self.ports = tuple(
+            port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
+        )  # fmt: skip
+        self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
+        self.screen = Screen(model, channel, LASTING[channel])
+        self.forms = enumerate_forms(self.covered, self.ports)
+        self.scores = _screen_forms(self.screen, self.forms, self.sensitivities, signals)
+
+    def prospects(self) -> list[Prospect]:
+        """The best forms, through the estimator, with their sizes fitted; shortest description first."""
+        model, own = self.model, self.model.own(self.channel)
+        best = [*_sharpen(self), *_ripples(self)]
+        exact = [_probed(model, self.channel, form) for form in best]
+        samples = LASTING[self.channel]
+        pairs = zip(best, exact, strict=True)
+        found = [Prospect(form, own, model.evidence(self.channel, own, samples=samples)) for form, own in pairs]
+        moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
+        alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
+        alone -= noise_left(model, self.channel, samples)
+        kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+    def chance(self, best: Prospect) -> float:
+        """That of the best among all forms; a ripple's is that of its order among as many."""
+        if best.form.shape == "harmonic":
+            return min(1.0, best.evidence.p_value * len(self.forms))
+        return _chance(self)
+
+    def at_another_time(self, form: Form) -> float:
+        """Largest gain of a term with its signal moved in time, as if the log were a circle; none for a ripple."""
+        if form.shape == "harmonic":
+            return 0.0
+        values = _values(self.model.bench, form, self.signals)
+        shifts = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
+        columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in shifts])
+        return float(self.screen.scores(columns).gain.max())
+
+
+def _covered(signals: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Range of each signal that varies."""
+    result = {}
+    for index, name in enumerate(SIGNALS):
+        known = signals[np.isfinite(signals[:, index]), index]
+        if len(known) and np.ptp(known) > 1e-9 * max(abs(known.max()), 1e-12):
+            result[name] = float(known.min()), float(known.max())
+    return result
+
+
+def _sensitivity(model: Model, channel: str, port: str) -> np.ndarray:
+    """What one unit at a port does to a channel, minus the derivative of the residual."""
+    constant = Form(port, "motor_speed", "none", "constant", "always", 1.0, 0.0, 1.0, 1.0, -1e9, 1e9)
+    return _probed(model, channel, constant)[0]
+
+
+def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
+    """A form's regressors, by the estimator itself."""
+    index = len(model.bench.calibration.terms)
+    bench = with_term(model.bench, form.term())
+    own = [coordinate_of(index, channel, form, "coefficient", "")]
+    if form.shape == "harmonic":
+        own.append(coordinate_of(index, channel, form, "sine", ""))
+    return bench.regressors(model.values, [Probe(c) for c in own], model.residual)
+
+
+def with_term(bench: Bench, term: Term) -> Bench:
+    return bench.under(msgspec.structs.replace(bench.calibration, terms=(*bench.calibration.terms, term)))
+
+
+def coordinate_of(index: int, channel: str, form: Form, field: str, effect: str) -> Coordinate:
+    key = f"terms[{index}].{field}"
+    if field in ("coefficient", "sine"):
+        moves = (Move(key, 1.0, -np.inf, np.inf),)
+        return Coordinate(
+            key, channel, 0.0, form.step, np.inf, moves, unit=HOOKS[form.port].unit, effect=effect, parameter=field
+        )
+    low, high, prior = form.bounds(field)
+    start = getattr(form, field)
+    return Coordinate(
+        key, channel, start, 1e-3 * prior, prior, (Move(key, 1.0, low, high),), low, high, effect=effect, parameter=field
+    )  # fmt: skip
+
+
+def _screen_forms(
+    screen: Screen, forms: Sequence[Form], sensitivities: Mapping[str, np.ndarray], signals: list[np.ndarray]
+) -> Scores:
+    """All forms, each as what its port does times what its shape makes of its signal."""
+    shapes: dict[Form, list[int]] = {}
+    for index, form in enumerate(forms):
+        shapes.setdefault(replace(form, port=""), []).append(index)
+    episodes = screen.model.bench.episodes
+    u, a = np.zeros((len(forms), episodes)), np.zeros((len(forms), episodes))
+    for members in shapes.values():
+        values = _values(screen.model.bench, forms[members[0]], signals)
+        columns = np.column_stack([sensitivities[forms[index].port] * values for index in members])
+        part = screen.scores(columns)
+        u[members], a[members] = part.u, part.a
+    return Scores(u, a)
+
+
+def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
+    """What a form of coefficient one makes of its signal, at every sample."""
+    record = _record_of(replace(form, port=form.port or PORTS[0]))
+    largest = bench.calibration.stiffness.maximum_force_N
+    parts = zip(bench.trials, signals, strict=True)
+    return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])
+
+
+def _record_of(form: Form) -> np.void:
+    record = np.zeros(1, PARAMETERS)[0]
+    fill_terms(record, (form.term(),))
+    record["term"][0]["coefficient"] = 1.0
+    return record["term"][0]
+
+
+def _chance(search: Search) -> float:
+    """Chance that the best of all forms gains as much with their signals moved in time."""
+    screen = Screen(search.model, search.channel, COARSE)
+    shapes = list(dict.fromkeys(replace(form, port="") for form in search.forms))
+    row = {shape: index for index, shape in enumerate(shapes)}
+    every = [screen.means.of(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
+    values = np.column_stack(every) * screen.means.per_mean[:, None]
+    by_port = []
+    for port, column in search.sensitivities.items():
+        rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
+        if rows:
+            by_port.append((screen.means.of((column * screen.keep)[:, None]), rows))
+    gain = search.scores.gain.max()
+    for number in range(_CHANCES):
+        moved = np.roll(values, int(len(values) * search.random.uniform(0.1, 0.9)), axis=0)
+        if any(float(screen.scores_of(own * moved[:, rows]).gain.max()) >= gain for own, rows in by_port):
+            # One that is as good is one too many, and settles it.
+            return 2.0 / (2.0 + number)
+    return 1.0 / (1.0 + _CHANCES)
+
+
+def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
+    """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
+    chosen: list[Form] = []
+    for index in np.argsort(-gains):
+        form = forms[index]
+        relatives = [f for f in chosen if (f.port, f.signal, f.memory) == (form.port, form.signal, form.memory)]
+        if gains[index] > 0.0 and len(relatives) < 2:
+            chosen.append(form)
+        if len(chosen) == most:
+            break
+    return chosen
+
+
+def _sharpen(search: Search) -> list[Form]:
+    """The best forms with their sizes where left-out episodes gain most."""
+    found = [_fit_sizes(search, form) for form in _best_of(search.forms, search.scores.gain, _SHARPENED)]
+    gains = np.array([gain for _, gain in found])
+    return _best_of([form for form, _ in found], gains, _SHORTLIST)
+
+
+def _fit_sizes(search: Search, form: Form) -> tuple[Form, float]:
+    """A form with its sizes fitted one after the other on the screen, and its gain there."""
+
+    def gain(tried: Form) -> float:
+        values = _values(search.model.bench, tried, search.signals)
+        return float(search.screen.scores((search.sensitivities[form.port] * values)[:, None]).gain[0])
+
+    best = gain(form)
+    for size in form.fitted:
+        low, high, _ = form.bounds(size)
+        now = getattr(form, size)
+        for tried in np.linspace(low, high, _TRIES + 2)[1:-1] if size == "centre" else np.geomspace(low, high, _TRIES):
+            other = replace(form, **{size: float(tried)})
+            reached = gain(other)
+            if reached > best:
+                best, now = reached, float(tried)
+        form = replace(form, **{size: now})
+    return form, best
+
+
+def _ripples(search: Search) -> list[Form]:
+    """The strongest ripples over the motor angle at each port that may have one."""
+    found = []
+    for port in rippling(search.ports) if "motor_angle" in search.covered else ():
+        effect = Effect(
+            name=port, hook=port, term=lambda: 0.0, equation="", source="",
+            parameters=(Parameter("o", "1", *_ORDERS, 1.0, "", _ORDERS),),
+            harmonic=Harmonic("o", "c", "s", grows_with="port"),
+        )  # fmt: skip
+        orders, _ = strongest_orders(search.model, effect, search.channel, {"port": search.sensitivities[port]}, _LOBES)
+        found += [harmonic(port, _order(search, port, o), search.model.bench.middle, search.covered) for o in orders]
+    return found
+
+
+def _order(search: Search, port: str, order: float) -> float:
+    """A ripple's order where it explains most, within half a lobe of one found by its spectrum."""
+    screen, (low, high) = search.screen, search.covered["motor_angle"]
+    angle = np.concatenate(search.signals)[:, list(SIGNALS).index("motor_angle")] - search.model.bench.middle
+    does = search.sensitivities[port] * screen.keep
+
+    def gain(tried: float) -> float:
+        both = np.column_stack([does * np.cos(tried * angle), does * np.sin(tried * angle)])
+        columns = screen.beside_nuisances(screen.means.of(both))
+        u = columns.T @ screen.residual[:, 0]
+        return float(u @ np.linalg.pinv(columns.T @ columns, hermitian=True) @ u)
+
+    # Of all places together a lobe is as wide as this.
+    lobe = 2.0 * np.pi / max(high - low, 1.0)
+    tried = (order + lobe * np.linspace(-0.5, 0.5, 2 * _TRIES + 1)).tolist()
+    return max((o for o in tried if o > 0.0), key=gain)
+
+
+def _stays_in_bounds(prospect: Prospect) -> bool:
+    """Whether a calibration may hold the term at the size found."""
+    try:
+        prospect.form.term(coefficient=float(np.hypot.reduce(prospect.evidence.values)))
+    except InvalidValue:
+        return False
+    return True
+
+
+def _length(prospect: Prospect, alone: float, episodes: int) -> float:
+    """What the term adds to the description length of what is left, in nats.
+
+    ``alone``: squared error of left-out episodes without the term, less the noise that no term explains."""
+    left = max(1.0 - prospect.evidence.gain / max(alone, 1e-300), 1e-3)
+    return description_length(left, prospect.form.numbers, episodes)
+
+
+def description_length(left: float, numbers: int, episodes: int) -> float:
+    """Description length of a squared error and the numbers of what left it; an episode counts as one observation."""
+    return 0.5 * episodes * np.log(left) + 0.5 * numbers * np.log(episodes)
+
+
+def noise_left(model: Model, channel: str, samples: int) -> float:
+    """Squared error that no term explains, of means over ``samples``."""
+    return model.counted(channel) * sample_noise(model.residual[channel]) ** 2 / samples
