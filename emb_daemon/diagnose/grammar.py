@@ -65,12 +65,12 @@ def _with_terms(selection: Selection, channel: str) -> Selection:
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
     """The same, or terms alone if these leave less by what matters: an effect of the ``catalogue`` beside which a term had to
     be made may be the shadow of what no catalogue holds. It is then asked again beside the terms."""
-    doubted = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
-    known = any(catalogue.candidates[name].in_calibration for name in doubted)
-    if not doubted or known or found.accepted == catalogue.accepted:
+    suspects = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
+    known = any(catalogue.candidates[name].in_calibration for name in suspects)
+    if not suspects or known or found.accepted == catalogue.accepted:
         return found
     bare = catalogue
-    for name in doubted:
+    for name in suspects:
         bare = bare.without(name, "explains less than terms without it, and nothing beside them")
     terms = _with_terms(bare, channel)
     if terms.accepted == bare.accepted:

@@ -187,7 +187,7 @@ def place_contact(s, p, angle, sigma):
 @njit
 def watch_contact(s, p, m, force_before, torque, leverage):
     """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
-    c, x, doubt = s.contact, s.past_contact, sqrt(s.covariance[1, 1])
+    c, x, contact_sigma = s.contact, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT])
     if p.clearance_sigma == 0.0:
         # Held as exactly known, as diagnose does; no calibration file can say so.
         engaged(c, x, 0.0)
@@ -204,7 +204,7 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
     unsure = hypot(offset_sigma, learned_sigma)
-    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, doubt, offset, unsure)
+    found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, contact_sigma, offset, unsure)
     # A change that explains the torque is not found a second time as a contact angle that is somewhere else.
     explained = likely_shift(s) != 0.0
     if explained:
@@ -230,10 +230,10 @@ def watch_contact(s, p, m, force_before, torque, leverage):
         forget_level(c)
         c.engaged = True
         _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
-    doubt = sqrt(s.covariance[1, 1])
-    if doubt < _KNOWN_RAD:
+    contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
+    if contact_sigma < _KNOWN_RAD:
         c.lost = False
-    engaged(c, s.past_contact, doubt)
+    engaged(c, s.past_contact, contact_sigma)
 
 
 @njit
@@ -252,9 +252,9 @@ def _start_contact(s, p, m, force, sigma, leverage):
     lag = p.relaxation_time * m.speed
     misread = 1.0 / (leverage * slope)
     for i in range(STATES):
-        s.covariance[1, i] = s.covariance[i, 1] = misread * s.covariance[OFFSET, i]
+        s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = misread * s.covariance[OFFSET, i]
     own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
-    s.covariance[1, 1] = own + misread * misread * s.covariance[OFFSET, OFFSET]
+    s.covariance[CONTACT, CONTACT] = own + misread * misread * s.covariance[OFFSET, OFFSET]
     s.contact_anchor = s.contact_angle
     start_anew(s.contact)
     open_again(s, p)

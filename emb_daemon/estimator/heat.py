@@ -34,7 +34,7 @@ _SHOWN_K = 20.0
 
 @njit
 def _start_heat(s, t, m):
-    """Profiles out of the backing plates alone: right for pads at rest, and doubted by how far the plates are off the caliper.
+    """Profiles out of the backing plates alone: right for pads at rest, and as uncertain as the plates are off the caliper.
 
     The disc takes the plates' mean and the pads lie between.
     """
@@ -50,7 +50,7 @@ def _start_heat(s, t, m):
         share = t.node_position[node] / t.thickness
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-    _doubt_start(s, m.caliper)
+    _widen_start(s, m.caliper)
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
@@ -58,10 +58,10 @@ def _start_heat(s, t, m):
 
 
 @njit
-def _doubt_start(s, around):
+def _widen_start(s, around):
     """Plates that are not as warm as what is ``around`` them (degC) tell of heat on its way, not of how long it has been."""
-    doubt = _BEHIND_PLATES * max(abs(s.disc - around) - _PLATES_SPREAD_K, 0.0)
-    s.temperature_sigma, s.history_sigma = max(s.temperature_sigma, doubt), max(s.history_sigma, doubt)
+    uncertainty = _BEHIND_PLATES * max(abs(s.disc - around) - _PLATES_SPREAD_K, 0.0)
+    s.temperature_sigma, s.history_sigma = max(s.temperature_sigma, uncertainty), max(s.history_sigma, uncertainty)
 
 
 @njit
@@ -82,7 +82,7 @@ def _tell_temperatures(s, t):
 
 @njit
 def _watch_plates(s, t, m, dt):
-    """Whether the thermocouples can be true; doubts the pads' temperature by what a false one may hide, K.
+    """Whether the thermocouples can be true; widens the pads' temperature by what a false one may hide, K.
 
     A reading that repeats to the bit is stuck once the pad has been hotter or colder than when it last moved for as long as
     heat takes through the pad, L^2/(4 a), by `_SHOWN_K` in the mean over that time. A reading that jumps is one of two that
@@ -149,7 +149,7 @@ def heat(s, p, m):
     if m.has_status and not s.ambient_heard:
         s.ambient_heard = True
         if m.cycle * CYCLE_S < _HEARD_S and not s.resumed:
-            _doubt_start(s, m.ambient)
+            _widen_start(s, m.ambient)
     touching = s.fused > TOUCHING_N
     if touching != s.touching and s.heat_time > 0.0:
         _flow(s, t, p.effects, m)

@@ -16,6 +16,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
+from emb_daemon.estimator.paths import UNCERTAIN_CONTACT_RAD
 from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
     MOST_SCALE,
@@ -70,8 +71,6 @@ _OPENED_S = 1.0
 _AMBIGUOUS_S = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
 GATE = 5.0
-#: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
-DOUBTFUL_RAD = 0.05
 
 #: What may have changed at once, or with heat, and a brake that drifts, which never becomes the first hypothesis.
 ALTERNATIVES = 4
@@ -200,7 +199,7 @@ def place(s, a, p, factor, warmth):
     here, _ = characteristic_curve(x, p.curve)
     there, slope = characteristic_curve(x + moved, p.curve)
     sigma = sqrt(max(a.covariance[CONTACT, CONTACT], 0.0))
-    if sigma > DOUBTFUL_RAD:
+    if sigma > UNCERTAIN_CONTACT_RAD:
         slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
     # The lag is left out of the difference: it settles within a fraction of the time that a jump takes to be proven.
     scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))

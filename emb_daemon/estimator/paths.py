@@ -6,6 +6,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.jit import njit
+from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 from emb_daemon.models.torque import friction_state, slid_angle, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
@@ -21,7 +22,7 @@ FLICKER_RAD = 0.0008
 #: A time after which everything has settled, s.
 _LONG_S = 1e6
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
-_DOUBTFUL_RAD = 0.05
+UNCERTAIN_CONTACT_RAD = 0.05
 
 
 @njit
@@ -52,9 +53,9 @@ def _deform(s, p, x, dt, factor):
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x
-    doubt = s.covariance[1, 1]
-    if doubt > _DOUBTFUL_RAD * _DOUBTFUL_RAD:
-        slope = mean_slope(x, sqrt(doubt), p.curve)
+    variance = s.covariance[CONTACT, CONTACT]
+    if variance > UNCERTAIN_CONTACT_RAD * UNCERTAIN_CONTACT_RAD:
+        slope = mean_slope(x, sqrt(variance), p.curve)
     drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
     relaxation_time = p.relaxation_time * effects.relaxation_time(p.effects, s.effects, travel, dt)
     s.force = first_order_lag(s.force, s.drive, drive, dt, relaxation_time)

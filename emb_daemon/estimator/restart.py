@@ -67,7 +67,7 @@ def _copy_pads(to, pads):
 
 @entry(STATE, PARAMETERS, SNAPSHOT, returns=1)
 def take_snapshot(s, p, snapshot):
-    """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or doubted."""
+    """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or uncertain."""
     if not s.started or s.unknown or s.contact.lost:
         return False
     snapshot.clearance = p.clearance + s.contact_angle - s.contact_anchor

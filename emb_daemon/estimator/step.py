@@ -30,7 +30,7 @@ from emb_daemon.estimator.status import (
 )
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
 from emb_daemon.jit import njit
-from emb_daemon.models.fusion import SCALE, maximum_likelihood
+from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
 from emb_daemon.models.plausibility import disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
@@ -81,7 +81,7 @@ def step(s, p, m, out):
         _start(s, p, m)
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
-        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[1, 1]), s.contact.confirmed)
+        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT]), s.contact.confirmed)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
@@ -153,7 +153,7 @@ def _look(s, p, m, facts, out):
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force
     out.sigma = min(out.sigma, p.maximum_force)
-    if out.sigma > _UNCERTAIN * p.maximum_force or s.covariance[1, 1] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
+    if out.sigma > _UNCERTAIN * p.maximum_force or s.covariance[CONTACT, CONTACT] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
         facts |= FORCE_UNCERTAIN
     return facts
 
@@ -175,7 +175,7 @@ def predict(s, p, age, out):
     out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
     out.contact_angle = s.contact_angle
-    out.contact_sigma = sqrt(s.covariance[1, 1])
+    out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
     out.stiffness_factor = s.factor * s.scale if s.started else 1.0
     out.innovation = out.innovation_sigma = np.nan
     tell(s, out)
