@@ -15,7 +15,7 @@ import numpy as np
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.forms import Form, made_effect
 from emb_daemon.diagnose.held_heat import follow_signals, record_heat
-from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     COARSE,
     Prospect,
@@ -50,7 +50,7 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
         if _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
-            selection = _called_by_name(selection, channel)
+            selection = _with_orders_again(_called_by_name(selection, channel), channel)
     return selection
 
 
@@ -63,8 +63,10 @@ def _with_terms(selection: Selection, channel: str) -> Selection:
 
 
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
-    """The same, or terms alone if these leave less by what matters: an effect of the ``catalogue`` beside which a term had to
-    be made may be the shadow of what no catalogue holds. It is then asked again beside the terms."""
+    """The same, or terms alone if these leave less by what matters and describe it more shortly.
+
+    An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
+    asked again beside the terms."""
     suspects = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
     known = any(catalogue.candidates[name].in_calibration for name in suspects)
     if not suspects or known or found.accepted == catalogue.accepted:
@@ -77,29 +79,31 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
         return found
     both = one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
-    return both if gain > found.screening.floor(found.model, channel) ** 2 else found
+    matters = gain > found.screening.floor(found.model, channel) ** 2
+    return both if matters and _description(both, channel) < _description(found, channel) else found
 
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
     """The same with an effect of the catalogue in the place of each term that it describes as shortly: what has a name is
     called by it."""
-    for term in [n for n, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]:
+    for term in _made(selection, channel):
         bare = selection.without(term, "an effect of the catalogue says the same")
         known = find_known(bare, channel)
         if known is None:
             continue
         named, name = bare.entered([known]), known.effect.name
-        if name in named.accepted and _description(named, name, channel) <= _description(selection, term, channel):
+        if name in named.accepted and _description(named, channel) <= _description(selection, channel):
             selection = named
     return selection
 
 
-def _description(selection: Selection, name: str, channel: str) -> float:
-    """Description length of what lasts of a channel's residual, with the numbers of one effect or term."""
+def _description(selection: Selection, channel: str) -> float:
+    """Description length of what lasts of a channel's residual, with all numbers of its effects and terms."""
     model, samples = selection.model, LASTING[channel]
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
     matters = model.counted(channel) * selection.screening.floor(model, channel) ** 2
-    return description_length(max(left, matters), len(model.of_effect(name)), model.bench.episodes)
+    numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
+    return description_length(max(left, matters), numbers, model.bench.episodes)
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
@@ -150,11 +154,44 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     )  # fmt: skip
     if against:
         return selection.noted([candidate])
-    # Side lobes that do as well here are told from the ripple itself by a fit with everything else.
-    lobes = [p for p in prospects if p.means == best.means and p.form.shape == best.form.shape == "harmonic"]
-    close = [p for p in lobes if p is not best and p.evidence.gain >= _AS_GOOD * best.evidence.gain]
-    fitted = [_enter(selection, replace(candidate, evidence=p.evidence), p.form) for p in (best, *close)]
-    return min(fitted, key=lambda s: s.model.noise(channel))
+    if best.form.shape == "harmonic":
+        return _enter_lobe(
+            selection, candidate, [p for p in prospects if p.form.shape == "harmonic" and p.means == best.means]
+        )
+    return _enter(selection, candidate, best.form)
+
+
+def _enter_lobe(selection: Selection, candidate: Candidate, lobes: Sequence[Prospect]) -> Selection:
+    """With a ripple: side lobes that do as well as the best on the screen are told from it by a fit with everything else."""
+    most = max(lobe.evidence.gain for lobe in lobes)
+    close = [lobe for lobe in lobes if lobe.evidence.gain >= _AS_GOOD * most]
+    fitted = [_enter(selection, replace(candidate, evidence=lobe.evidence), lobe.form) for lobe in close]
+    return min(fitted, key=lambda s: s.model.noise(candidate.channel))
+
+
+def _with_orders_again(selection: Selection, channel: str) -> Selection:
+    """The same with each ripple's order chosen once more: before everything else was in place, a side lobe may have done
+    better."""
+    for name in _made(selection, channel):
+        candidate = selection.candidates[name]
+        if "sine" not in [c.parameter for c in candidate.amplitudes]:
+            continue
+        bare = selection.without(name, "its order was chosen again")
+        signals = _signals(bare.model)
+        ripples = Search(bare.model, channel, signals).ripples() if signals else []
+        lobes = [p for p in ripples if p.form.port == candidate.effect.hook and p.evidence.gain > 0.0]
+        if not lobes:
+            continue
+        again = replace(candidate, effect=made_effect(lobes[0].form, _name(lobes[0].form, bare)))
+        other = _enter_lobe(bare, again, lobes)
+        if other.model.noise(channel) < (1.0 - TOLERANCE) * selection.model.noise(channel):
+            selection = other
+    return selection
+
+
+def _made(selection: Selection, channel: str) -> list[str]:
+    """Terms that were accepted in a channel."""
+    return [name for name, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]
 
 
 def _signals(model: Model) -> list[np.ndarray] | None:

@@ -16,7 +16,7 @@ from emb_daemon.offline.score import rmse
 #: over which a residual of either path stays the same.
 _INFLATION = 5.0
 #: A fit ends when the cost falls by less than this share, or after so many evaluations: screening and the next round follow.
-_TOLERANCE, _EVALUATIONS = 2e-3, 8
+TOLERANCE, _EVALUATIONS = 2e-3, 8
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Model:
 
         prior = {c: (self.centre.get(c, c.start), c.prior) if np.isfinite(c.prior) else None for c in own}
         free = {c: Free(self.values[c], c.step, c.low, c.high, prior[c]) for c in own}
-        found = fit([Block(residual, own, episode, derivative)], free, tolerance=_TOLERANCE, evaluations=_EVALUATIONS)
+        found = fit([Block(residual, own, episode, derivative)], free, tolerance=TOLERANCE, evaluations=_EVALUATIONS)
         values = self.values | found.values
         table = -scale * derivative(found.values)
         return replace(

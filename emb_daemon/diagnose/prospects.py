@@ -3,6 +3,7 @@ do, and the best few run through the estimator."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -108,17 +109,30 @@ class Search:
         )  # fmt: skip
         self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
         self.screen = Screen(model, channel, LASTING[channel])
-        self.forms = enumerate_forms(self.covered, self.ports)
-        self.scores = _screen_forms(self.screen, self.forms, self.sensitivities, signals)
+
+    @cached_property
+    def forms(self) -> list[Form]:
+        """All but ripples."""
+        return enumerate_forms(self.covered, self.ports)
+
+    @cached_property
+    def scores(self) -> Scores:
+        """What left-out episodes say of the forms."""
+        return _screen_forms(self.screen, self.forms, self.sensitivities, self.signals)
+
+    def ripples(self) -> list[Prospect]:
+        """The strongest ripples over the motor angle at each port that may have one, through the estimator."""
+        return self._run(_ripples(self))
+
+    def _run(self, forms: Sequence[Form]) -> list[Prospect]:
+        columns = [_probed(self.model, self.channel, form) for form in forms]
+        found = [self.model.evidence(self.channel, own, samples=LASTING[self.channel]) for own in columns]
+        return [Prospect(*one) for one in zip(forms, columns, found, strict=True)]
 
     def prospects(self) -> list[Prospect]:
         """The best forms, through the estimator, with their sizes fitted; shortest description first."""
-        model, own = self.model, self.model.own(self.channel)
-        best = [*_sharpen(self), *_ripples(self)]
-        exact = [_probed(model, self.channel, form) for form in best]
-        samples = LASTING[self.channel]
-        pairs = zip(best, exact, strict=True)
-        found = [Prospect(form, own, model.evidence(self.channel, own, samples=samples)) for form, own in pairs]
+        model, own, samples = self.model, self.model.own(self.channel), LASTING[self.channel]
+        found = [*self._run(_sharpen(self)), *self.ripples()]
         moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
         alone -= noise_left(model, self.channel, samples)
