@@ -21,13 +21,16 @@ from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_k
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.evidence import Averaging, Moments, false_discovery, judge, leave_out
+from emb_daemon.diagnose.forms import harmonic, made_effect
 from emb_daemon.diagnose.held_heat import record_heat, run_held
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
+from emb_daemon.diagnose.prospects import Search
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
+from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.diagnose.unexplained import Left, achieved
@@ -378,6 +381,28 @@ def test_what_has_a_name_is_called_by_it(viscous):
     named = grammar._called_by_name(made, channel)
     assert named.accepted == ["viscous_friction"]
     assert named.candidates[term].reason == "an effect of the catalogue says the same"
+
+
+def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
+    """As it happens where something else was still missing when the order was chosen."""
+    bench = Bench(
+        [log_of(_logs(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})[0])], calibration
+    )
+    start = Model.of(bench)
+    selection = Selection(start.refined({"torque"}), Screening(bench, start))
+    ripples = Search(selection.model, "torque", grammar._signals(selection.model))
+    side = harmonic("gear_gain", 2.6, bench.middle, ripples.covered)
+    [lobe] = ripples._run([side])
+    effect = made_effect(side, "term:gear_gain:motor_angle")
+    wrong = grammar._enter(selection, Candidate(effect, "torque", evidence=lobe.evidence), side)
+    right = grammar._with_orders_again(wrong, "torque")
+    orders = []
+    for found in (wrong, right):
+        fitted = found.model.bench.calibrated(found.model.values)
+        [term] = [term for term in fitted.terms if term.name in found.accepted]
+        orders.append(1.0 / term.scale)
+    assert abs(orders[0] - 3.0) > 0.1
+    assert orders[1] == pytest.approx(3.0, rel=0.01)
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):
