@@ -121,7 +121,11 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
-def test_workers_may_die(tmp_path):
+@pytest.mark.parametrize("lives", [0, 3])
+def test_workers_may_die(tmp_path, monkeypatch, lives):
+    """Dask counts a worker's death against every task that lay there: only who kills one alone is given up."""
+    monkeypatch.setattr("emb_daemon.fleet.cluster._LIVES", lives)
+
     def square(number: int) -> int:
         """Its worker is killed the first time it squares 3, and always at 5."""
         mark = tmp_path / f"{number}"
@@ -130,10 +134,14 @@ def test_workers_may_die(tmp_path):
             os.kill(os.getpid(), 9)
         return number * number
 
+    told = []
     with cluster(workers=2) as client:
-        done = run(client, square, list(range(8)), failed=lambda item, reason: f"{item}: {reason}")
+        done = run(
+            client, square, list(range(8)), lambda *counts: told.append(counts), lambda item, reason: f"{item}: {reason}"
+        )
     assert done[:5] + done[6:] == [0, 1, 4, 9, 16, 36, 49]
     assert done[5].startswith("5: ")
+    assert told == [(number, 8) for number in range(1, 9)]
 
 
 def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, calibration):

@@ -75,8 +75,8 @@ def run(
 
     Args:
         progress: called with how many are done of how many.
-        failed: what stands for an item whose task raises InputError or outlives no worker, by item and reason; such an error
-            ends the work if None.
+        failed: what stands for an item whose task raises InputError or outlives no worker even when it runs alone, by item
+            and reason; such an error ends the work if None.
 
     Raises:
         InputError: of a task, where ``failed`` is None.
@@ -86,6 +86,8 @@ def run(
     from distributed.scheduler import KilledWorker
 
     results: list = [None] * len(items)
+    suspects: list[int] = []
+    done = 0
     waiting = iter(enumerate(items))
     row_of: dict = {}
 
@@ -96,20 +98,31 @@ def run(
             return future
         return None
 
-    ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    running = as_completed([future for future in (submit() for _ in range(min(ahead, len(items)))) if future])
-    for done, future in enumerate(running, start=1):
-        row = row_of.pop(future.key)
+    def settle(row: int, future: Any, final: tuple[type[Exception], ...]) -> None:
+        nonlocal done
         try:
             results[row] = future.result()
-        except (InputError, KilledWorker) as error:
+        except final as error:
             if failed is None:
                 raise InputError(str(error)) from None
             results[row] = failed(items[row], str(error))
+        except KilledWorker:
+            suspects.append(row)
+            return
         except CancelledError:
             raise Unavailable("the scheduler is gone; the same command with --resume goes on when it is back") from None
-        future.release()
+        finally:
+            future.release()
+        done += 1
         progress(done, len(items))
+
+    ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    running = as_completed([future for future in (submit() for _ in range(min(ahead, len(items)))) if future])
+    for future in running:
+        settle(row_of.pop(future.key), future, (InputError,))
         if (following := submit()) is not None:
             running.add(following)
+    # Dask blames a worker's death on every task that lay there: to blame is who kills one when it is alone.
+    for row in suspects:
+        settle(row, client.submit(task, items[row], pure=False), (InputError, KilledWorker))
     return results
