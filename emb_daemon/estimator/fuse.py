@@ -17,6 +17,7 @@ from emb_daemon.estimator.hypotheses import (
     mix,
     open_again,
     open_all,
+    open_proven,
     place,
     settle,
     stay_finite,
@@ -76,8 +77,8 @@ from emb_daemon.models.plausibility import (
     hold,
 )
 
-#: Motor torque over what the calibration's torque constant makes of the current, at least; and age of the torque path's last
-#: word, s, from which the force rests on stiffness alone.
+#: Motor torque over what the calibration's torque constant makes of the current, at least: half of what the monitor grants;
+#: and age of the torque path's last word, s, from which the force rests on stiffness alone: half of `SILENCE_S`.
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Share of the largest force by which an unproven jump must move the force to be told.
 _NOTED = 0.003
@@ -229,7 +230,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         fold(s, warmth, True)
         if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
             fold(s, warmth, False)
-            open_all(s, p)
+            open_proven(s, p)
             forget(s.consistency)
             forget_level(s.contact)
     else:
