@@ -18,11 +18,14 @@ from emb_daemon.adapt.fit import fit_training
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, curve_values, why_out_of_bounds, with_learned
 from emb_daemon.adapt.memory import FORMAT, Memory, Store, state_directory, with_entry
 from emb_daemon.adapt.pairs import FORCE, pairs_of_passes
+from emb_daemon.adapt.training import apply_learned
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.estimator.records import PARAMETERS, new_state
+from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
+from emb_daemon.estimator.unknown import set_priors
 from emb_daemon.logs.read import read_frames
+from emb_daemon.models.fusion import GAIN, INERTIA
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.scenarios import park, random_angle, rest, training
@@ -590,6 +593,40 @@ def test_a_wrong_torque_constant_is_not_taken_for_other_pads(ideal, gain):
     assert np.abs(force_error(found, ideal, np.linspace(1.0, 20.0, 20))).max() < 200.0
     other = fit(rows, believed(), IDEAL)
     assert abs(force_error(other, ideal, [20.0])[0]) < 3.0 * sigma_at(other, ideal, 20.0)
+
+
+@pytest.mark.parametrize(("curve", "inertia"), [(0.88, 1.06), (1.0, 1.15), (1.1, 0.9)])
+def test_the_inertia_of_another_unit_is_not_taken_for_a_torque_constant(ideal, curve, inertia):
+    """With pads that are known the inertia is found; with others, which of both it is stays in sigma."""
+    unit = ideal.copy()
+    unit["curve"] *= curve
+    unit["inertia"] *= inertia
+    found = fit(trained_rows(unit), IDEAL)
+    assert found.outcome == r.ACCEPTED, found.note
+    assert found.evidence["curve_changed"] == (curve != 1.0)
+    share = 1.0 if curve == 1.0 else 0.5
+    assert found.inertia_error == pytest.approx(inertia**share - 1.0, abs=0.02)
+    assert found.torque_error == pytest.approx(inertia ** (1.0 - share) - 1.0, abs=0.02)
+    travel = np.linspace(5.0, 20.0, 10)
+    sigma = np.array([sigma_at(found, unit, x) for x in travel])
+    assert np.all(np.abs(force_error(found, unit, travel)) < 3.0 * sigma)
+
+
+def test_with_a_new_curve_the_strokes_torque_constant_and_inertia_are_believed(ideal):
+    """With the old one, those that driving has found."""
+    rows, a = trained_rows(ideal, seconds=4.0), np.zeros(1, r.ADAPTER)[0]
+    a["contact_angle"], a["contact_sigma"] = ideal["clearance"], 0.1
+    a["torque_error"], a["torque_error_sigma"], a["inertia_error"], a["inertia_sigma"] = 0.05, 0.03, 0.08, 0.02
+    changed = ideal.copy()
+    changed["curve"] *= 1.1
+    for learned, expected in ((ideal, (0.01, 0.02, 3e-5)), (changed, (-0.05, 0.08, 0.0))):
+        state = new_state(1)
+        state["contact_angle"] = ideal["clearance"]
+        set_priors(state["covariance"][0], ideal)
+        state["error"][0, [GAIN, INERTIA]] = 0.01, 0.02
+        state["covariance"][0, GAIN, INERTIA] = state["covariance"][0, INERTIA, GAIN] = 3e-5
+        apply_learned(state[0], ideal, np.zeros(1, STATE), rows, learned, a)
+        assert (*state["error"][0, [GAIN, INERTIA]], state["covariance"][0, GAIN, INERTIA]) == pytest.approx(expected)
 
 
 def test_a_torque_constant_that_no_magnet_has_is_rejected(ideal):

@@ -209,7 +209,7 @@ class Adaptation:
             return
         self._evaluations[corner], self.learned[corner] = evaluation, learned
         adapter["evaluation"], adapter["evaluation_ready"] = evaluation.outcome, True
-        for name in ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma"):
+        for name in r.FOUND:
             adapter[name] = getattr(evaluation, name)
 
     def close(self, states: np.ndarray, parameters: np.ndarray) -> None:

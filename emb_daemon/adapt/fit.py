@@ -6,7 +6,8 @@ calibration.
 
 An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
 sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
-which steel keeps for life, can.
+which steel keeps for life, can, if it is that of the unit that was calibrated. Where the pads have changed too, it may not be:
+then the torque constant lies halfway, with a standard deviation that reaches both.
 
 Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
 uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
@@ -42,7 +43,7 @@ from emb_daemon.calibration.parameters import (
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
-from emb_daemon.estimator.unknown import SLOW_RAD_PER_S
+from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S, UNIT_INERTIA
 from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.fusion import SLOW, VISCOUS
@@ -55,13 +56,12 @@ INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
-#: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
-#: off than a calibration leaves it.
-_INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
+#: The same beside an inertia that is another unit's: no further off than a calibration leaves it.
+_GAIN_KEPT_SIGMA = 0.01
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
-#: Residuals beyond this many standard deviations count linearly (Huber).
+#: Residuals beyond this many standard deviations count linearly (Huber): over 99 % as efficient as squares on normal noise.
 _HUBER = 2.5
 #: Samples of which the mean torque is fitted: the acceleration's noise falls with their number, and the motion asked for has
 #: a period of ten such blocks.
@@ -245,11 +245,11 @@ class _Fit(NamedTuple):
     contact_sigma: float
 
 
-def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA):
+def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=UNIT_INERTIA):
     """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
     against that; outliers are left out of the second round."""
     prior = np.zeros(len(x))
-    prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, _INERTIA_SIGMA**-2
+    prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, inertia_sigma**-2
     first = _improve(training, x, steps, prior, free)
     far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
     if np.mean(far) <= _FEW:
@@ -273,14 +273,24 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     much better one with more freedom fits the noise."""
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(offset_friction, 1e-4)
-    free = _fit(training, x, steps, np.delete(np.arange(len(x)), _INERTIA))
+    with_curve, without = np.delete(np.arange(len(x)), _INERTIA), np.delete(np.arange(_CURVE), _INERTIA)
+    free = _fit(training, x, steps, with_curve)
     kept = np.concatenate([free.x[:_CURVE], curve])
-    held = _fit(training, kept, steps, np.delete(np.arange(_CURVE), _INERTIA))
+    held = _fit(training, kept, steps, without)
+    if held.cost < free.cost:
+        # What has more freedom explains no less: it began too far off and ended at a curve that does not rise at contact.
+        free = _fit(training, held.x, steps, with_curve)
     if not _as_good(held, free):
         # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+        kept = np.concatenate([free.x[:_CURVE], curve])
         kept[_GAIN] = 0.0
         held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
-    return (held, True) if _as_good(held, free) else (free, False)
+    if _as_good(held, free):
+        return held, True
+    # Magnets that lost as much, or the rotor of another unit: what inertia and torque constant contradict each other by is
+    # either's, and its size says how far they may be off (the likeliest standard deviation of two, by their difference).
+    apart = max(abs(free.x[_GAIN]) / sqrt(2.0), _GAIN_KEPT_SIGMA)
+    return _fit(training, free.x, steps, np.arange(len(x)), apart, apart), False
 
 
 def _as_good(held, fit):
@@ -400,6 +410,8 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         contact_sigma=float(sigmas[_CONTACT]) if unchanged else fit.contact_sigma,
         torque_error=expm1(-x[_GAIN]),
         torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
+        inertia_error=expm1(x[_INERTIA]),
+        inertia_sigma=hypot(sigmas[_INERTIA], INERTIA_SIGMA),
         evidence={
             "samples": len(rows),
             "residual_A": float(sigma / now["torque_constant"]),

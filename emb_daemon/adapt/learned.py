@@ -29,6 +29,7 @@ class Evaluation:
         values, sigmas: by the calibration's keys.
         contact_angle: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad.
         torque_error, torque_error_sigma: of the torque path, as a share of the force: the magnets' and the current sensor's.
+        inertia_error, inertia_sigma: of the calibration's inertia, as a share of it.
         evidence: figures for people, by name.
     """
 
@@ -40,6 +41,8 @@ class Evaluation:
     contact_sigma: float = np.nan
     torque_error: float = 0.0
     torque_error_sigma: float = np.nan
+    inertia_error: float = 0.0
+    inertia_sigma: float = np.nan
     evidence: dict[str, float] = field(default_factory=dict)
 
 

@@ -43,11 +43,14 @@ LIMITS = np.dtype(
     align=True,
 )
 
+#: What an `Evaluation` hands to the tick beside PARAMETERS.
+FOUND = ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma", "inertia_error", "inertia_sigma")
+
 #: One corner's adaptation as it runs. ``evaluation_wanted`` asks whoever computes for an evaluation of the first
 #: ``training_rows`` of ``rows``, told apart by ``generation``; ``evaluation_ready`` says that it is there: how it ended, and
-#: if it was accepted the contact angle with its standard deviation for the learned curve. ``ended`` asks for the outcome to
-#: be logged and kept. ``force`` is the torque path's without the torque's offset, smoothed; ``holding`` whether the corner
-#: surely clamps with its parking force at ``time_ns``; ``pulse`` the wheel's count since which the car stood.
+#: if it was accepted what it `FOUND`, the contact angle's standard deviation for the learned curve. ``ended`` asks for the
+#: outcome to be logged and kept. ``force`` is the torque path's without the torque's offset, smoothed; ``holding`` whether the
+#: corner surely clamps with its parking force at ``time_ns``; ``pulse`` the wheel's count since which the car stood.
 #: ``snapshot_wanted`` asks for what the estimator knows to be kept, last at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
@@ -60,7 +63,7 @@ ADAPTER = np.dtype(
         *fields("i8", "rows training_rows generation"),
         *fields("?", "evaluation_wanted evaluation_ready"),
         ("evaluation", "i8"),
-        *fields("f8", "contact_angle contact_sigma torque_error torque_error_sigma"),
+        *((name, "f8") for name in FOUND),
         ("ended", "?"),
         *fields("f8", "ambient rise factor_sigma"),
         ("time_ns", "i8"),

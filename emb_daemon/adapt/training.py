@@ -16,7 +16,7 @@ from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, OFFSET, SCALE
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 _STANDING_RAD_S = 0.1
@@ -143,6 +143,14 @@ def _progress(a, limits):
 
 
 @njit
+def _replace(s, state, error, sigma):
+    """Believe an ``error`` of one state with standard deviation ``sigma``, whatever was believed before."""
+    for i in range(len(s.error)):
+        s.covariance[state, i] = s.covariance[i, state] = 0.0
+    s.error[state], s.covariance[state, state] = error, sigma * sigma
+
+
+@njit
 def apply_learned(s, p, scratch, rows, learned, a):
     """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
     path models to the last of ``rows``.
@@ -154,8 +162,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     for i in range(len(p.curve)):
         kept = kept and learned.curve[i] == p.curve[i]
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
-    scale, gain = s.scale if kept else 1.0, s.error[GAIN]
-    gain_variance = s.covariance[GAIN, GAIN]
+    scale = s.scale if kept else 1.0
     first = max(0, len(rows) - _RUN_UP)
     scratch[0] = s
     t = scratch[0]
@@ -170,7 +177,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
     # what may still differ for this very curve.
     # Stiffness, contact and friction are new; what concerns the motor and its current sensor is no part of them.
-    motor = (OFFSET, FADE, HOUSING)
+    motor = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
     for i in range(len(s.error)):
         if i not in motor:
             s.error[i] = 0.0
@@ -179,11 +186,11 @@ def apply_learned(s, p, scratch, rows, learned, a):
                 s.covariance[i, j] = 0.0
     s.covariance[FAST, FAST] = 1.0
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
-    if kept:
-        s.error[GAIN], s.covariance[GAIN, GAIN] = gain, gain_variance
-    else:
-        s.error[GAIN] = -a.torque_error - s.error[FADE] * s.winding - s.error[HOUSING] * s.housing
-        s.covariance[GAIN, GAIN] = a.torque_error_sigma**2
+    if not kept:
+        # A new curve rests on the torque constant and the inertia of the stroke.
+        faded = s.error[FADE] * s.winding + s.error[HOUSING] * s.housing
+        _replace(s, GAIN, -a.torque_error - faded, a.torque_error_sigma)
+        _replace(s, INERTIA, a.inertia_error, a.inertia_sigma)
         # What the stroke left open of the new curve, driving may still find.
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
     s.scale = scale
