@@ -19,7 +19,6 @@ from emb_daemon.estimator.hypotheses import (
     mix,
     open_again,
     open_all,
-    open_proven,
     settle,
     stay_finite,
     suspected,
@@ -344,33 +343,6 @@ def test_a_drift_stays_possible_beside_a_change_that_is_all_but_certain(p, opene
     s["alternatives"]["log_odds"][TORQUE_JUMP] = 50.0
     least, most = drift_odds(s)
     assert 0.1 < np.exp(least - 50.0) < 0.2 and most == 50.0
-
-
-def test_a_proof_against_the_first_is_none_against_a_drift_that_explains_as_much(p, opened):
-    s = opened[0]
-    s["alternatives"]["log_odds"][TORQUE_JUMP] = 12.0
-    drift = s["alternatives"][DRIFT]
-    for log_odds, stays in ((11.9, True), (10.5, False)):
-        drift["log_odds"], drift["error"][SCALE] = log_odds, 0.1
-        s["alternatives"]["log_odds"][TORQUE_JUMP] = 12.0
-        assert settle(s, p, True, 0.004)
-        open_proven(s, p)
-        assert (drift["error"][SCALE] == 0.1) == stays
-        assert drift["log_odds"] == pytest.approx(-0.1 if stays else least_odds(DRIFT))
-        assert s["alternatives"]["log_odds"][TORQUE_JUMP] == PRIOR_ODDS
-
-
-@pytest.mark.parametrize("seed", (1, 2))
-def test_another_unit_than_was_calibrated_is_covered(p, seed):
-    """Its stiffness and inertia explain what a torque constant would that the inertia vouches for; which it is, no stop
-    tells."""
-    path, unit = brake.stops(p, 12, seed), p.copy()
-    unit["curve"] *= 1.11
-    unit["inertia"] *= 1.15
-    unit["torque_constant"] *= 0.976
-    rows, force = brake.samples(unit, path)
-    _, _, beyond, sigma, _, _ = _end(p, brake.noisy(rows, p, seed), force, stops=8)
-    assert beyond < 0.02 and sigma < 1000.0
 
 
 def test_two_that_are_alike_wait_for_more_strokes(p, opened):

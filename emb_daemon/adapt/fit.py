@@ -43,7 +43,7 @@ from emb_daemon.calibration.parameters import (
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
-from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S, UNIT_INERTIA
+from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S
 from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.fusion import SLOW, VISCOUS
@@ -56,8 +56,9 @@ INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
-#: The same beside an inertia that is another unit's: no further off than a calibration leaves it.
-_GAIN_KEPT_SIGMA = 0.01
+#: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
+#: off than a calibration leaves it.
+_INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
 _ITERATIONS = 40
 #: The fit has converged when an iteration lowers the cost by less than this share.
 _CONVERGED = 1e-7
@@ -245,7 +246,7 @@ class _Fit(NamedTuple):
     contact_sigma: float
 
 
-def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=UNIT_INERTIA):
+def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=_INERTIA_SIGMA):
     """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
     against that; outliers are left out of the second round."""
     prior = np.zeros(len(x))

@@ -7,10 +7,9 @@ of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic 
 1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
 deviation. A proven one becomes the first hypothesis.
 
-The last is a brake whose contact angle, stiffness and inertia differ from their calibration as units of one drawing do, and
-drift. What it makes of the torque, the first mostly takes for a torque constant or a friction within their priors: both
-explain it, so nothing is ever proven, and the fused force does not follow it. Its distance from that counts in the standard
-deviation by its odds. A proof against the first is none against a drift that explains the torque as well: such a drift stays.
+The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
+torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
+proven, and the fused force does not follow it. Its distance from that counts in the standard deviation by its odds.
 """
 
 from math import exp, log, sqrt
@@ -122,20 +121,10 @@ def open_again(s, p):
 
 @njit
 def open_all(s, p):
-    """After a start."""
+    """After a start, or when another hypothesis has become the first."""
     open_again(s, p)
     _open(s, p, DISC_GROWTH)
     _open(s, p, DRIFT)
-
-
-@njit
-def open_proven(s, p):
-    """When an alternative has become the first hypothesis. A drift that explains the torque about as well, by odds nearer to
-    even than to those it begins with, is no less possible than before; another begins anew from what was proven."""
-    open_again(s, p)
-    _open(s, p, DISC_GROWTH)
-    if s.alternatives[DRIFT].log_odds < 0.5 * _DRIFT_ODDS:
-        _open(s, p, DRIFT)
 
 
 @njit
@@ -300,7 +289,6 @@ def settle(s, p, released, dt):
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
             s.drive += a.shift
-            s.alternatives[DRIFT].log_odds -= a.log_odds
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
     if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):

@@ -45,7 +45,7 @@ _GAIN, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
 #: Offset of the motor torque at power-on: share of the torque that the largest force needs (Hall sensors: 0.5 to 1 % of a
 #: range that is several times that current); and time in which it drifts as far again, s.
 _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
-#: Inertia: rotor and screw do not change, but what a calibration of this unit makes of them is no better than this, share.
+#: Inertia: rotor and screw do not change, but what a calibration makes of them is no better than this, share.
 INERTIA_SIGMA = 0.02
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
 _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
@@ -66,14 +66,11 @@ _MISSED, _MISSED_S = 0.3, 10.0
 #: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
 #: that moved), m; stiffness (thinnest pads, another compound) and motor torque, shares.
 _CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
-#: By which units of one drawing differ: stiffness of their pads (half the spread between compounds), inertia of rotor and
-#: screw, shares.
-_UNIT_SCALE, UNIT_INERTIA = 0.1, 0.1
 #: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
 #: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
-#: it stands, m per root of a second; walk of its stiffness, share per root of a second.
+#: it stands, m per root of a second; stiffness and its walk, shares.
 _DRIFT_CONTACT_M, _DRIFT_WALK_M_PER_SQRT_S, _DRIFT_STANDING = 10e-6, 3e-6, 0.3
-_DRIFT_SCALE_WALK_PER_SQRT_S = 0.02 / 60.0
+_DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S = 0.02, 0.02 / 60.0
 #: Bounds of what can be learned: beyond them it is a fault.
 LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
@@ -210,11 +207,9 @@ def add_growth(P, p):
 
 @njit
 def add_drift(P, p):
-    """What a brake may differ by from its calibration without anything having happened to it: it is another unit than was
-    calibrated, and in service."""
+    """What a brake in service may differ by from its calibration without anything having happened to it."""
     P[CONTACT, CONTACT] += (_DRIFT_CONTACT_M / p.gear_gain) ** 2
-    P[SCALE, SCALE] += _UNIT_SCALE**2
-    P[INERTIA, INERTIA] += UNIT_INERTIA**2
+    P[SCALE, SCALE] += _DRIFT_SCALE**2
 
 
 @njit
