@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from adaptkit import ClosedLoop, parked
 
+from emb_daemon.adapt import fit as fit_module
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.files import decode, encode
@@ -610,6 +611,22 @@ def test_the_inertia_of_another_unit_is_not_taken_for_a_torque_constant(ideal, c
     travel = np.linspace(5.0, 20.0, 10)
     sigma = np.array([sigma_at(found, unit, x) for x in travel])
     assert np.all(np.abs(force_error(found, unit, travel)) < 3.0 * sigma)
+
+
+def test_a_guess_that_is_far_off_makes_no_old_curve_look_good(ideal, monkeypatch):
+    """From there a curve of its own ends without a slope at contact and explains less than the one it could have kept."""
+    guess = fit_module._guess
+
+    def far_off(*arguments):
+        x, scale = guess(*arguments)
+        x[0] -= 3.0
+        x[-3:] = 1e-6, 1.1, -0.1
+        return x, scale
+
+    monkeypatch.setattr(fit_module, "_guess", far_off)
+    unit = ideal.copy()
+    unit["curve"] *= 0.88
+    assert fit(trained_rows(unit), IDEAL).evidence["curve_changed"]
 
 
 def test_with_a_new_curve_the_strokes_torque_constant_and_inertia_are_believed(ideal):
