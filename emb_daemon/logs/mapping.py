@@ -4,6 +4,7 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
 """
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
@@ -14,8 +15,10 @@ from msgspec import Meta
 from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.contradictions import contradictions
 from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
+from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
@@ -24,6 +27,8 @@ from emb_daemon.wire.units import UNITS
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
+#: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
+_SHORTEST_S, _LONGEST_S = 1e-5, 1.0
 
 
 class Mapped(Struct, kw_only=True):
@@ -96,6 +101,8 @@ class Source:
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
+        if (sampled := held_rows(series.values)) is not None:
+            series = Series(series.time_ns[sampled], series.values[sampled])
         turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
         return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
 
@@ -221,7 +228,7 @@ class Mapping:
             raw, digest = read_table(path, sorted(wanted), self._file.time)
         else:
             recorded = read_log(path)
-            raw, digest = self._decode(recorded, wanted), recorded.digest
+            raw, digest = self._decode(path, recorded, wanted), recorded.digest
         messages = {
             name: {
                 key: source.converted(*raw[source.name]) if isinstance(source, Source) else source
@@ -229,10 +236,24 @@ class Mapping:
             }
             for name, signals in self.messages.items()
         }
+        for corner in CORNERS:
+            for line in contradictions(corner, messages):
+                print(f"{path}: {corner}: {line}", file=sys.stderr)
+        self._check_rate(path, messages)
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
         return frames, digest
+
+    def _check_rate(self, path: Path, messages: dict) -> None:
+        for corner in CORNERS:
+            for name, source in self._sources(f"EMB_{corner}_Resolver").items():
+                series = messages[f"EMB_{corner}_Resolver"][name]
+                if len(series.time_ns) > 2 and not _SHORTEST_S <= 1e-9 * series.period_ns <= _LONGEST_S:
+                    raise InputError(
+                        f"{path}: {source.name}: one value every {1e-9 * series.period_ns:.3g} s; expected {_SHORTEST_S:g} to "
+                        f"{_LONGEST_S:g} s; is the unit of time right?"
+                    )
 
     def _clocks(self) -> str:
         names = sorted({next(iter(self._sources(f"EMB_{corner}_Resolver").values())).name for corner in CORNERS
@@ -242,7 +263,7 @@ class Mapping:
         messages = {name: self.database.get_message_by_name(name.rpartition(".")[0]) for name in names}
         return ", ".join(f"{name} ({message.frame_id:#x})" for name, message in messages.items())
 
-    def _decode(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Times and values of the rig's signals; one in a frame too short for it is left out."""
         found, frames = {}, recorded.frames
         by_message: dict[str, list[str]] = {}
@@ -256,9 +277,16 @@ class Mapping:
             decoded = [
                 message.decode(payload, decode_choices=False, allow_truncated=True) for payload in recorded.payloads(rows)
             ]
-            for signal in signals:
-                values = [row.get(signal.rpartition(".")[2], np.nan) for row in decoded]
-                found[signal] = (frames["time_ns"][rows], np.array(values, float))
+            columns = {
+                signal: np.array([row.get(signal.rpartition(".")[2], np.nan) for row in decoded], float) for signal in signals
+            }
+            # Parts of a multiplexed message are messages of their own.
+            parts = [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]
+            for part in parts:
+                heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
+                values = [columns[signal][heard] for signal in part]
+                stamps, kept = in_time(f"{path}: {', '.join(part)}", frames["time_ns"][rows[heard]], values)
+                found |= {signal: (stamps, column[kept]) for signal, column in zip(part, values, strict=True)}
         return found
 
 

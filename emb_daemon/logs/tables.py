@@ -10,12 +10,15 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
+from emb_daemon.logs.stamps import in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _DELIMITERS = (",", ";", "\t")
 #: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
+#: What int64 nanoseconds hold: the year 2262, s.
+_LATEST_S = 9.2e9
 #: Cells that say that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -43,8 +46,13 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     # Of a clock, seconds already.
     seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal].type) else UNITS[time.unit][1])
     known = np.isfinite(seconds)
-    stamps = np.rint(1e9 * seconds[known]).astype(np.int64)
-    return {name: (stamps, values[known]) for name, values in columns.items()}, digest
+    if np.any(np.abs(seconds[known]) > _LATEST_S):
+        raise InputError(
+            f"{path}: {time.signal}: {np.max(np.abs(seconds[known])):g} s are no time; is `time.unit`, {time.unit}, right?"
+        )
+    columns = {name: values[known] for name, values in columns.items()}
+    stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
+    return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
 
 
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
@@ -157,9 +165,13 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
             found = {}
             for name in names:
                 signal = file.get(name)
+                values = np.asarray(signal.samples).astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
-                found[name] = (stamps, np.asarray(signal.samples).astype(float))
+                stamps, rows = in_time(f"{path}: {name}", stamps, [values])
+                found[name] = (stamps, values[rows])
             return found
+    except InputError:
+        raise
     except Exception as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: not readable as a measurement: {text}") from None
