@@ -5,6 +5,7 @@ averaged; slower ones stay as they are, since nothing can be put between samples
 """
 
 import math
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,8 @@ from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
 _DUE = 0.9
+#: Between two looks at several buses, s: a fraction of our cycle.
+_POLL_S = 0.0005
 
 
 @dataclass
@@ -79,6 +82,35 @@ class _Message:
         return time_ns, int(protect(self.can_id, payload, self.counter % COUNTER_MODULO, 0)), self.can_id, 8, 0
 
 
+class SeveralBuses:
+    """python-can buses by channel as one of them: frames of all, each with its channel; what is sent goes to the first."""
+
+    def __init__(self, buses: dict):
+        self._buses = buses
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def recv(self, timeout_s: float):
+        """The next frame of any, None if none comes in time."""
+        until = time.monotonic() + timeout_s
+        while True:
+            for channel, bus in self._buses.items():
+                if (message := bus.recv(0)) is not None:
+                    message.channel = channel
+                    return message
+            if (left := until - time.monotonic()) <= 0.0:
+                return None
+            time.sleep(min(_POLL_S, left))
+
+    def send(self, message) -> None:
+        next(iter(self._buses.values())).send(message)
+
+    def shutdown(self) -> None:
+        for bus in self._buses.values():
+            bus.shutdown()
+
+
 class MappedBus(PythonCanBus):
     """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is.
 
@@ -92,15 +124,17 @@ class MappedBus(PythonCanBus):
 
     def __init__(self, bus, mapping: Mapping):
         super().__init__(bus, [])
-        if mapping.database is None:
+        if not mapping.databases:
             raise InputError(f"{mapping.path}: maps columns; expected one with `dbc` for a live bus")
-        self._values: dict[str, _Value] = {}
+        self._values: list[_Value] = []
         self._messages = {name: self._message(name, mapping) for name in mapping.messages if not name.startswith("RIG_")}
-        self._theirs: dict[tuple[int, bool], tuple] = {}
-        for name in self._values:
-            theirs = mapping.database.get_message_by_name(name.rpartition(".")[0])
-            _, signals = self._theirs.setdefault((theirs.frame_id, theirs.is_extended_frame), (theirs, []))
-            signals.append((name.rpartition(".")[2], self._values[name]))
+        self._theirs: dict[tuple[int, bool], list[tuple]] = {}
+        for value in self._values:
+            source = value.source
+            message, _, signal = source.name.rpartition(".")
+            theirs = mapping.databases[source.bus].get_message_by_name(message)
+            readers = self._theirs.setdefault((theirs.frame_id, theirs.is_extended_frame), [])
+            readers.append((mapping.channels[source.bus], theirs, signal, value))
         self._clocks = {}
         for corner in CORNERS:
             if resolver := self._messages.get(f"EMB_{corner}_Resolver"):
@@ -110,10 +144,12 @@ class MappedBus(PythonCanBus):
     def _message(self, name: str, mapping: Mapping) -> _Message:
         message, database = our_messages()[name]
         names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
+        # Each of ours has its own, for two may come from one of the rig's, by different scales.
         signals = {
-            signal: self._values.setdefault(source.name, _Value(source)) if isinstance(source, Source) else source
+            signal: _Value(source) if isinstance(source, Source) else source
             for signal, source in mapping.messages[name].items()
         }
+        self._values += [value for value in signals.values() if isinstance(value, _Value)]
         layout = dict(zip(names, signal_columns(database, name, names), strict=True))
         return _Message(message.frame_id, cycle_ns(message), signals, layout)
 
@@ -126,13 +162,16 @@ class MappedBus(PythonCanBus):
 
     def heard(self, message, time_ns: int) -> list[tuple]:
         """FRAME rows that a frame of the rig (python-can Message) makes of ours."""
-        theirs, signals = self._theirs.get((message.arbitration_id, message.is_extended_id), (None, ()))
-        if theirs is None:
-            return []
-        decoded = theirs.decode(bytes(message.data), decode_choices=False, allow_truncated=True)
-        for name, value in signals:
-            if math.isfinite(raw := float(decoded.get(name, math.nan))):
+        decoded: dict[int, dict] = {}
+        for channel, theirs, name, value in self._theirs.get((message.arbitration_id, message.is_extended_id), ()):
+            if channel is not None and channel != str(message.channel):
+                continue
+            if id(theirs) not in decoded:
+                decoded[id(theirs)] = theirs.decode(bytes(message.data), decode_choices=False, allow_truncated=True)
+            if math.isfinite(raw := float(decoded[id(theirs)].get(name, math.nan))):
                 value.take(raw, time_ns)
+        if not decoded:
+            return []
         rows = []
         for corner, clock in self._clocks.items():
             resolver = self._messages[f"EMB_{corner}_Resolver"]
@@ -197,4 +236,10 @@ def open_mapped(options: dict, mapping: Mapping) -> MappedBus:
         InputError: no interface is named, or an unknown one, or the mapping has no DBC.
         Unavailable: it cannot be opened now.
     """
-    return MappedBus(open_python_can(options), mapping)
+    channels = sorted({channel for channel in mapping.channels.values() if channel is not None})
+    if not channels:
+        return MappedBus(open_python_can(options), mapping)
+    # The daemon's own channel first: what it sends goes there.
+    ours = str(options.get("channel") or channels[0])
+    buses = {name: open_python_can(options | {"channel": name}) for name in dict.fromkeys([ours, *channels])}
+    return MappedBus(SeveralBuses(buses), mapping)
