@@ -49,11 +49,12 @@ def _shuffled(columns):
     [
         (_twice, "were recorded twice: left out", 0.0001),
         (_coarse(0.010), "stamps come in bunches, one every 10 ms", 0.0015),
+        (_coarse(0.005), "stamps come in bunches, one every 5 ms", 0.0015),
         (_coarse(0.0156), "stamps come in bunches, one every 15.6 ms", 0.0015),
         (_in_batches, "stamps come in bunches, one every 19.8 ms", 0.0015),
         (_shuffled, "", 0.0001),
     ],
-    ids=["twice", "10 ms", "15.6 ms", "batches", "out of order"],
+    ids=["twice", "10 ms", "5 ms", "15.6 ms", "batches", "out of order"],
 )  # fmt: skip
 def test_stamps_of_recorders_are_put_right(truth, tmp_path, capsys, change, said, most_s):
     """Sample by sample the log is the one with right stamps, but for a delay that all its signals share."""

@@ -21,7 +21,7 @@ from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, 
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
 from emb_daemon.wire.units import UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
@@ -235,6 +235,28 @@ class Mapping:
             for message, text in _LOST.items():
                 if (name := message.format(corner)) not in self.messages:
                     self.notes.append(f"{self.path}: {name} is not mapped: {text}")
+
+    def require_frames(self) -> None:
+        """Raises InputError of a mapping of tables, which has no frames."""
+        if not self.databases:
+            raise InputError(f"{self.path}: maps columns; expected one with `dbc` for a live bus")
+
+    @property
+    def has_fd(self) -> bool:
+        """Whether any of the rig's mapped messages is CAN FD."""
+        names = {(s.bus, s.name.rpartition(".")[0]) for message in self.messages for s in self._sources(message).values()}
+        return any(self.databases[bus].get_message_by_name(name).is_fd for bus, name in names)
+
+    def taken(self, layout: np.ndarray) -> list[str]:
+        """A fault for each message of the rig's DBC with an id that the daemon of a LAYOUT sends with."""
+        ours = set(np.flatnonzero(layout["slot"][0] == OURS).tolist())
+        return [
+            f"{self.path}: {message.name} of the rig has id {message.frame_id:#x}, with which the daemon sends; expected "
+            "other ids of ours (`dbc` of the configuration)"
+            for database in self.databases.values()
+            for message in database.messages
+            if message.frame_id in ours and not message.is_extended_frame
+        ]
 
     def _sources(self, message: str) -> dict[str, Source]:
         return {key: source for key, source in self.messages.get(message, {}).items() if isinstance(source, Source)}

@@ -9,11 +9,11 @@ from emb_daemon.errors import InputError
 
 #: Step back in time from which a file holds two recordings; frames of two buses stand less out of order, ns.
 _BACK_NS = 1_000_000_000
-#: Share of the mean period below which two stamps are one: jitter leaves more, a queue that is emptied at once less.
-_ONE = 0.1
-#: Share of the steps in motion that have to be that short for stamps to come in bunches; chance makes 0.1 of a sender that
-#: sends at random.
-_BUNCHED = 0.2
+#: Share of the mean period up to which two stamps are one: jitter leaves more, a gateway or a queue that is emptied less.
+_ONE = 0.2
+#: Shares of the steps in motion that have to be so short, and to be none at all, for stamps to come in bunches; chance makes
+#: 0.18 and 0 of a sender that sends at random.
+_BUNCHED, _SAME_STAMP = 0.3, 0.05
 #: Share of the steps that are no pauses, and multiple of the longest of them from which a step is one.
 _ORDINARY, _PAUSE = 0.95, 10.0
 #: Bunches over which a mean time is taken: a stamp is then wrong by a twentieth of the time between two.
@@ -54,7 +54,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     for column in columns:
         before, after = column[rows[:-1]], column[rows[1:]]
         same &= (before == after) | (np.isnan(before) & np.isnan(after))
-    if np.sum(near & ~same) > _BUNCHED * np.sum(~same):
+    moving = np.sum(~same)
+    if np.sum(near & ~same) > _BUNCHED * moving or np.sum((steps == 0) & ~same) > _SAME_STAMP * moving:
         between = float(np.mean(steps[going_on & ~near]))
         times = _spread(times, np.flatnonzero(~going_on) + 1, round(_BUNCHES * between / mean))
         kept = np.concatenate([[True], np.diff(times) > 0])
