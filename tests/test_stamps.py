@@ -168,6 +168,15 @@ def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):
         assert "scale: -1" not in capsys.readouterr().err, start
 
 
+@pytest.mark.parametrize("rate_Hz", [12.5, 250.0])
+def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, rate_Hz):
+    """At the top of a fast sine the current brakes the motor; between slow samples the motor goes its way."""
+    time_s = foreignkit.FINE_S * np.arange(round(8.0 / foreignkit.FINE_S))
+    sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 5.0 * time_s)
+    _read(tmp_path, foreignkit.sampled(foreignkit.truth(sine if rate_Hz > 100.0 else foreignkit.random()), rate_Hz))
+    assert capsys.readouterr().err == ""
+
+
 def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, capsys):
     columns = foreignkit.sampled(truth, 250.0)
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)

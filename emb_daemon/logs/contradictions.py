@@ -11,6 +11,8 @@ from emb_daemon.logs.resample import Series, Signals
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
 #: Share of the largest current that its means at one end of the travel must reach, and multiple of those at the other.
 _HOLDS, _MORE = 0.2, 2.0
+#: Correlation of angle and acceleration up to which the current for both can be told apart.
+_TOLD_APART = 0.5
 #: Share of the largest force that it must change by from one end of the travel to the other.
 _FOLLOWS = 0.2
 #: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
@@ -32,7 +34,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
-    if angle is None or not np.ptp(angle.values):
+    if angle is None or angle.is_sparse or not np.ptp(angle.values):
         return lines
     if jump := _starts_anew(angle.values):
         return [
@@ -62,7 +64,22 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
     return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
 
 
+def _without_inertia(angle: Series, current: Series) -> Series | None:
+    """The current that does not accelerate the motor; None where load and acceleration cannot be told apart, as in a sine."""
+    acceleration = np.gradient(angle.derivative().values, 1e-9 * angle.time_ns)
+    at = current.sampled(angle.time_ns)
+    known = np.isfinite(at) & np.isfinite(acceleration)
+    if np.sum(known) < _LEAST or not np.ptp(acceleration[known]):
+        return None
+    columns = np.stack([np.ones(np.sum(known)), angle.values[known], acceleration[known]], axis=1)
+    if abs(np.corrcoef(columns[:, 1], columns[:, 2])[0, 1]) > _TOLD_APART:
+        return None
+    return Series(angle.time_ns[known], at[known] - np.linalg.lstsq(columns, at[known])[0][2] * acceleration[known])
+
+
 def _turned_current(angle: Series, current: Series) -> list[str]:
+    if (current := _without_inertia(angle, current)) is None:
+        return []
     low, high = _by_travel(angle, current)
     enough = _HOLDS * np.quantile(np.abs(current.values), 0.99)
     if max(abs(low), abs(high)) < enough:

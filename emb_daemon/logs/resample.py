@@ -215,7 +215,9 @@ def fill_missing(name: str, signals: Signals) -> Signals:
 
 
 def _another_motion(angle: Series, speed: Series) -> str:
-    """How speed and angle contradict each other; empty if they do not."""
+    """How speed and angle contradict each other; empty if they do not, or if nobody knows the way between two samples."""
+    if angle.is_sparse:
+        return ""
     steps = np.diff(angle.time_ns)
     near = (steps > 0) & (steps <= _CARRIED_PERIODS * angle.period_ns)
     at = speed.sampled(angle.time_ns)
@@ -233,7 +235,7 @@ def _another_motion(angle: Series, speed: Series) -> str:
         if abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
-    share = 0.0 if angle.is_sparse else float(np.mean(apart[near]))
+    share = float(np.mean(apart[near]))
     if share <= _MOST_APART:
         return ""
     return (
