@@ -142,19 +142,46 @@ _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
         ("\ufeff" + _HEADER.replace(",", "\t") + "\r\n" + _table(100).replace(",", "\t").replace("\n", "\r\n"), ""),
         (_HEADER + "\n" + _table(100) + "0.400,10.0,25", "1 rows with another number of cells than 6 left out"),
+        (f"{_HEADER}\n{_table(100)}{_HEADER}\n", "1 cells are no numbers, left out, the first of them 'angle_rad'"),
+        (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,#N/A") + "0.4,10,25,1.5,22,Over\n", "out, the first of"),
+        ((_HEADER + "\n" + _table(100)).replace("\n", "\r"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", "|"), ""),
+        ("sep=;\n" + (_HEADER + "\n" + _table(100, "{t:g},{a:g},25,1.5,22,0")).replace(",", ";").replace(".", ","), ""),
     ],
-    ids=["comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off"],
+    ids=[
+        "comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off", "two headers", "words",
+        "old Mac", "bars", "late decimal commas",
+    ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     (tmp_path / "a.csv").write_text(content, encoding="utf-8", newline="")
     samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+    assert np.allclose(samples["angle"][:100], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
     told = capsys.readouterr().err
     assert said in told and ("left out" in told) == bool(said)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16"])
+@pytest.mark.parametrize(
+    ("stamp", "unit"),
+    [
+        ("08:15:{s:06.3f}", "s"),
+        ("15:{s:06.3f}", "s"),
+        ("22.11.2026 08:15:{s:06.3f}", "s"),
+        ("2026-11-22T08:15:{s:06.3f}Z", "s"),
+        ("{ns:d}", "ns"),
+    ],
+)
+def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
+    rows = (stamp.format(s=10.0 + 0.004 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n) for n in range(100))
+    table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
+    (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le"])
 def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time_s", "Uhrzeit").replace("plate_C", '"Temperatur [°C]"'))
     head = _HEADER.replace("time_s", "Uhrzeit").replace("plate_C", "Temperatur [°C]")

@@ -99,10 +99,10 @@ def _turned_current(angle: Series, current: Series) -> list[str]:
 def _turned_force(angle: Series, force: Series) -> list[str]:
     low, high = _by_travel(angle, force)
     largest = float(np.quantile(np.abs(force.values), 0.99))
-    if largest < _LEAST_CLAMP_N:
-        return [f"ClampForceRef reaches {largest:.3g} N, which clamps nothing; is its unit right?"]
     if abs(high - low) < _FOLLOWS * largest:
         return []
+    if (reached := np.max(np.abs(force.values))) < _LEAST_CLAMP_N:
+        return [f"ClampForceRef reaches {reached:.3g} N, which clamps nothing; is its unit right?"]
     if high < low:
         what = "ClampForceRef" if abs(high) > abs(low) else "MotorAngle and MotorSpeed"
         return [f"ClampForceRef falls from {low:.4g} N to {high:.4g} N while MotorAngle rises: `scale: -1` of {what}?"]

@@ -73,12 +73,12 @@ class Time(Struct, kw_only=True):
 
     #: Name of the column.
     signal: str
-    #: s, ms or us.
+    #: s, ms, us or ns.
     unit: str = "s"
 
     def __post_init__(self):
         if UNITS.get(self.unit, ("",))[0] != "s":
-            raise ValueError(f"unit: expected s, ms or us, found {self.unit!r}")
+            raise ValueError(f"unit: expected s, ms, us or ns, found {self.unit!r}")
 
 
 class Bus(Struct, kw_only=True):
