@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.errors import InputError
 
@@ -45,8 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
     options = bus_options(arguments)
     if arguments.mapping:
         from emb_daemon.logs.live import ReferenceBus, open_buses
+        from emb_daemon.logs.mapping import Mapping
 
-        mapping = open_mapping(arguments.mapping)
+        mapping = Mapping(arguments.mapping)
         bus = ReferenceBus(open_buses(options, mapping), mapping, Listener().ids)
     else:
         bus = open_bus(**options, ids=Listener().ids)

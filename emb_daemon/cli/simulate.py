@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
@@ -53,9 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
     if arguments.mapping:
+        from emb_daemon.logs.mapping import Mapping
         from emb_daemon.logs.simulated import open_simulated
 
-        bus = open_simulated(bus_options(arguments), open_mapping(arguments.mapping), ids)
+        bus = open_simulated(bus_options(arguments), Mapping(arguments.mapping), ids)
     else:
         bus = open_bus(**bus_options(arguments), ids=ids)
     if arguments.keys:

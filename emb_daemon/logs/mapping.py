@@ -234,7 +234,8 @@ class Mapping:
         for corner in corners:
             for message, text in _LOST.items():
                 if (name := message.format(corner)) not in self.messages:
-                    self.notes.append(f"{self.path}: {name} is not mapped: {text}")
+                    blind = name == "VEH_Status" and f"EMB_{corner}_Current" not in self.messages
+                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else text}")
 
     def require_frames(self) -> None:
         """Raises InputError of a mapping of tables, which has no frames."""
@@ -370,11 +371,13 @@ def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bo
     return all(len(fewest - other) <= _LOST_COPIES * len(fewest) for other in by_channel)
 
 
+_BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"
 #: What a corner loses with a message that is not mapped.
 _LOST = {
     "EMB_{}_Current": "the force rests on the motor angle alone",
     "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
     "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
-    "VEH_Status": "that the brake begins released has to be shown by motor and current; of a bench say so by `value: 0` of "
-    "ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp",
+    "VEH_Status": "that the brake was released has to be shown by motor and current; " + _BENCH,
 }
+#: The same where there is no current either.
+_BLIND = "without a current nothing shows either where the brake is released, and the force stays unknown; " + _BENCH
