@@ -35,7 +35,7 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         columns: of values, shape (n,) each, that tell a repetition from a sample.
 
     Raises:
-        InputError: time goes back by more than a second.
+        InputError: time goes back by more than a second, or does not pass.
     """
     if len(back := np.flatnonzero(np.diff(time_ns) < -_BACK_NS)):
         by = 1e-9 * float(time_ns[back[0]] - time_ns[back[0] + 1])
@@ -45,6 +45,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     steps = np.diff(times)
     if len(steps) < 2:
         return times, rows
+    if times[-1] == times[0]:
+        raise InputError(f"{source}: {len(times)} values, all of them of one time")
     going_on = steps <= _PAUSE * np.quantile(steps, _ORDINARY)
     mean = float(np.mean(steps[going_on]))
     near = steps <= _ONE * mean
@@ -62,7 +64,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         print(f"{source}: stamps come in bunches, one every {1e-6 * between:.3g} ms: spread evenly", file=sys.stderr)
     else:
         kept = np.concatenate([[True], ~(near & same) & (steps > 0)])
-        print(f"{source}: {np.sum(~kept)} of {len(kept)} values were recorded twice: left out", file=sys.stderr)
+        if not kept.all():
+            print(f"{source}: {np.sum(~kept)} of {len(kept)} values were recorded twice: left out", file=sys.stderr)
     return times[kept], rows[kept]
 
 
