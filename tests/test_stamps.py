@@ -178,6 +178,15 @@ def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, 
     assert capsys.readouterr().err == ""
 
 
+def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):
+    """The last count of its encoder goes to and fro."""
+    rng, count = np.random.default_rng(1), 800
+    noise = {"speed_rad_per_s": 0.3, "current_A": 0.2, "plate_C": 0.0, "force_N": 20.0}
+    columns = {"time_s": 0.004 * np.arange(count), "angle_rad": 5.0 + 0.0015 * rng.integers(0, 2, count)}
+    _read(tmp_path, columns | {name: rng.normal(0.0, sigma, count) for name, sigma in noise.items()})
+    assert capsys.readouterr().err == ""
+
+
 def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, capsys):
     columns = foreignkit.sampled(truth, 250.0)
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)

@@ -11,6 +11,8 @@ from emb_daemon.logs.resample import Series, Signals
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
 #: Share of the largest current that its means at one end of the travel must reach, and multiple of those at the other.
 _HOLDS, _MORE = 0.2, 2.0
+#: Travel below which a motor stands, and whatever follows its angle is noise, rad.
+_TRAVEL_RAD = 1.0
 #: Correlation of angle and acceleration up to which the current for both can be told apart.
 _TOLD_APART = 0.5
 #: Share of the largest force that it must change by from one end of the travel to the other.
@@ -34,7 +36,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
-    if angle is None or angle.is_sparse or not np.ptp(angle.values):
+    if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         return lines
     if jump := _starts_anew(angle.values):
         return [
