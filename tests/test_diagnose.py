@@ -41,6 +41,7 @@ from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import EpisodeErrors, rmse
+from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import random_angle, simulate_log, training
 from emb_daemon.resources import resource
@@ -461,6 +462,16 @@ def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_pa
     assert result.after.rmse("stiffness") < 0.6 * result.before.rmse("stiffness")
     assert "torque" not in report(result)["paths"] and "no motor current" in verdict(result)
     assert page(result)
+
+
+def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(calibration):
+    """Friction that rises for seconds after each stroke, whichever way: a hidden state driven by a power of the speed."""
+    hidden = {"size": 1.5, "signal": PLANT_SIGNALS.index("motor_speed"), "exponent": 1.5, "other": -1.0, "lag_s": 2.5}
+    frames, _ = _logs(calibration, 33, {"drawn_gear_friction": hidden}, stops=3)
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
+    best = Search(model, "torque", grammar._signals(model)).prospects()[0]
+    assert best.means == ("gear_friction", "motor_speed") and best.form.memory == "response"
+    assert best.form.memory_scale == pytest.approx(2.5, rel=0.3)
 
 
 @pytest.fixture(scope="module")

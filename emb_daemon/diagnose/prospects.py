@@ -227,7 +227,7 @@ def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
 def _record_of(form: Form) -> np.void:
     record = np.zeros(1, PARAMETERS)[0]
     fill_terms(record, (form.term(),))
-    record["term"][0]["coefficient"] = 1.0
+    record["term"][0]["coefficient"], record["term"][0]["limit"] = 1.0, np.inf
     return record["term"][0]
 
 
