@@ -178,7 +178,7 @@ def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
     own = [coordinate_of(index, channel, form, "coefficient", "")]
     if form.shape == "harmonic":
         own.append(coordinate_of(index, channel, form, "sine", ""))
-    return bench.regressors(model.values, [Probe(c) for c in own], model.residual)
+    return bench.regressors(model.values, [Probe(c) for c in own], model.residual, model.heat)
 
 
 def with_term(bench: Bench, term: Term) -> Bench:

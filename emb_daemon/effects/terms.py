@@ -208,7 +208,9 @@ def look(e, s, p, m):
 @njit
 def _follow_all(e, t, signals, dt, maximum_force, values):
     for row in range(len(signals)):
-        t.signal[:] = signals[row]
+        # Its own, and those that gates look at.
+        for which in (e.signal, _FORCE, _SPEED, _WHEEL):
+            t.signal[which] = signals[row, which]
         values[row] = _value(e, t, 0, dt[row], maximum_force)
 
 
