@@ -69,7 +69,7 @@ SIZES_N = (75.0, 150.0, 300.0, 600.0)
 
 
 #: Residual that lasts over that of the same unit with nothing hidden: from here something is clearly left (half as much again,
-#: as `diagnose` has it), up to here clearly nothing; between them either answer is right.
+#: as `diagnose` has it), up to here nothing; between them either answer is right.
 _LEFT, _NOTHING = 1.5, 1.2
 
 
@@ -79,19 +79,22 @@ class Rest:
 
     Attributes:
         after: with the calibration that `diagnose` wrote.
-        alone: of the same unit and schedule with nothing hidden, the calibration fitted to that very log: what any can reach.
+        plain, fitted: of the same unit and schedule with nothing hidden, by the calibration as it was, and fitted to that very
+            log: what it achieves on such units, and what it could.
         said: whether the report calls something unexplained there.
     """
 
     after: float
-    alone: float
+    plain: float
+    fitted: float
     said: bool
 
     @property
-    def right(self) -> bool | None:
-        """Whether that is as it is; None where nobody could say."""
-        ratio = self.after / self.alone
-        return None if _NOTHING < ratio < _LEFT else self.said is (ratio >= _LEFT)
+    def anything(self) -> bool | None:
+        """Whether something is left; None where nobody could say."""
+        if self.after <= _NOTHING * self.fitted:
+            return False
+        return True if self.after >= _LEFT * max(self.plain, self.fitted) else None
 
 
 @dataclass(frozen=True)
@@ -288,13 +291,12 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
 
 def what_is_left(result: Diagnosis, alone: Log) -> dict[str, Rest]:
     """By path, beside the log of the same unit with nothing hidden."""
-    nothing = Model.of(Bench([alone], result.original)).refined(FORCE_CHANNELS)
+    plain = Model.of(Bench([alone], result.original))
+    fitted = plain.refined(FORCE_CHANNELS)
     judges = result.judges.under(result.calibration)
-    residual = judges.residuals({})
+    all_three = (judges, judges.residuals({})), (plain.bench, plain.residual), (fitted.bench, fitted.residual)
     return {
-        path: Rest(
-            _lasting(judges, residual, path), _lasting(nothing.bench, nothing.residual, path), result.left[path].present
-        )
+        path: Rest(*(_lasting(bench, residual, path) for bench, residual in all_three), result.left[path].present)
         for path in ("stiffness", "torque")
     }
 
@@ -389,9 +391,8 @@ def _share(group: list[Trial]) -> str:
 
 def _said(group: list[Trial], anything: bool) -> str:
     """Paths on which the report says rightly that something is left (``anything``), or that nothing is, of all where it is."""
-    rests = [rest for trial in group for rest in trial.left.values() if rest.right is not None]
-    right = [rest.right for rest in rests if (rest.after / rest.alone >= _LEFT) is anything]
-    return f"{sum(right)}/{len(right)}" if right else "–"
+    said = [rest.said is anything for trial in group for rest in trial.left.values() if rest.anything is anything]
+    return f"{sum(said)}/{len(said)}" if said else "–"
 
 
 def _percent(errors: list[float]) -> str:

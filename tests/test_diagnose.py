@@ -482,7 +482,9 @@ def coupled(calibration):
 
 
 def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration, coupled, monkeypatch):
-    monkeypatch.setattr(search, "make_terms", lambda selection, progress: selection)
+    [term] = coupled[0].accepted
+    bare = coupled[0].without(term, "to see what is said where no term is made")
+    monkeypatch.setattr(diagnosis, "select", lambda bench, progress: bare)
     result = diagnose(coupled[1:2], calibration)
     assert all(finding.in_calibration for finding in result.accepted)
     assert result.unexplained.strongest.signal in ("brake_torque", "disc_speed")
@@ -696,7 +698,7 @@ def _path_effects(result):
 
 def _undeclared(rig, case):
     """Fit and validation log of the simulated rig: training, random angle and the first stops."""
-    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), 150.0) for name in ("fit", "val")]
+    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), 110.0) for name in ("fit", "val")]
 
 
 def _first(log, seconds):
