@@ -24,6 +24,7 @@ import numpy as np
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
+from emb_daemon.diagnose import search
 from emb_daemon.diagnose.diagnosis import Diagnosis, diagnose
 from emb_daemon.diagnose.evidence import Averaging
 from emb_daemon.diagnose.model import Model
@@ -418,9 +419,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--pairs", type=int, default=40, help="plants with two effects")
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
     parser.add_argument("--drawn", type=int, default=16, help="plants with an effect that a seed draws from a wider family")
+    parser.add_argument("--bare", action="store_true", help="make no terms: does the report say that something is left?")
     parser.add_argument("--output", type=Path, help="trials, one JSON object per line; those already there are not run again")
     parser.add_argument("--calibration", type=Path, help="default: the shipped one")
     arguments = parser.parse_args(argv)
+    if arguments.bare:
+        search.make_terms = lambda selection, progress: selection
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     planned = plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign, arguments.drawn)
     done = {_key(t.seed, t.kind, () if t.kind == "drawn" else t.hidden, t.size): t for t in recorded(arguments.output)}
