@@ -63,17 +63,38 @@ class _Loop:
 # --- What the loop tells ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 1024)), max_size=20))
+class _Meanwhile:
+    """A ring while whose rows are read, the loop goes on."""
+
+    def __init__(self, ring, go_on):
+        self.ring, self.go_on = ring, go_on
+
+    def __getitem__(self, places):
+        half = len(places) // 2
+        first = self.ring[places[:half]]
+        self.go_on()
+        return np.concatenate([first, self.ring[places[half:]]])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(["tell", "take", "overtake"]), st.integers(0, 3 * 1024)), max_size=20))
 def test_every_row_is_taken_once_and_in_order_or_counted_as_lost(tmp_path_factory, steps):
     path = tmp_path_factory.mktemp("share") / "estimates"
     loop, reader = _Loop(path, parameters=np.zeros(4, shared.PARAMETERS)), EstimatesReader(path)
     reader.look()
+    rings = reader._rings
     taken, missing = [], 0
-    for take, count in [*steps, (True, 0), (True, 0)]:
-        if not take:
-            loop.tell(count)
+
+    def tell(count):
+        for start in range(0, count, 1024):
+            loop.tell(min(1024, count - start))
+
+    for step, count in [*steps, ("take", 0), ("take", 0)]:
+        if step == "tell":
+            tell(count)
             continue
+        overtaking = iter([count] if step == "overtake" else [])
+        reader._rings = [_Meanwhile(ring, lambda counts=overtaking: tell(next(counts, 0))) for ring in rings]
         samples, estimates, lost = reader.take()
         assert np.array_equal(estimates["force"] % 1000, -2 * samples["angle"] % 1000), "a row of two moments"
         missing += lost
@@ -265,7 +286,7 @@ class _Served:
     def __init__(self, path: Path, transport):
         setup = Setup(_CONFIGURATION)
         self.loop, self.transport = _Loop(path), transport
-        self._file = make_a2l({"FL": setup.calibrations["FL"]}).encode()
+        self._file = make_a2l({"FL": setup.calibrations["FL"]})
         self.measurement = Measurement(path, transport, VERSION.encode(), NAME.encode(), self._file)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -18,6 +18,6 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.workshop.a2l import VERSION, make_a2l
 
     check_output(arguments.output, [arguments.config], (".a2l",))
-    write_atomically(arguments.output, make_a2l(Setup(arguments.config).calibrations).encode("ascii", "replace"))
+    write_atomically(arguments.output, make_a2l(Setup(arguments.config).calibrations))
     print(f"{arguments.output}: {VERSION}")
     return 0

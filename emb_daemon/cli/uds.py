@@ -1,11 +1,11 @@
 """emb-daemon uds."""
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids
+from emb_daemon.cli.serving import serve
 
 EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
@@ -32,22 +32,14 @@ def run(arguments: argparse.Namespace) -> int:
     check_ids(arguments, listened)
     state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
-    stopped = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.append(True))
     try:
         diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id)
         if diagnostics.memory.warning:
             print(diagnostics.memory.warning, file=sys.stderr)
-        print(
-            f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}", flush=True
+        serve(
+            diagnostics,
+            f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}",
         )
-        told = ""
-        while not stopped:
-            diagnostics.step()
-            if diagnostics.trouble != told:
-                told = diagnostics.trouble
-                print(told, file=sys.stderr, flush=True)
         diagnostics.memory.save()
     finally:
         bus.close()

@@ -1,11 +1,10 @@
 """emb-daemon xcp."""
 
 import argparse
-import signal
-import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments
+from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
     "emb-daemon xcp --config /etc/emb_daemon/emb.yaml --share /run/emb_daemon/estimates --udp 127.0.0.1:5555\n"
@@ -29,20 +28,11 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.workshop.measure import Measurement
 
     setup = Setup(arguments.config)
-    file = make_a2l(setup.calibrations).encode("ascii", "replace")
-    stopped: list[bool] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.append(True))
+    file = make_a2l(setup.calibrations)
     transport, where = _udp(arguments.udp) if arguments.udp else _can(arguments, setup)
     try:
         measurement = Measurement(arguments.share, transport, VERSION.encode(), NAME.encode(), file)
-        print(f"XCP on {where}: {VERSION}", flush=True)
-        told = ""
-        while not stopped:
-            measurement.step()
-            if measurement.trouble != told:
-                told = measurement.trouble
-                print(told, file=sys.stderr, flush=True)
+        serve(measurement, f"XCP on {where}: {VERSION}")
     finally:
         transport.close()
     return 0

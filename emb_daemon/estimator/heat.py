@@ -82,7 +82,7 @@ def _tell_temperatures(s, t):
 
 @njit
 def _watch_plates(s, t, m, dt):
-    """Whether the thermocouples can be true; widens the pads' temperature by what a false one may hide, K.
+    """Whether the thermocouples can be true; widens the uncertainty of the pads' temperature by what a false one may hide, K.
 
     A reading that repeats to the bit is stuck once the pad has been hotter or colder than when it last moved for as long as
     heat takes through the pad, L^2/(4 a), by `_SHOWN_K` in the mean over that time. A reading that jumps is one of two that

@@ -99,8 +99,8 @@ def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> 
     return _block("MEASUREMENT", head, f"ECU_ADDRESS 0x{address_of(corner, index):X}")
 
 
-def make_a2l(calibrations: Mapping[str, Calibration]) -> str:
-    """The file for a daemon that estimates the corners of ``calibrations``: ASCII."""
+def make_a2l(calibrations: Mapping[str, Calibration]) -> bytes:
+    """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC wants it."""
     methods, blocks = _Methods(), []
     for name, calibration in calibrations.items():
         corner, numbers = CORNERS.index(name), places(calibration)
@@ -116,10 +116,11 @@ def make_a2l(calibrations: Mapping[str, Calibration]) -> str:
             _group(f"{name}.calibration", calibration.actuator, "REF_CHARACTERISTIC",
                    [f"{name}.{place.key}" for place in numbers]),
         ]  # fmt: skip
-    return _FRAME.format(
-        name=NAME, about=f"{', '.join(calibrations)}", version=__version__, address=VERSION_ADDRESS, epk=VERSION,
+    file = _FRAME.format(
+        name=NAME, about=", ".join(calibrations), version=__version__, address=VERSION_ADDRESS, epk=VERSION,
         content="\n".join([*methods.blocks.values(), *blocks]),
     )  # fmt: skip
+    return file.encode("ascii", "replace")
 
 
 def _group(name: str, about: str, keyword: str, members: list[str]) -> str:
