@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from emb_daemon.calibration import terms as calibration_terms
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
@@ -384,8 +385,9 @@ def test_what_has_a_name_is_called_by_it(viscous):
     assert named.candidates[term].reason == "an effect of the catalogue says the same"
 
 
-def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
-    """As it happens where something else was still missing when the order was chosen."""
+def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkeypatch):
+    """As it happens where something else was still missing when the order was chosen; beyond what its port may bear it is
+    refused, and the search goes on."""
     bench = Bench(
         [log_of(_logs(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})[0])], calibration
     )
@@ -395,7 +397,8 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
     side = harmonic("gear_gain", 2.6, bench.middle, ripples.covered)
     [lobe] = ripples._run([side])
     effect = made_effect(side, "term:gear_gain:motor_angle")
-    wrong = grammar._enter(selection, Candidate(effect, "torque", evidence=lobe.evidence), side)
+    candidate = Candidate(effect, "torque", evidence=lobe.evidence)
+    wrong = grammar._enter(selection, candidate, side)
     right = grammar._with_orders_again(wrong, "torque")
     orders = []
     for found in (wrong, right):
@@ -404,6 +407,9 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
         orders.append(1.0 / term.scale)
     assert abs(orders[0] - 3.0) > 0.1
     assert orders[1] == pytest.approx(3.0, rel=0.01)
+    monkeypatch.setattr(calibration_terms, "_FACTOR", 1e-3)
+    refused = grammar._enter(selection, candidate, side).candidates[effect.name]
+    assert not refused.accepted and "port may bear" in refused.reason
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):

@@ -62,8 +62,7 @@ class Term(Struct, kw_only=True):
             raise InvalidValue("high: expected more than low")
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
-        # What a response reaches, the time for which the signal is at its edge says: the kernel holds it to the limit.
-        if self.largest > self.limit and self.memory != "response":
+        if not self.is_bounded:
             raise InvalidValue(
                 f"coefficient: the term reaches {self.largest:.3g} {self.unit}, expected {self.limit:g} at most"
             )
@@ -77,6 +76,12 @@ class Term(Struct, kw_only=True):
     def limit(self) -> float:
         """Most that it may add, in the port's unit."""
         return _MOST_AT.get(self.port, _FACTOR)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether it stays within its limit. What a response reaches, the time for which its signal stays says: the kernel
+        holds it there."""
+        return self.memory == "response" or self.largest <= self.limit
 
     @property
     def largest(self) -> float:
@@ -98,8 +103,9 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["port"], row["signal"] = PORTS.index(term.port), list(SIGNALS).index(term.signal)
         row["memory"], row["shape"] = MEMORIES.index(term.memory), SHAPES.index(term.shape)
         row["gate"] = GATES.index(term.gate)
-        for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high", "limit"):
+        for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
+        row["limit"] = term.limit if term.memory == "response" else np.inf
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

@@ -258,6 +258,8 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     worse = model.noise(channel) >= before.noise(channel)
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
         return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+    if not next(term for term in bench.calibrated(model.values).terms if term.name == name).is_bounded:
+        return selection.noted([replace(candidate, reason="fitted with everything else it is more than its port may bear")])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
     return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])
