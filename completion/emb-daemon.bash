@@ -21,8 +21,8 @@ _emb_daemon() {
         diagnose) options="--calibration --validate --output --mapping --corner" ;;
         fleet) options="" ;;
         effect) options="" ;;
-        simulate) options="--corners --seconds --scenario --calibration --reference --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        monitor) options="--once --json --web --record --udp -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        simulate) options="--corners --seconds --scenario --calibration --reference --mapping --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        monitor) options="--once --json --web --record --udp --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;

@@ -175,7 +175,7 @@ class Thesis:
             for entry in result.campaign.file.gear_wear
             if (log := result.campaign.load(entry.training, "gear_wear", "training")) is not None
         ]
-        self.torque_step = TorqueStep(values=self.torque.physical(), fit=self.torque, log=result.torque.log, gears=gears)
+        self.torque_step = TorqueStep(values=self.torque.physical(), fit=self.torque, logs=result.torque.logs, gears=gears)
 
     def _damping(self, without: list[float]) -> float:
         known = [form.damping_s for form in self.forms if form.damping_s and form.thickness_mm not in without]

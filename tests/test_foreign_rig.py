@@ -142,19 +142,46 @@ _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
         ("\ufeff" + _HEADER.replace(",", "\t") + "\r\n" + _table(100).replace(",", "\t").replace("\n", "\r\n"), ""),
         (_HEADER + "\n" + _table(100) + "0.400,10.0,25", "1 rows with another number of cells than 6 left out"),
+        (f"{_HEADER}\n{_table(100)}{_HEADER}\n", "1 cells are no numbers, left out, the first of them 'angle_rad'"),
+        (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,#N/A") + "0.4,10,25,1.5,22,Over\n", "out, the first of"),
+        ((_HEADER + "\n" + _table(100)).replace("\n", "\r"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", "|"), ""),
+        ("sep=;\n" + (_HEADER + "\n" + _table(100, "{t:g},{a:g},25,1.5,22,0")).replace(",", ";").replace(".", ","), ""),
     ],
-    ids=["comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off"],
+    ids=[
+        "comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off", "two headers", "words",
+        "old Mac", "bars", "late decimal commas",
+    ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     (tmp_path / "a.csv").write_text(content, encoding="utf-8", newline="")
     samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+    assert np.allclose(samples["angle"][:100], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
     told = capsys.readouterr().err
     assert said in told and ("left out" in told) == bool(said)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16"])
+@pytest.mark.parametrize(
+    ("stamp", "unit"),
+    [
+        ("08:15:{s:06.3f}", "s"),
+        ("15:{s:06.3f}", "s"),
+        ("22.11.2026 08:15:{s:06.3f}", "s"),
+        ("2026-11-22T08:15:{s:06.3f}Z", "s"),
+        ("{ns:d}", "ns"),
+    ],
+)
+def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
+    rows = (stamp.format(s=10.0 + 0.004 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n) for n in range(100))
+    table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
+    (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le"])
 def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time_s", "Uhrzeit").replace("plate_C", '"Temperatur [°C]"'))
     head = _HEADER.replace("time_s", "Uhrzeit").replace("plate_C", "Temperatur [°C]")
@@ -227,6 +254,34 @@ def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, l
     assert figures["force_N"]["fused"]["rmse"] < most_N and figures["force_N"]["inside_two_sigma"] > 0.93
 
 
+@pytest.mark.parametrize("stands_s", [1.2, 0.0])
+def test_a_log_that_begins_clamped_without_status_is_known_after_a_release(tmp_path, capsys, stands_s):
+    """And not from where a motor turns round half open, from which the clearance does not count."""
+    clearance = foreignkit.parameters()["clearance"]
+    low = 0.0 if stands_s else 0.5 * clearance
+    ways = [(14.0, 0.5), (clearance + 8.0, 0.5), (low, 0.5), (low, stands_s), (clearance + 12.0, 2.0), (clearance + 12.0, 1.0)]
+    angle, at = [], clearance + 8.0
+    for target, seconds in ways:
+        share = (1.0 - np.cos(np.linspace(0.0, np.pi, round(seconds / foreignkit.FINE_S)))) / 2.0
+        angle.append(at + (target - at) * share)
+        at = target
+    foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "VEH_Status"))
+    columns = foreignkit.sampled(foreignkit.truth(np.concatenate(angle)), 250.0)
+    columns = {name: values[50:] for name, values in columns.items()}
+    out = tmp_path / "out.parquet"
+    _replay(tmp_path, foreignkit.write_table(tmp_path / "a.parquet", columns), capsys, "--output", out)
+    table = pyarrow.parquet.read_table(out).to_pandas()
+    error, sigma = table["clamp_force_N"] - table["clamp_force_ref_N"], table["clamp_force_sigma_N"]
+    assert np.mean(np.abs(error) <= 2.0 * sigma) > 0.93
+    assert (sigma[:200] > 1000.0).all() and (sigma.iloc[-200:].max() < 200.0) == bool(stands_s)
+
+
+def test_neither_status_nor_current_is_said(tmp_path, capsys):
+    mapping = foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "VEH_Status", "CurrentQ"))
+    assert main(["check", "--mapping", str(mapping)]) == 0
+    assert "the force stays unknown; of a bench say so by `value: 0`" in capsys.readouterr().err
+
+
 def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
     foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "RIG_"))
     table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
@@ -297,6 +352,16 @@ def test_a_log_of_other_ids_is_told_by_them(bus, capsys):
     assert main(["replay", str(bus)]) == 2
     said = capsys.readouterr().err
     assert "no frame of id 0x100, the resolver of corner FL; found 0x18feef01, 0x18feef02; " in said and "--mapping" in said
+
+
+def test_what_a_log_does_not_hold_is_not_taken_for_used(bus, capsys):
+    options = ["--mapping", str(bus.parent / "mapping.yaml"), "--calibration", str(bus.parent / "calibration.yaml")]
+    for option, said in (
+        (["--corner", "RR"], "nothing of corner RR; it holds FL"),
+        (["--measured-torque"], "no brake torque"),
+    ):
+        assert main(["replay", str(bus), *options, *option]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_diagnosis_reads_a_bus_of_other_people(bus, monkeypatch, capsys):

@@ -11,7 +11,12 @@ import pytest
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.cli.main import main
+from emb_daemon.identify.example import FILES
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.write import write_frames
+from emb_daemon.plant import scenarios as sc
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.resources import resource
 
 _PAGE = Path(__file__).parent.parent / "docs" / "own_actuator.md"
 
@@ -100,3 +105,24 @@ def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
     assert "expected an empty folder" in capsys.readouterr().err
     assert main(["identify"]) == 2
     assert "expected CAMPAIGN.yaml and --output" in capsys.readouterr().err
+
+
+def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys):
+    """In slow clamps alone, a gear with play passes for friction that turns over within a radian: 1.7 kN in a stop."""
+    effects = {"stribeck_friction": {"rise": 0.25, "speed_rad_per_s": 14.0}, "backlash": {"play_rad": 0.12}}
+    shipped = load_calibration(resource("config/calibration.yaml"))
+    plant = plant_from_calibration(shipped, effects=effects)
+    drive = sum((sc.rig_stop(force, 40.0, 3.0, 6.0) for force in (4e3, 9e3, 16e3, 6e3)), sc.rest(2.0))
+    for seed, (name, schedule) in enumerate({"curve": sc.curve(plant), "fit": drive, "judge": drive}.items()):
+        write_frames(tmp_path / f"{name}.log", sc.simulate_log(plant, schedule, seed=seed)[0])
+    (tmp_path / "datasheet.yaml").write_text((FILES / "datasheet.yaml").read_text())
+    logs = "curves: [{log: curve.log}]\nintegrated: [{fit: fit.log, judge: judge.log}]\n"
+    (tmp_path / "campaign.yaml").write_text("rig: x\ndatasheet: datasheet.yaml\n" + logs)
+    output = tmp_path / "found.yaml"
+    assert main(["identify", str(tmp_path / "campaign.yaml"), "--output", str(output)]) == 3
+    assert "random: no usable log" in capsys.readouterr().err
+    found = load_calibration(output)
+    assert found.friction.presliding_angle_rad == pytest.approx(shipped.friction.presliding_angle_rad, rel=0.3)
+    log = emb_daemon.load_log(tmp_path / "judge.log")
+    error = emb_daemon.run(log, found)["force"] - log.force_N
+    assert np.sqrt(np.nanmean(error**2)) < 400.0

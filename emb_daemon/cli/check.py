@@ -20,14 +20,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not arguments.config and not arguments.mapping:
         raise InputError("check: expected --config FILE, --mapping FILE or both")
-    faults, setup = [], None
+    faults, checked = [], {}
     for path, check in ((arguments.mapping, open_mapping), (arguments.config, Setup)):
         try:
-            checked = check(path) if path else None
+            checked[check] = check(path) if path else None
         except InputError as error:
             faults += error.faults
-        else:
-            setup = checked
+    mapping, setup = checked.get(open_mapping), checked.get(Setup)
+    if mapping and setup:
+        faults += mapping.taken(setup.layout)
     if faults:
         raise InputErrors(faults)
     if arguments.mapping:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.errors import InputError
 
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
     parser.add_argument("--record", type=Path, metavar="FILE", help="everything heard, as an MCAP file")
     parser.add_argument("--udp", metavar="HOST:PORT", help="JSON datagrams, 50 a second, for PlotJuggler")
+    add_mapping_argument(parser)
     add_bus_arguments(parser)
 
 
@@ -41,7 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.once and not handed_out and not sys.stdout.isatty():
         raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
     options = bus_options(arguments)
-    bus = open_bus(**options, ids=Listener().ids)
+    if arguments.mapping:
+        from emb_daemon.logs.live import ReferenceBus, open_buses
+        from emb_daemon.logs.mapping import Mapping
+
+        mapping = Mapping(arguments.mapping)
+        bus = ReferenceBus(open_buses(options, mapping), mapping, Listener().ids)
+    else:
+        bus = open_bus(**options, ids=Listener().ids)
     title = " ".join(str(options[name]) for name in ("interface", "channel") if options[name])
     try:
         if handed_out:

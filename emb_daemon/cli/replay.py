@@ -66,6 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return 0
     results = [result for log in arguments.logs for result in replay.run_corners(log)]
+    for result in results if arguments.measured_torque else ():
+        if not np.isfinite(result.reference.brake_torque_Nm).any():
+            raise InputError(f"{result.path}: no brake torque (BrakeTorqueRef) in it; expected without --measured-torque")
     if arguments.output:
         _write_table(arguments.output, results)
     if arguments.report:

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.mapping:
         from emb_daemon.logs.live import open_mapped
 
-        bus = open_mapped(options, open_mapping(arguments.mapping))
+        bus = open_mapped(options, open_mapping(arguments.mapping), setup.layout)
     else:
         bus = open_bus(**options, ids=ids)
     keyless = ()

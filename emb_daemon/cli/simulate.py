@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="the kind of brake; without it, the shipped one")
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
+    add_mapping_argument(parser)
     parser.add_argument("--keys", type=Path, metavar="FILE", help="authenticate what is sent, believe nothing else (SecOC)")
     parser.add_argument("--state", type=Path, metavar="DIR", help="with --keys: folder that keeps the trip counter")
     parser.add_argument("--seed", type=int, default=0, help="of tolerances and noise (0)")
@@ -39,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     if (arguments.keys is None) != (arguments.state is None):
         raise InputError("--keys and --state: expected both or neither")
+    if arguments.keys and arguments.mapping:
+        raise InputError("--keys: of our own messages; expected without --mapping")
     schedule = scenario(arguments.scenario)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
@@ -48,7 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
     ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
-    bus = open_bus(**bus_options(arguments), ids=ids)
+    if arguments.mapping:
+        from emb_daemon.logs.mapping import Mapping
+        from emb_daemon.logs.simulated import open_simulated
+
+        bus = open_simulated(bus_options(arguments), Mapping(arguments.mapping), ids)
+    else:
+        bus = open_bus(**bus_options(arguments), ids=ids)
     if arguments.keys:
         from emb_daemon.runtime.secured import Authentication, FreshnessFile, SecuredBus
 

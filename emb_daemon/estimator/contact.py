@@ -153,13 +153,16 @@ def seek_release(s, p, m):
 
 @njit
 def _passed_clearance(s, p, m):
-    """Whether the motor has closed from where it started by a good part of the clearance and no force opposed it: then it
-    started released, whatever was asked of it."""
+    """Whether the motor has closed from where it started, or from where it has stood lower since, by a good part of the
+    clearance and no force opposed it: then it was released there, whatever was asked of it."""
     if s.friction_mean > _SLIDING and np.isfinite(s.balance):
         s.passed += 1.0
         s.opposing += (s.balance - s.opposing) / s.passed
     elif m.angle <= s.start_angle:
         s.passed = s.opposing = 0.0
+        if s.stood_s > _OFF_S:
+            # Where it only turned round, half open, nobody had released it.
+            s.start_angle = m.angle
     closed = s.clearance > 0.0 and m.angle - s.start_angle > _PASSED * s.clearance
     sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
     free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force

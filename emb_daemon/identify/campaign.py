@@ -19,6 +19,7 @@ from emb_daemon.wire.layout import load_database
 #: Turning points of the motor angle per second of motion that tell a slow clamp from random motion.
 SLOW, RANDOM = (0.0, 1.0), (1.0, 100.0)
 NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
+NEED_INTEGRATED = "training and braking heat at full frame rate"
 #: Correlation of force and angle from which a log is the wrong way round; a curve of either direction has 0.9 and more.
 _AGAINST = 0.5
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.

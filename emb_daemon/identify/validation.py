@@ -7,7 +7,7 @@ import numpy as np
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.identify.campaign import NEED_RANDOM, RANDOM, Campaign
+from emb_daemon.identify.campaign import NEED_INTEGRATED, NEED_RANDOM, RANDOM, Campaign
 from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.identify.text import stem
@@ -17,7 +17,6 @@ from emb_daemon.report.figures import BAND, MODEL, PALE, REFERENCE, Panel, Trace
 from emb_daemon.report.page import Page
 
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
-_NEED_INTEGRATED = "training and braking heat at full frame rate"
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessS
         log = campaign.load_motion(entry.log, "frequency_response", _NEED_SINE, reversals=bounds)
         add(entry, "frequency", f"sine, {entry.frequency_Hz:g} Hz", log)
     for pair in campaign.file.integrated:
-        log = campaign.load(pair.judge, "integrated.judge", _NEED_INTEGRATED)
+        log = campaign.load(pair.judge, "integrated.judge", NEED_INTEGRATED)
         if log is not None:
             found.append(validate(f"integrated, {stem(pair.judge)}", "integrated", log, ours))
     return found

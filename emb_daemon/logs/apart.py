@@ -19,27 +19,31 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 #: CPU time that a reader gets: to start, s, and for each megabyte, s. BLF takes python-can up to 5 s a megabyte.
 _START_S, _PER_MEGABYTE_S = 30.0, 60.0
+#: Readers that count from zero the channels that their tools count from one.
+_FROM_ZERO = ("BLFReader", "ASCReader")
 #: The child's words for a library that is not installed.
 _MISSING = 3
 
 
-def frames_of(content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """FRAME array and payloads, one after the other, of a log's content, by python-can's reader of that name. Raises whatever
-    that raises."""
+def frames_of(content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """FRAME array, payloads, one after the other, and channels, as texts, of a log's content, by python-can's reader of that
+    name. Raises whatever that raises."""
     import can
     from can.io.generic import TextIOMessageReader
 
     kind, file, octets, rows = getattr(can, reader_name), io.BytesIO(content), bytearray(), []
+    channels = []
     for message in kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file):
         octets += message.data
         flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
         flags |= FD * message.is_fd
         data = int.from_bytes(message.data[:8], "little")
+        channels.append(str(message.channel + 1 if reader_name in _FROM_ZERO else message.channel))
         rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
-    return np.array(rows, FRAME), np.frombuffer(octets, np.uint8)
+    return np.array(rows, FRAME), np.frombuffer(octets, np.uint8), np.array(channels, "U32")
 
 
-def frames_apart(path: Path, content: bytes, reader_name: str, most_bytes: int) -> tuple[np.ndarray, np.ndarray]:
+def frames_apart(path: Path, content: bytes, reader_name: str, most_bytes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`frames_of` in another process, which gets ``most_bytes`` of memory.
 
     Raises:
@@ -60,18 +64,20 @@ def frames_apart(path: Path, content: bytes, reader_name: str, most_bytes: int) 
     if done.returncode:
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {said}")
     arrays = np.load(io.BytesIO(done.stdout))
-    return arrays["frames"], arrays["octets"]
+    return arrays["frames"], arrays["octets"], arrays["channels"]
 
 
 def main() -> int:
     reader_name, seconds, most_bytes = sys.argv[1], *(int(word) for word in sys.argv[2:])
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
-    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for kind, most in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_DATA, most_bytes), (resource.RLIMIT_CORE, 0)):
+        # Somebody may have set a lower bound, which nobody may raise.
+        bound = resource.getrlimit(kind)[1]
+        most = most if bound == resource.RLIM_INFINITY else min(most, bound)
+        resource.setrlimit(kind, (most, bound))
     content, output = sys.stdin.buffer.read(), io.BytesIO()
     try:
-        frames, octets = frames_of(content, reader_name)
-        np.savez(output, frames=frames, octets=octets)
+        frames, octets, channels = frames_of(content, reader_name)
+        np.savez(output, frames=frames, octets=octets, channels=channels)
     except ImportError as error:
         print(error, file=sys.stderr)
         return _MISSING

@@ -5,11 +5,14 @@ averaged; slower ones stay as they are, since nothing can be put between samples
 """
 
 import math
+import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.mapping import Mapping, Source
 from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
 from emb_daemon.runtime.bus import PythonCanBus, open_python_can
@@ -20,6 +23,8 @@ from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
 _DUE = 0.9
+#: Between two looks at several buses, s: a fraction of our cycle.
+_POLL_S = 0.0005
 
 
 @dataclass
@@ -78,61 +83,119 @@ class _Message:
         self.sent_ns = time_ns
         return time_ns, int(protect(self.can_id, payload, self.counter % COUNTER_MODULO, 0)), self.can_id, 8, 0
 
+    def reference(self, time_ns: int) -> tuple:
+        """A FRAME row of a reference instrument's message, with what is mapped in it."""
+        payload = 0
+        for name, layout in self.layout.items():
+            value = self.signals.get(name, math.nan)
+            value = value.last if isinstance(value, _Value) else value
+            if layout["low"] <= value <= layout["high"]:
+                payload |= int(pack(value, layout))
+            else:
+                payload |= absent_raw(int(layout["length"])) % (1 << int(layout["length"])) << int(layout["start"])
+        return time_ns, payload, self.can_id, 8, 0
+
+
+class SeveralBuses:
+    """python-can buses by channel as one: frames of all, each with its channel; what is sent goes to its channel's, or to the
+    first."""
+
+    def __init__(self, buses: dict):
+        self._buses = buses
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def recv(self, timeout_s: float):
+        """The next frame of any, None if none comes in time."""
+        until = time.monotonic() + timeout_s
+        while True:
+            for channel, bus in self._buses.items():
+                if (message := bus.recv(0)) is not None:
+                    message.channel = channel
+                    return message
+            if (left := until - time.monotonic()) <= 0.0:
+                return None
+            time.sleep(min(_POLL_S, left))
+
+    def send(self, message) -> None:
+        self._buses.get(str(message.channel), next(iter(self._buses.values()))).send(message)
+
+    def shutdown(self) -> None:
+        for bus in self._buses.values():
+            bus.shutdown()
+
+
+class _Signals:
+    """The values of our messages of a mapping, as the rig's frames bring them."""
+
+    def __init__(self, mapping: Mapping, names: Iterable[str]):
+        mapping.require_frames()
+        self.messages = {name: _message(name, mapping) for name in names}
+        self._readers: dict[tuple[int, bool], list[tuple]] = {}
+        for our in self.messages.values():
+            for value in our.signals.values():
+                if isinstance(value, _Value):
+                    source = value.source
+                    message, _, signal = source.name.rpartition(".")
+                    theirs = mapping.databases[source.bus].get_message_by_name(message)
+                    readers = self._readers.setdefault((theirs.frame_id, theirs.is_extended_frame), [])
+                    readers.append((mapping.channels[source.bus], theirs, signal, value))
+
+    def take(self, message, time_ns: int) -> bool:
+        """Whether a frame of the rig (python-can Message) holds any of the signals; then they have its values."""
+        if message.is_error_frame or message.is_remote_frame:
+            return False
+        decoded: dict[int, dict] = {}
+        for channel, theirs, name, value in self._readers.get((message.arbitration_id, message.is_extended_id), ()):
+            if channel is not None and channel != str(message.channel):
+                continue
+            if id(theirs) not in decoded:
+                decoded[id(theirs)] = theirs.decode(bytes(message.data), decode_choices=False, allow_truncated=True)
+            if math.isfinite(raw := float(decoded[id(theirs)].get(name, math.nan))):
+                value.take(raw, time_ns)
+        return bool(decoded)
+
+
+def _message(name: str, mapping: Mapping) -> _Message:
+    message, database = our_messages()[name]
+    names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
+    # Each of ours has its own value, for two may come from one of the rig's, by different scales.
+    signals = {
+        signal: _Value(source) if isinstance(source, Source) else source for signal, source in mapping.messages[name].items()
+    }
+    layout = dict(zip(names, signal_columns(database, name, names), strict=True))
+    return _Message(message.frame_id, cycle_ns(message), signals, layout)
+
 
 class MappedBus(PythonCanBus):
     """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is.
 
     Args:
-        bus: python-can's, without filters; for CAN FD opened with it.
+        bus: python-can's, without filters; for CAN FD opened with it (`open_buses`).
         mapping: by the rig's DBC; its references stay outside.
-
-    Raises:
-        InputError: a mapping of tables has no frames.
     """
 
     def __init__(self, bus, mapping: Mapping):
         super().__init__(bus, [])
-        if mapping.database is None:
-            raise InputError(f"{mapping.path}: maps columns; expected one with `dbc` for a live bus")
-        self._values: dict[str, _Value] = {}
-        self._messages = {name: self._message(name, mapping) for name in mapping.messages if not name.startswith("RIG_")}
-        self._theirs: dict[tuple[int, bool], tuple] = {}
-        for name in self._values:
-            theirs = mapping.database.get_message_by_name(name.rpartition(".")[0])
-            _, signals = self._theirs.setdefault((theirs.frame_id, theirs.is_extended_frame), (theirs, []))
-            signals.append((name.rpartition(".")[2], self._values[name]))
+        self._signals = _Signals(mapping, [name for name in mapping.messages if not name.startswith("RIG_")])
+        self._messages = self._signals.messages
         self._clocks = {}
         for corner in CORNERS:
             if resolver := self._messages.get(f"EMB_{corner}_Resolver"):
                 clock = next(value for value in resolver.signals.values() if isinstance(value, _Value))
                 self._clocks[corner] = clock
 
-    def _message(self, name: str, mapping: Mapping) -> _Message:
-        message, database = our_messages()[name]
-        names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
-        signals = {
-            signal: self._values.setdefault(source.name, _Value(source)) if isinstance(source, Source) else source
-            for signal, source in mapping.messages[name].items()
-        }
-        layout = dict(zip(names, signal_columns(database, name, names), strict=True))
-        return _Message(message.frame_id, cycle_ns(message), signals, layout)
-
     def drain(self) -> np.ndarray:
         rows = []
         for message, time_ns in self._arrived():
-            if not (message.is_error_frame or message.is_remote_frame):
-                rows += self.heard(message, time_ns)
+            rows += self.heard(message, time_ns)
         return np.array(rows, FRAME)
 
     def heard(self, message, time_ns: int) -> list[tuple]:
         """FRAME rows that a frame of the rig (python-can Message) makes of ours."""
-        theirs, signals = self._theirs.get((message.arbitration_id, message.is_extended_id), (None, ()))
-        if theirs is None:
+        if not self._signals.take(message, time_ns):
             return []
-        decoded = theirs.decode(bytes(message.data), decode_choices=False, allow_truncated=True)
-        for name, value in signals:
-            if math.isfinite(raw := float(decoded.get(name, math.nan))):
-                value.take(raw, time_ns)
         rows = []
         for corner, clock in self._clocks.items():
             resolver = self._messages[f"EMB_{corner}_Resolver"]
@@ -190,11 +253,54 @@ def _completed(slow: _Message) -> dict[str, float]:
     return known
 
 
-def open_mapped(options: dict, mapping: Mapping) -> MappedBus:
-    """A bus by python-can's options (`cli.busoptions`), read through a mapping.
+class ReferenceBus(PythonCanBus):
+    """A bus on which frames of ``ids`` are ours and the rig's force sensors are heard beside them, as RIG_c_Force."""
+
+    def __init__(self, bus, mapping: Mapping, ids: list[int]):
+        super().__init__(bus, ids)
+        names = [name for name in mapping.messages if name.startswith("RIG_") and name.endswith("_Force")]
+        if not names:
+            raise InputError(f"{mapping.path}: expected RIG_c_Force.ClampForceRef of a corner, for what else would be shown?")
+        self._signals = _Signals(mapping, names)
+
+    def drain(self) -> np.ndarray:
+        rows = []
+        for message, time_ns in self._arrived():
+            if self._concerns_us(message) and not message.is_error_frame:
+                rows.append(
+                    (time_ns, int.from_bytes(message.data[:8], "little"), message.arbitration_id, len(message.data), 0)
+                )
+            elif self._signals.take(message, time_ns):
+                rows += [our.reference(time_ns) for our in self._signals.messages.values() if our.fresh(time_ns)]
+        return np.array(rows, FRAME)
+
+
+def open_buses(options: dict, mapping: Mapping):
+    """python-can's bus by its options (`cli.busoptions`), or as many as the mapping names channels; for CAN FD if the rig's
+    messages are.
 
     Raises:
         InputError: no interface is named, or an unknown one, or the mapping has no DBC.
         Unavailable: it cannot be opened now.
     """
-    return MappedBus(open_python_can(options), mapping)
+    mapping.require_frames()
+    if mapping.has_fd:
+        options = {"fd": True} | options
+    channels = sorted({channel for channel in mapping.channels.values() if channel is not None})
+    if not channels:
+        return open_python_can(options)
+    # The daemon's own channel first: what it sends goes there.
+    ours = str(options.get("channel") or channels[0])
+    return SeveralBuses({name: open_python_can(options | {"channel": name}) for name in dict.fromkeys([ours, *channels])})
+
+
+def open_mapped(options: dict, mapping: Mapping, layout: np.ndarray) -> MappedBus:
+    """A bus read through a mapping, for a daemon of a LAYOUT.
+
+    Raises:
+        InputErrors: messages of the rig have ids with which the daemon sends.
+        InputError, Unavailable: as `open_buses`.
+    """
+    if faults := mapping.taken(layout):
+        raise InputErrors(faults)
+    return MappedBus(open_buses(options, mapping), mapping)

@@ -4,26 +4,33 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
 """
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, field
 
 from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.contradictions import contradictions
 from emb_daemon.logs.read import Recorded, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
+from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
 from emb_daemon.wire.units import UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
+#: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
+_SHORTEST_S, _LONGEST_S = 1e-5, 1.0
+#: Share of the payloads that a gateway or the beginning of a log may leave out of a copy.
+_LOST_COPIES = 0.1
 
 
 class Mapped(Struct, kw_only=True):
@@ -31,6 +38,8 @@ class Mapped(Struct, kw_only=True):
 
     #: Message.Signal of the rig's DBC; without a DBC, the name of a column or channel.
     signal: str | None = None
+    #: Which of `buses` carries it, if there are any.
+    bus: str | None = None
     #: Its unit, where the rig's DBC states none or a wrong one; always for columns and channels.
     unit: str | None = None
     #: ours = scale * (theirs, in our unit) + offset; -1 turns a direction round.
@@ -49,7 +58,10 @@ class Mapped(Struct, kw_only=True):
     def __post_init__(self):
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
-        alone = (self.unit, self.period, self.mean_ms) == (None, None, None) and (self.scale, self.offset) == (1.0, 0.0)
+        alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
+            1.0,
+            0.0,
+        )
         if self.value is not None and not alone:
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
@@ -61,12 +73,21 @@ class Time(Struct, kw_only=True):
 
     #: Name of the column.
     signal: str
-    #: s, ms or us.
+    #: s, ms, us or ns.
     unit: str = "s"
 
     def __post_init__(self):
         if UNITS.get(self.unit, ("",))[0] != "s":
-            raise ValueError(f"unit: expected s, ms or us, found {self.unit!r}")
+            raise ValueError(f"unit: expected s, ms, us or ns, found {self.unit!r}")
+
+
+class Bus(Struct, kw_only=True):
+    """One of several CAN buses."""
+
+    #: Its DBC, ARXML or KCD, relative to this file.
+    dbc: str
+    #: Its channel as the log names it: can1 of candump, 1 of Vector's CAN 1; live, the one to open. Left out, it may be any.
+    channel: str | int | None = None
 
 
 class MappingFile(Struct, kw_only=True):
@@ -76,26 +97,32 @@ class MappingFile(Struct, kw_only=True):
     format: Annotated[int, Meta(ge=1, le=1)]
     #: The rig's DBC, ARXML or KCD, relative to this file; left out for tables and measurements.
     dbc: str | None = None
+    #: Instead of `dbc`, of a rig with several buses: by a name of yours.
+    buses: dict[str, Bus] = field(default_factory=dict)
     #: Of a .csv or .parquet table; channels of a measurement have times of their own.
     time: Time | None = None
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
 
     def __post_init__(self):
-        if self.dbc is not None and self.time is not None:
-            raise ValueError("time: the frames of a CAN log have theirs; expected dbc or time")
+        if self.dbc is not None and self.buses:
+            raise ValueError("buses: each has a dbc of its own; expected dbc or buses")
+        if (self.dbc is not None or self.buses) and self.time is not None:
+            raise ValueError("time: the frames of a CAN log have theirs; expected one of dbc, buses and time")
 
 
 class Source:
-    """One foreign signal, and how it becomes ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a
-    sampling period."""
+    """One foreign signal of a bus (None: the only one), and how it becomes ours: ``scale`` and ``offset`` from the rig's unit
+    to ours, ``span_ns`` None is a sampling period."""
 
     def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
-        self.name, self.period = mapped.signal, mapped.period
+        self.name, self.bus, self.period = mapped.signal, mapped.bus, mapped.period
         self.scale, self.offset, self.span_ns = scale, offset, span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
+        if (sampled := held_rows(series.values)) is not None:
+            series = Series(series.time_ns[sampled], series.values[sampled])
         turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
         return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
 
@@ -104,7 +131,8 @@ class Mapping:
     """A mapping file, checked against both descriptions.
 
     Attributes:
-        database: the rig's (cantools), None of tables and measurements.
+        databases: the rig's (cantools) by bus, None the name of the only one; empty of tables and measurements.
+        channels: by bus, as the log names it; None is any.
         messages: sources by message and signal of ours, a number where it is a constant; a signal that another stands in for
             is not among them.
         notes: a line for each signal that the rig does not measure and that others stand in for.
@@ -116,7 +144,9 @@ class Mapping:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
-        self.database = load_database(self.path.parent / self._file.dbc) if self._file.dbc else None
+        buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
+        self.databases = {name: load_database(self.path.parent / bus.dbc) for name, bus in buses.items()}
+        self.channels = {name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()}
         self._ours = our_messages()
         self._faults: list[str] = []
         self.notes: list[str] = []
@@ -147,8 +177,11 @@ class Mapping:
                     name, f"value: {mapped.value:g}; expected {layout['low']:g} to {layout['high']:g} {ours.unit or ''}"
                 )
             return None
+        if mapped.bus not in (self.databases or {None: None}):
+            known = ", ".join(self._file.buses)
+            return self._fault(name, f"bus: expected one of {known}" if known else "bus: there are no `buses` in this file")
         try:
-            stated = self._their_unit(mapped.signal)
+            stated = self._their_unit(mapped.bus, mapped.signal)
         except KeyError:
             return self._fault(name, f"{mapped.signal}: the rig's DBC has no such message and signal")
         unit = (stated if mapped.unit is None else mapped.unit).strip()
@@ -165,16 +198,16 @@ class Mapping:
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
-    def _their_unit(self, signal: str) -> str:
+    def _their_unit(self, bus: str | None, signal: str) -> str:
         """Of a signal as the rig describes it, empty if it does not.
 
         Raises:
             KeyError: the rig's DBC has no such signal.
         """
-        if self.database is None:
+        if not self.databases:
             return ""
         message, _, name = signal.rpartition(".")
-        return self.database.get_message_by_name(message).get_signal_by_name(name).unit or ""
+        return self.databases[bus].get_message_by_name(message).get_signal_by_name(name).unit or ""
 
     def _check_complete(self) -> None:
         """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
@@ -201,7 +234,30 @@ class Mapping:
         for corner in corners:
             for message, text in _LOST.items():
                 if (name := message.format(corner)) not in self.messages:
-                    self.notes.append(f"{self.path}: {name} is not mapped: {text}")
+                    blind = name == "VEH_Status" and f"EMB_{corner}_Current" not in self.messages
+                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else text}")
+
+    def require_frames(self) -> None:
+        """Raises InputError of a mapping of tables, which has no frames."""
+        if not self.databases:
+            raise InputError(f"{self.path}: maps columns; expected one with `dbc` for a live bus")
+
+    @property
+    def has_fd(self) -> bool:
+        """Whether any of the rig's mapped messages is CAN FD."""
+        names = {(s.bus, s.name.rpartition(".")[0]) for message in self.messages for s in self._sources(message).values()}
+        return any(self.databases[bus].get_message_by_name(name).is_fd for bus, name in names)
+
+    def taken(self, layout: np.ndarray) -> list[str]:
+        """A fault for each message of the rig's DBC with an id that the daemon of a LAYOUT sends with."""
+        ours = set(np.flatnonzero(layout["slot"][0] == OURS).tolist())
+        return [
+            f"{self.path}: {message.name} of the rig has id {message.frame_id:#x}, with which the daemon sends; expected "
+            "other ids of ours (`dbc` of the configuration)"
+            for database in self.databases.values()
+            for message in database.messages
+            if message.frame_id in ours and not message.is_extended_frame
+        ]
 
     def _sources(self, message: str) -> dict[str, Source]:
         return {key: source for key, source in self.messages.get(message, {}).items() if isinstance(source, Source)}
@@ -216,57 +272,112 @@ class Mapping:
 
     def read_with_digest(self, path: str | Path) -> tuple[np.ndarray, str]:
         """`read`, and the SHA-256 of the file as it was read."""
-        path, wanted = Path(path), {source.name for name in self.messages for source in self._sources(name).values()}
-        if self.database is None:
-            raw, digest = read_table(path, sorted(wanted), self._file.time)
+        path = Path(path)
+        wanted = {(source.bus, source.name) for name in self.messages for source in self._sources(name).values()}
+        if not self.databases:
+            table, digest = read_table(path, sorted(name for _, name in wanted), self._file.time)
+            raw = {(None, name): series for name, series in table.items()}
         else:
             recorded = read_log(path)
-            raw, digest = self._decode(recorded, wanted), recorded.digest
+            raw, digest = self._decode(path, recorded, wanted), recorded.digest
         messages = {
             name: {
-                key: source.converted(*raw[source.name]) if isinstance(source, Source) else source
+                key: source.converted(*raw[source.bus, source.name]) if isinstance(source, Source) else source
                 for key, source in signals.items()
             }
             for name, signals in self.messages.items()
         }
+        for corner in CORNERS:
+            for line in contradictions(corner, messages):
+                print(f"{path}: {corner}: {line}", file=sys.stderr)
+        self._check_rate(path, messages)
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
         return frames, digest
 
-    def _clocks(self) -> str:
-        names = sorted({next(iter(self._sources(f"EMB_{corner}_Resolver").values())).name for corner in CORNERS
-                        if self._sources(f"EMB_{corner}_Resolver")})  # fmt: skip
-        if self.database is None:
-            return ", ".join(names)
-        messages = {name: self.database.get_message_by_name(name.rpartition(".")[0]) for name in names}
-        return ", ".join(f"{name} ({message.frame_id:#x})" for name, message in messages.items())
+    def _check_rate(self, path: Path, messages: dict) -> None:
+        for corner in CORNERS:
+            for name, source in self._sources(f"EMB_{corner}_Resolver").items():
+                series = messages[f"EMB_{corner}_Resolver"][name]
+                if len(series.time_ns) > 2 and not _SHORTEST_S <= 1e-9 * series.period_ns <= _LONGEST_S:
+                    raise InputError(
+                        f"{path}: {source.name}: one value every {1e-9 * series.period_ns:.3g} s; expected {_SHORTEST_S:g} to "
+                        f"{_LONGEST_S:g} s; is the unit of time right?"
+                    )
 
-    def _decode(self, recorded: Recorded, wanted: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Times and values of the rig's signals; one in a frame too short for it is left out."""
-        found, frames = {}, recorded.frames
-        by_message: dict[str, list[str]] = {}
-        for signal in wanted:
-            by_message.setdefault(signal.rpartition(".")[0], []).append(signal)
-        for name, signals in by_message.items():
-            message = self.database.get_message_by_name(name)
-            flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
-            mine = (frames["can_id"] == message.frame_id) & (flags == EXTENDED * message.is_extended_frame)
-            rows = np.flatnonzero(mine)
+    def _clocks(self) -> str:
+        clocks = [next(iter(self._sources(f"EMB_{corner}_Resolver").values()), None) for corner in CORNERS]
+        names = {}
+        for source in filter(None, clocks):
+            message, _, _ = source.name.rpartition(".")
+            frame_id = self.databases[source.bus].get_message_by_name(message).frame_id if self.databases else None
+            channel = self.channels.get(source.bus)
+            place = [f"{frame_id:#x}"] * bool(self.databases) + [f"channel {channel}"] * (channel is not None)
+            names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
+        return ", ".join(names)
+
+    def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
+        """Times and values of the rig's signals by bus and name; one in a frame too short for it is left out."""
+        found = {}
+        by_message: dict[tuple[str | None, str], list[str]] = {}
+        for bus, signal in sorted(wanted, key=str):
+            by_message.setdefault((bus, signal.rpartition(".")[0]), []).append(signal)
+        for (bus, name), signals in by_message.items():
+            message = self.databases[bus].get_message_by_name(name)
+            rows = self._rows(path, recorded, message, self.channels[bus])
             decoded = [
                 message.decode(payload, decode_choices=False, allow_truncated=True) for payload in recorded.payloads(rows)
             ]
-            for signal in signals:
-                values = [row.get(signal.rpartition(".")[2], np.nan) for row in decoded]
-                found[signal] = (frames["time_ns"][rows], np.array(values, float))
+            columns = {
+                signal: np.array([row.get(signal.rpartition(".")[2], np.nan) for row in decoded], float) for signal in signals
+            }
+            # Parts of a multiplexed message are messages of their own.
+            for part in [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]:
+                heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
+                values = [columns[signal][heard] for signal in part]
+                stamps, kept = in_time(f"{path}: {', '.join(part)}", recorded.frames["time_ns"][rows[heard]], values)
+                found |= {(bus, signal): (stamps, column[kept]) for signal, column in zip(part, values, strict=True)}
         return found
 
+    def _rows(self, path: Path, recorded: Recorded, message, channel: str | None) -> np.ndarray:
+        """Of a message's frames.
 
+        Raises:
+            InputError: the log has nothing of the channel, or two channels carry the message and the mapping names none.
+        """
+        frames = recorded.frames
+        flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
+        mine = (frames["can_id"] == message.frame_id) & (flags == EXTENDED * message.is_extended_frame)
+        channels = recorded.channels
+        if channel is not None:
+            if channel not in (known := np.unique(channels).tolist()):
+                raise InputError(f"{path}: nothing of channel {channel}, which {self.path} names; found {', '.join(known)}")
+            mine &= channels == channel
+        elif len(known := np.unique(channels[mine]).tolist()) > 1 and not _is_copied(recorded, mine, channels):
+            raise InputError(
+                f"{path}: {message.name} ({message.frame_id:#x}) comes from channels {', '.join(known)}, and not the same; "
+                f"name the right one in {self.path} (`buses:`, `channel`)"
+            )
+        return np.flatnonzero(mine)
+
+
+def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bool:
+    """Whether what one channel carries of a message is what another does: a gateway's copy, or two loggers of one bus."""
+    rows = np.flatnonzero(mine)
+    payloads = np.array([payload.hex() for payload in recorded.payloads(rows)])
+    by_channel = [set(payloads[channels[rows] == channel].tolist()) for channel in np.unique(channels[rows])]
+    fewest = min(by_channel, key=len)
+    return all(len(fewest - other) <= _LOST_COPIES * len(fewest) for other in by_channel)
+
+
+_BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"
 #: What a corner loses with a message that is not mapped.
 _LOST = {
     "EMB_{}_Current": "the force rests on the motor angle alone",
     "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
     "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
-    "VEH_Status": "that the brake begins released has to be shown by motor and current; of a bench say so by `value: 0` of "
-    "ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp",
+    "VEH_Status": "that the brake was released has to be shown by motor and current; " + _BENCH,
 }
+#: The same where there is no current either.
+_BLIND = "without a current nothing shows either where the brake is released, and the force stays unknown; " + _BENCH

@@ -7,7 +7,9 @@ import io
 import os
 import sys
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -83,11 +85,17 @@ def unpack_gzip(path: Path, raw: bytes) -> bytes:
 @dataclass(frozen=True)
 class Recorded:
     """A log file as it stands: ``frames``, a FRAME array in file order, ``octets``, their payloads one after the other (those
-    of CAN FD whole), and ``digest``, the SHA-256 of the file."""
+    of CAN FD whole), ``names`` gives the channel of each frame, and ``digest`` is the SHA-256 of the file."""
 
     frames: np.ndarray
     octets: np.ndarray
     digest: str
+    names: Callable[[], np.ndarray]
+
+    @cached_property
+    def channels(self) -> np.ndarray:
+        """Of each frame, as text: as candump names it, by number in other formats, Vector's from 1."""
+        return self.names()
 
     def payloads(self, rows: np.ndarray) -> list[bytes]:
         """Payloads of the frames with these row numbers."""
@@ -96,27 +104,33 @@ class Recorded:
         return [self.octets[start:end].tobytes() for start, end in zip(starts[rows], ends[rows], strict=True)]
 
 
-def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
     octets = np.zeros(len(text) // 2, np.uint8)
     frames, bad_line, unfinished = parse_candump(text, octets)
     if bad_line and unfinished and bad_line > 1:
         print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
     elif bad_line:
         raise InputError(f"{path}:{bad_line}: not a candump line, expected '(seconds.fraction) interface id#data'")
-    return frames, octets
+    return (
+        frames,
+        octets,
+        lambda: np.array([line.split(b" ", 2)[1].decode() for line in text.splitlines() if line][: len(frames)]),
+    )
 
 
-def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray]:
+def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
     try:
         if reader_name in _APART:
-            return frames_apart(path, content, reader_name, 2 * _most_bytes())
-        return frames_of(content, reader_name)
+            frames, octets, channels = frames_apart(path, content, reader_name, 2 * _most_bytes())
+        else:
+            frames, octets, channels = frames_of(content, reader_name)
     except InputError:
         raise
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {str(error) or type(error).__name__}") from None
+    return frames, octets, lambda: channels
 
 
 def read_frames(path: str | Path) -> np.ndarray:
@@ -153,7 +167,8 @@ def read_log(path: str | Path) -> Recorded:
         raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
     raw = read_file(path)
     content = unpack_gzip(path, raw)
-    frames, octets = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
+    parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
+    frames, octets, channels = parsed
     if not len(frames):
         raise InputError(f"{path}: holds no frames")
-    return Recorded(frames, octets, hashlib.sha256(raw).hexdigest())
+    return Recorded(frames, octets, hashlib.sha256(raw).hexdigest(), channels)

@@ -25,6 +25,10 @@ _SAME_PERIOD = 0.05
 _SPARSE_CYCLES = 5
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
+#: Share of values beyond what our message carries that an instrument's own faults do not make.
+_MOST_BEYOND = 0.01
+#: Silence of every motor over which slow messages go on: what cools in between is warm for an hour, ns.
+_SILENT_NS = 3_600_000_000_000
 #: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
 #: Periods from which a step of time is a pause.
@@ -33,6 +37,18 @@ _PAUSE = 10
 #: be sampled apart, from which the estimator takes it for a resolver that lost its zero. That happens once, not again and
 #: again: share of the steps.
 _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
+#: Way from which an angle tells how fast it changes, rad; correlation of both from which it does; and how far their ratio may
+#: be from 1: a filter's delay makes some hundredths of it.
+_WAY_RAD, _CORRELATED, _OTHER_SCALE = 1.0, 0.8, 0.1
+#: Ratios of units that are taken for one another.
+_RATIOS = {
+    30.0 / np.pi: "rpm taken for rad/s, or the reverse",
+    180.0 / np.pi: "degrees taken for radians, or the reverse",
+    2.0 * np.pi: "turns taken for radians, or the reverse",
+    6.0: "rpm taken for degrees per second, or the reverse",
+    60.0: "turns per minute taken for turns per second, or the reverse",
+    1e3: "a unit of time or a prefix that is wrong by a thousand",
+}
 #: Least step of the wire's MotorSpeed.
 _STEP_RAD_PER_S = 0.02
 #: Signals of an E2E protected message that its protection fills.
@@ -186,12 +202,8 @@ def fill_missing(name: str, signals: Signals) -> Signals:
     """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
-        if isinstance(angle, Series) and isinstance(speed, Series) and (apart := _apart(angle, speed)) > _MOST_APART:
-            print(
-                f"{name}: MotorSpeed is another motion than the change of MotorAngle in {100.0 * apart:.1f} % of the samples "
-                "(stamps of a busy computer, a wrong unit or sign?): left out, the change of the angle is taken",
-                file=sys.stderr,
-            )
+        if isinstance(angle, Series) and isinstance(speed, Series) and (why := _another_motion(angle, speed)):
+            print(f"{name}: MotorSpeed {why}: left out, the change of the angle is taken", file=sys.stderr)
             speed = None
         angle = speed.integral() if angle is None else angle
         return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
@@ -202,14 +214,43 @@ def fill_missing(name: str, signals: Signals) -> Signals:
     return signals
 
 
-def _apart(angle: Series, speed: Series) -> float:
-    """Share of the steps in which angle and speed tell of different motions."""
+def _another_motion(angle: Series, speed: Series) -> str:
+    """How speed and angle contradict each other; empty if they do not, or if nobody knows the way between two samples."""
+    if angle.is_sparse:
+        return ""
     steps = np.diff(angle.time_ns)
     near = (steps > 0) & (steps <= _CARRIED_PERIODS * angle.period_ns)
     at = speed.sampled(angle.time_ns)
-    slip = np.diff(angle.values) - 0.5e-9 * (at[1:] + at[:-1]) * steps
-    beyond = np.abs(slip) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
-    return float(np.mean(beyond[near])) if near.any() and not angle.is_sparse else 0.0
+    way, turned = np.diff(angle.values), 0.5e-9 * (at[1:] + at[:-1]) * steps
+    known = near & np.isfinite(turned)
+    if not known.any():
+        return ""
+    moved, explained = float(np.sum(np.abs(way[known]))), float(np.sum(np.abs(turned[known])))
+    # What noise adds up to is no way.
+    if (
+        min(moved, explained) > _WAY_RAD
+        and abs(ratio := float(way[known] @ turned[known] / (turned[known] @ turned[known]))) > 0.0
+    ):
+        correlation = float(np.corrcoef(way[known], turned[known])[0, 1])
+        if abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
+            return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
+    apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
+    share = float(np.mean(apart[near]))
+    if share <= _MOST_APART:
+        return ""
+    return (
+        f"is another motion than the change of MotorAngle in {100.0 * share:.1f} % of the samples (stamps of a busy computer?)"
+    )
+
+
+def _meaning(ratio: float) -> str:
+    """What an angle that changes ``ratio`` times as fast as its speed says may come from."""
+    sign = "a direction turned round" if ratio < 0.0 else ""
+    for known, text in _RATIOS.items():
+        for expected in (known, 1.0 / known):
+            if abs(abs(ratio) / expected - 1.0) < _OTHER_SCALE:
+                return " and ".join(filter(None, [sign, text]))
+    return sign if abs(abs(ratio) - 1.0) <= _OTHER_SCALE else " and ".join(filter(None, [sign, "a wrong unit or gear"]))
 
 
 def _mean(first: Series | float, second: Series | float) -> Series | float:
@@ -244,11 +285,10 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     for corner in CORNERS:
         if resolver := messages.get(f"EMB_{corner}_Resolver"):
             ticks[corner] = _clock(next(source for source in resolver.values() if isinstance(source, Series)))
-    heard = [times for times, _ in ticks.values() if len(times)]
-    if not heard:
+    if not any(len(times) for times, _ in ticks.values()):
         return np.zeros(0, FRAME)
-    span = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
-    result = np.concatenate([_frames(*ours[name], signals, ticks, span) for name, signals in messages.items()])
+    stretches = _stretches(np.unique(np.concatenate([times for times, _ in ticks.values()])), _SILENT_NS)
+    result = np.concatenate([_frames(*ours[name], signals, ticks, stretches) for name, signals in messages.items()])
     # Stable: at one instant slow messages come first and the resolver last, as the pipeline pairs it with its current.
     return result[np.argsort(result["time_ns"], kind="stable")]
 
@@ -301,14 +341,28 @@ def is_received(message: str) -> bool:
     return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
 
 
-def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, int]) -> np.ndarray:
+def _stretches(times: np.ndarray, silent_ns: float) -> list[tuple[int, int]]:
+    """First and last of ascending times (there has to be one) between silences longer than ``silent_ns``."""
+    ends = np.flatnonzero(np.diff(times) > silent_ns)
+    return list(zip(times[np.append(0, ends + 1)].tolist(), times[np.append(ends, -1)].tolist(), strict=True))
+
+
+def _grid(stretches: list[tuple[int, int]], cycle_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times every ``cycle_ns`` from the first stretch on, those that lie in one, and how many cycles lie before each."""
+    origin = stretches[0][0]
+    cycles = np.concatenate(
+        [np.arange(-((origin - first) // cycle_ns), (last - origin) // cycle_ns + 1) for first, last in stretches]
+    )
+    return origin + cycles * cycle_ns, cycles
+
+
+def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tuple[int, int]]) -> np.ndarray:
     corner, kind = (*message.name.split("_"), "")[1:3]
     if corner in ticks and kind in ("Resolver", "Current", "Force"):
         times, cycles = ticks[corner]
         columns = {key: _fast(key, source, times) for key, source in signals.items()}
     else:
-        times = np.arange(span[0], span[1] + 1, cycle_ns(message))
-        cycles = np.arange(len(times))
+        times, cycles = _grid(stretches, cycle_ns(message))
         columns = {
             key: source.held(times, cycle_ns(message)) if isinstance(source, Series) else source
             for key, source in signals.items()
@@ -324,7 +378,13 @@ def _frames(message, database, signals: Signals, ticks: dict, span: tuple[int, i
             raw = absent
         else:
             column = np.broadcast_to(np.asarray(source, float), times.shape)
-            known = np.isfinite(column) & (column >= layout["low"]) & (column <= layout["high"])
+            known = (column >= layout["low"]) & (column <= layout["high"])
+            if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
+                print(
+                    f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
+                    "the samples, which make no frames; is its unit right?",
+                    file=sys.stderr,
+                )
             raw = np.rint((np.where(known, column, layout["offset"]) - layout["offset"]) / layout["factor"]).astype(np.int64)
             if is_reference:
                 raw = np.where(known, raw, absent)
@@ -368,5 +428,4 @@ def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
     if angle.is_ours or angle.is_sparse:
         steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
         return times, np.concatenate([[0], np.cumsum(steps)])
-    grid = np.arange(int(times[0]), int(times[-1]) + 1, CYCLE_NS)
-    return grid, np.arange(len(grid))
+    return _grid(_stretches(times, _CARRIED_PERIODS * angle.period_ns), CYCLE_NS)

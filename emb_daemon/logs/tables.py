@@ -3,19 +3,31 @@
 import csv
 import hashlib
 import io
+import re
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
+from emb_daemon.logs.stamps import in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
-_DELIMITERS = (",", ";", "\t")
+_DELIMITERS = (",", ";", "\t", "|")
 #: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
+#: Share of a column's cells that may be no numbers.
+_MOST_ODD = 0.01
+#: A time of day with parts of a second, or minutes and seconds, after a German date or none; others are pyarrow's to read.
+_CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+#: Octets of which every second is zero in UTF-16 without a mark.
+_MARK = 200
+#: What int64 nanoseconds hold: the year 2262, s.
+_LATEST_S = 9.2e9
 #: Cells that say that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -41,10 +53,15 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     table = _table(path, content, ending, [time.signal, *names])
     columns = {name: _numbers(path, table, name) for name in names}
     # Of a clock, seconds already.
-    seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal].type) else UNITS[time.unit][1])
+    seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
     known = np.isfinite(seconds)
-    stamps = np.rint(1e9 * seconds[known]).astype(np.int64)
-    return {name: (stamps, values[known]) for name, values in columns.items()}, digest
+    if np.any(np.abs(seconds[known]) > _LATEST_S):
+        raise InputError(
+            f"{path}: {time.signal}: {np.max(np.abs(seconds[known])):g} s are no time; is `time.unit`, {time.unit}, right?"
+        )
+    columns = {name: values[known] for name, values in columns.items()}
+    stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
+    return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
 
 
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
@@ -63,14 +80,17 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
     return table
 
 
-def _is_clock(kind) -> bool:
+def _is_clock(column) -> bool:
     import pyarrow
 
-    return pyarrow.types.is_timestamp(kind) or pyarrow.types.is_time(kind)
+    if pyarrow.types.is_string(column.type):
+        return any(cell and _CLOCK.fullmatch(cell.strip()) for cell in column.slice(0, _PREAMBLE).to_pylist())
+    return pyarrow.types.is_timestamp(column.type) or pyarrow.types.is_time(column.type)
 
 
 def _numbers(path: Path, table, name: str) -> np.ndarray:
-    """A column's values; of dates and times of day, seconds."""
+    """A column's values; of dates and times of day, seconds. A few cells that are no numbers, as tools write of an overflow
+    or a division by zero, are left out, with a word on stderr."""
     import pyarrow
 
     column = table[name]
@@ -78,10 +98,41 @@ def _numbers(path: Path, table, name: str) -> np.ndarray:
         return 1e-9 * column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64()).to_numpy()
     if pyarrow.types.is_time(column.type):
         return 1e-9 * column.cast(pyarrow.time64("ns")).cast(pyarrow.int64()).to_numpy()
+    if not pyarrow.types.is_string(column.type):
+        try:
+            return column.cast(pyarrow.float64(), safe=False).to_numpy()
+        except pyarrow.ArrowException:
+            raise InputError(f"{path}: {name}: expected a column of numbers, found {column.type}") from None
+    cells = column.to_pylist()
+    values = np.array([_number(cell) for cell in cells])
+    odd = [row for row in np.flatnonzero(np.isnan(values)).tolist() if cells[row] is not None]
+    if not odd:
+        return values
+    first = f"the first of them {cells[odd[0]]!r}, value {odd[0] + 1}"
+    if len(odd) > _MOST_ODD * len(cells):
+        raise InputError(f"{path}: {name}: expected a column of numbers; {len(odd)} cells are none, {first}")
+    print(f"{path}: {name}: {len(odd)} cells are no numbers, left out, {first}", file=sys.stderr)
+    return values
+
+
+def _number(cell: str | None) -> float:
+    """Of a cell's text; of a date and a time of day, or of one of them, seconds; NaN of anything else."""
+    if cell is None:
+        return np.nan
     try:
-        return column.cast(pyarrow.float64()).to_numpy()
-    except pyarrow.ArrowException:
-        raise InputError(f"{path}: {name}: expected a column of numbers, found {column.type}") from None
+        return float(cell)
+    except ValueError:
+        found = _CLOCK.fullmatch(cell.strip())
+    if not found:
+        return np.nan
+    hours, minutes, seconds = (float((found[part] or "0").replace(",", ".")) for part in ("h", "m", "s"))
+    of_day = 3600.0 * hours + 60.0 * minutes + seconds
+    try:
+        return of_day + (
+            datetime.strptime(found["date"], "%d.%m.%Y").replace(tzinfo=UTC).timestamp() if found["date"] else 0.0
+        )
+    except ValueError:
+        return np.nan
 
 
 def _text_table(path: Path, content: bytes, names: list[str]):
@@ -90,6 +141,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     import pyarrow.csv
 
     content = _as_utf8(content)
+    if b"\n" not in content:
+        content = content.replace(b"\r", b"\n")
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
@@ -112,16 +165,22 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         odd.append(row)
         return "skip"
 
-    table = pyarrow.csv.read_csv(
-        io.BytesIO(content),
-        # The handler is called from one thread only.
-        pyarrow.csv.ReadOptions(skip_rows=header + 1 + units, column_names=cells, use_threads=False),
-        pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
-        # Where a comma does not separate, it is a decimal one.
-        pyarrow.csv.ConvertOptions(
-            decimal_point="," if delimiter != "," and any("," in cell for cell in first) else ".", null_values=_NOTHING
-        ),
-    )
+    def read(decimal_point: str):
+        odd.clear()
+        return pyarrow.csv.read_csv(
+            io.BytesIO(content),
+            # The handler is called from one thread only.
+            pyarrow.csv.ReadOptions(skip_rows=header + 1 + units, column_names=cells, use_threads=False),
+            pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
+            pyarrow.csv.ConvertOptions(decimal_point=decimal_point, null_values=_NOTHING, strings_can_be_null=True),
+        )
+
+    table = read(".")
+    wanted = [table[name] for name in names if table.column_names.count(name) == 1]
+    texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
+    # Where a comma does not separate, it is a decimal one; a number may have it for the first time after many rows.
+    if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
+        table = read(",")
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
     return table
@@ -131,6 +190,8 @@ def _as_utf8(content: bytes) -> bytes:
     """Text as UTF-8 without a mark of byte order; what is neither UTF-8 nor UTF-16 is Latin-1, as older tools write it."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", errors="replace").encode()
+    if content[1:_MARK:2].count(0) > 0.9 * len(content[1:_MARK:2]) > 0.0:
+        return content.decode("utf-16-le", errors="replace").encode()
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -157,9 +218,13 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
             found = {}
             for name in names:
                 signal = file.get(name)
+                values = np.asarray(signal.samples).astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
-                found[name] = (stamps, np.asarray(signal.samples).astype(float))
+                stamps, rows = in_time(f"{path}: {name}", stamps, [values])
+                found[name] = (stamps, values[rows])
             return found
+    except InputError:
+        raise
     except Exception as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: not readable as a measurement: {text}") from None

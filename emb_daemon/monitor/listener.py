@@ -8,10 +8,20 @@ from functools import partial
 
 import numpy as np
 
+from emb_daemon.resources import resource
 from emb_daemon.wire import contract
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
-from emb_daemon.wire.layout import ADAPT_REQUEST, CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP, default_layout
+from emb_daemon.wire.layout import (
+    ADAPT_REQUEST,
+    CLAMP_FORCE,
+    CORNERS,
+    ESTIMATOR_STATUS,
+    PAD_TEMP,
+    default_layout,
+    load_database,
+    signal_columns,
+)
 
 HISTORY_S = 60
 SECOND_NS = 1_000_000_000
@@ -64,6 +74,7 @@ class Corner:
         self.streams = [Stream(cycle) for cycle in cycles_ns]
         #: [second, largest usable force in kN, number of forces], the newest last.
         self._seconds: deque[list] = deque(maxlen=HISTORY_S + 1)
+        self._reference_kN, self._reference_ns = math.nan, 0
 
     def remember(self, force_kN: float, time_ns: int) -> None:
         second = time_ns // SECOND_NS
@@ -73,6 +84,15 @@ class Corner:
         entry[2] += 1
         if not math.isnan(force_kN):
             entry[1] = force_kN if math.isnan(entry[1]) else max(entry[1], force_kN)
+
+    def refer(self, force_N: float, time_ns: int) -> None:
+        """A rig's force sensor has measured ``force_N``."""
+        self._reference_kN, self._reference_ns = 1e-3 * force_N, time_ns
+
+    def reference_kN(self, now_ns: int) -> float | None:
+        """What a rig's force sensor measured within the last half second, if there is one."""
+        recent = now_ns - self._reference_ns <= SECOND_NS // 2 and math.isfinite(self._reference_kN)
+        return round(self._reference_kN, 3) if recent else None
 
     def forces_kN(self, now_ns: int) -> list[float]:
         """Largest usable force of each of the last HISTORY_S whole seconds, oldest first; NaN where there was none."""
@@ -118,6 +138,7 @@ class Corner:
             "status": contract.STATUSES.get(force.status, "?"),
             "clamp_force_kN": value(force, 0, 3),
             "clamp_force_sigma_kN": value(force, 1, 3),
+            "clamp_force_ref_kN": self.reference_kN(now_ns),
             "source": _word(contract.SOURCES, force, 3),
             "input_age_ms": int(force.values[4]) if force.values else None,
             "mode": _word(contract.MODES, status, 0),
@@ -150,12 +171,16 @@ def _word(words: Sequence[str] | Mapping[int, str], stream: Stream, column: int)
 
 
 class Listener:
-    """All corners' broadcasts. `hear` takes FRAME arrays as a bus gives them, times on the monotonic clock."""
+    """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus` beside them. `hear` takes FRAME arrays as a bus
+    gives them, times on the monotonic clock."""
 
     def __init__(self):
         layout = default_layout()[0]
         self._cycles = layout["sent_cycle_ns"].tolist()
         self._place = {int(layout["sent_id"][kind, row]): (kind, row) for kind in range(4) for row in range(len(CORNERS))}
+        rig = load_database(resource("dbc/rig.dbc"))
+        [self._force] = signal_columns(rig, "RIG_FL_Force", ("ClampForceRef",)).tolist()
+        self._rigs = {rig.get_message_by_name(f"RIG_{name}_Force").frame_id: row for row, name in enumerate(CORNERS)}
         self._signals = [layout["sent"][kind, : layout["sent_count"][kind]].tolist() for kind in range(4)]
         # Loading compiled code takes long enough for a socket's buffer to overflow.
         for compiled in (counter_of, status_of, partial(crc, 0)):
@@ -177,8 +202,12 @@ class Listener:
 
     def hear(self, frames: np.ndarray) -> None:
         for time_ns, data, can_id, length, flags in frames.tolist():
-            place = self._place.get(can_id)
-            if place is None or flags & (EXTENDED | REMOTE | ERROR | FD):
+            place, rig = self._place.get(can_id), self._rigs.get(can_id)
+            if flags & (EXTENDED | REMOTE | ERROR | FD):
+                continue
+            if rig is not None and (force_N := _physical(data, self._force)) >= self._force[5]:
+                self.corners[rig].refer(force_N, time_ns)
+            if place is None:
                 continue
             kind, row = place
             stream = self.corners[row].streams[kind]

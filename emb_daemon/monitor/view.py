@@ -94,6 +94,8 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
         third.append(state["status"], style=STATUS_COLOURS.get(state["status"], "red"))
         if state["input_age_ms"]:
             third.append(f"  {state['input_age_ms']} ms old", style="yellow")
+    if state["clamp_force_ref_kN"] is not None:
+        third.append(f"  sensor {number(state['clamp_force_ref_kN'], 2)} kN")
     third.append(f"  {state['forces_per_s']:.0f}/s  ")
     third.append(f"{corner.missing} missing", style="yellow" if corner.missing else "dim")
     third.append("  ")
@@ -141,5 +143,9 @@ def summary(listener: Listener, now_ns: int) -> list[str]:
         pads = f"pads {number(state['inner_surface_C'], 0)} and {number(state['outer_surface_C'], 0)} °C"
         counts = f"{state['forces_per_s']:.0f}/s, {state['missing']} missing, {state['damaged']} damaged"
         reasons = f"; {', '.join(state['reasons'])}" if state["reasons"] else ""
-        lines.append(f"{corner.name} {force} ± {sigma} kN {state['source']}, {state['mode']}, {pads}, {counts}{reasons}")
+        reference = state["clamp_force_ref_kN"]
+        sensor = "" if reference is None else f" (sensor {number(reference, 3)} kN)"
+        lines.append(
+            f"{corner.name} {force} ± {sigma} kN{sensor} {state['source']}, {state['mode']}, {pads}, {counts}{reasons}"
+        )
     return lines

@@ -119,12 +119,15 @@ def _why_empty(frames: np.ndarray, corner: str, resolver_id: int) -> str:
     if (frames["flags"][mine] & EXTENDED == 0).any():
         return f"no resolver sample of corner {corner} that passes its CRC and counter check"
     found, counts = np.unique(frames["can_id"], return_counts=True)
+    decoder = Decoder()
+    if others := [name for name in CORNERS if decoder.can_id(f"EMB_{name}_Resolver") in found]:
+        return f"nothing of corner {corner}; it holds {', '.join(others)} (--corner)"
     often = found[np.argsort(-counts, kind="stable")]
     listed = ", ".join(f"{can_id:#x}" for can_id in np.sort(often[:_LISTED]))
     rest = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
     return (
         f"no frame of id {resolver_id:#x}, the resolver of corner {corner}; found {listed}{rest}; a rig with other ids needs "
-        "a mapping file (--mapping), another corner --corner"
+        "a mapping file (--mapping)"
     )
 
 

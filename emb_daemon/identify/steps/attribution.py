@@ -76,22 +76,31 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
     Nothing without random logs: slow motion leaves inertia and relaxation to the datasheet, and a search that may move them
     all would find what they are not."""
     if not any(pads.random for pads in stiffness.pads):
-        return AttributionStep(calibration=known)
+        return _unsearched(hot, known)
     logs, mounted = [], []
     for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
         logs += pads.logs
         mounted += [{"pad_thickness_mm": pads.thickness_mm, CLEARANCE: max(float(c), 0.0)} for c in curve.clearances_rad]
     bench = Bench([*logs, *hot], known, [*mounted, *({} for _ in hot)], own_data=True)
     if bench.episodes < EPISODES:
-        return AttributionStep(calibration=known)
+        return _unsearched(hot, known)
     found = diagnose_bench(bench, None, progress)
     calibration = replace(found.calibration, contact=known.contact, noise=known.noise, provenance=None)
     return AttributionStep(
         sigmas=found.calibration.provenance.sigmas,
         calibration=calibration,
         diagnosis=found,
-        hot=tuple(_errors(found, index) for index in range(len(logs), len(bench.trials))),
+        hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
     )
+
+
+def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
+    """What ``known`` leaves stays unexplained."""
+    if not hot:
+        return AttributionStep(calibration=known)
+    bench = Bench(hot, known, own_data=True)
+    residual = bench.residuals({})["stiffness"]
+    return AttributionStep(calibration=known, hot=tuple(_errors(bench, residual, index) for index in range(len(hot))))
 
 
 def words(step: AttributionStep) -> str:
@@ -114,10 +123,9 @@ def section(page: Page, step: AttributionStep) -> None:
         sections(page, step.diagnosis)
 
 
-def _errors(found: Diagnosis, index: int) -> Errors:
-    """What the search leaves of one log's stiffness path."""
-    trials = found.bench.trials
+def _errors(bench: Bench, residual: np.ndarray, index: int) -> Errors:
+    """What is left of one log's stiffness path, of the ``residual`` of all logs."""
+    trials = bench.trials
     first = sum(len(trial.log.samples) for trial in trials[:index])
-    residual = found.residual["stiffness"][first : first + len(trials[index].log.samples)]
     known = np.isfinite(trials[index].force_N)
-    return residual[known], trials[index].force_N[known]
+    return residual[first : first + len(trials[index].log.samples)][known], trials[index].force_N[known]

@@ -57,7 +57,7 @@ def identify(
         errors = [pair for fold in folds for pair in fold.errors]
         held_out = [left for fold in folds for left in fold.unexplained]
     else:
-        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, known) for log in logs]
+        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, known) for log in torque.logs]
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
             "levels come from the second halves of the random logs."

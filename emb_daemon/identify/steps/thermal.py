@@ -8,7 +8,7 @@ from emb_daemon.calibration.parameters import keys, moved, value_of
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
 from emb_daemon.identify.recording import Recording, recording, simulate
 from emb_daemon.identify.steps import Step, cooling, friction, softening
 from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
@@ -28,7 +28,6 @@ _NEEDED = {
     "heat_flux_map": "braking at several forces and disc speeds, for friction over force, speed and temperature",
     "pad_cooling": "bursts of clamps while the pads cool, for softening",
     "validate": "braking with thermocouples in the pads; pad temperatures are not judged without it",
-    "integrated": "training and braking heat at full frame rate",
 }
 
 
@@ -155,8 +154,8 @@ def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
     pairs = campaign.file.integrated
     for number, pair in enumerate(pairs, 1):
         suffix = f" {number}" if len(pairs) > 1 else ""
-        fit[f"integrated fit{suffix}"] = campaign.load(pair.fit, "integrated.fit", _NEEDED["integrated"])
-        unseen[f"integrated{suffix}"] = campaign.load(pair.judge, "integrated.judge", _NEEDED["integrated"])
+        fit[f"integrated fit{suffix}"] = campaign.load(pair.fit, "integrated.fit", NEED_INTEGRATED)
+        unseen[f"integrated{suffix}"] = campaign.load(pair.judge, "integrated.judge", NEED_INTEGRATED)
     return tuple({name: log for name, log in logs.items() if log is not None} for logs in (fit, unseen))
 
 

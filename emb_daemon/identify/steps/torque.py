@@ -17,7 +17,7 @@ from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
 from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
 from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
 from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
@@ -83,13 +83,13 @@ class TorqueStep(Step):
     """Motor and friction.
 
     Attributes:
-        fit: over all logs of the campaign's pads.
-        log: one of them, to be shown.
+        fit: over all logs of the campaign's pads, and of drives where no pads were moved at random.
+        logs: those.
         gears: (training log, fit) for each state of wear of the gear.
     """
 
     fit: TorqueFit
-    log: Log
+    logs: list[Log]
     gears: list[tuple[str, TorqueFit]]
 
     def gear_wear(self) -> float:
@@ -102,7 +102,12 @@ def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> Torq
     """Torque path from all logs with motor current, and each gear's from its training log; without any current, what the
     datasheet says, with standard deviations as wide as that leaves them."""
     sheet = campaign.datasheet
-    logs = [log for own in pads for log in own.logs if log.samples["has_current"].any()]
+    logs = [log for own in pads for log in own.logs]
+    if not any(own.random for own in pads):
+        # Slow motion alone tells friction at one speed from nothing.
+        driven = (campaign.load(pair.fit, "integrated.fit", NEED_INTEGRATED) for pair in campaign.file.integrated)
+        logs += [log for log in driven if log is not None]
+    logs = [log for log in logs if log.samples["has_current"].any()]
     if not logs:
         campaign.fault(
             "torque: no log holds motor current, so that torque constant and inertia are the datasheet's, friction is unknown "
@@ -117,7 +122,7 @@ def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> Torq
         log = campaign.load_motion(entry.training, "gear_wear", _NEED_TRAINING, reversals=(0.0, 100.0))
         if log is not None:
             gears.append((entry.training, fit_torque([log], nominal, sheet)))
-    return TorqueStep(values=found.physical(), sigmas=found.sigmas, fit=found, log=pads[len(pads) // 2].logs[-1], gears=gears)
+    return TorqueStep(values=found.physical(), sigmas=found.sigmas, fit=found, logs=logs, gears=gears)
 
 
 class _Regression:
@@ -288,8 +293,9 @@ def section(page: Page, step: TorqueStep) -> None:
     rows.append(["unexplained current / A", *(f"{found.rms_A:.3f}" for found in fits)])
     gears = [stem(name) for name, _ in step.gears]
     part.table(["parameter", "all pads", *gears], rows, "Gears: each state of wear identified from its own training log.")
-    current, time = step.log.samples["current_q"], step.log.time_s
-    rows_of, residual = step.fit.residuals[str(step.log.path)]
+    log = step.logs[len(step.logs) // 2]
+    current, time = log.samples["current_q"], log.time_s
+    rows_of, residual = step.fit.residuals[str(log.path)]
     explained = Trace("explained", time[rows_of], current[rows_of] - residual, MODEL)
     part.figure(
         time_figure(
@@ -298,5 +304,5 @@ def section(page: Page, step: TorqueStep) -> None:
                 Panel("Residual", "A", [Trace("unexplained", time[rows_of], residual, MODEL)], 200),
             ]
         ),
-        f"{step.log.path.name}",
+        f"{log.path.name}",
     )

@@ -1,0 +1,111 @@
+"""What a mapped log says that no brake does: a direction turned round, an angle that starts anew, a column that is one number.
+
+A unit or a sign that a mapping states wrongly cannot be known from numbers alone; what they contradict can, and is said.
+"""
+
+import numpy as np
+
+from emb_daemon.logs.resample import Series, Signals
+
+#: Samples from which anything is judged; parts of the travel for which a mean is taken, and samples that each has to have.
+_LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
+#: Share of the largest current that its means at one end of the travel must reach, and multiple of those at the other.
+_HOLDS, _MORE = 0.2, 2.0
+#: Travel below which a motor stands, and whatever follows its angle is noise, rad.
+_TRAVEL_RAD = 1.0
+#: Correlation of angle and acceleration up to which the current for both can be told apart.
+_TOLD_APART = 0.5
+#: Share of the largest force that it must change by from one end of the travel to the other.
+_FOLLOWS = 0.2
+#: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
+_LEAST_CLAMP_N = 100.0
+#: Share of the range that one step takes where a value starts anew, and how often it has to.
+_ANEW, _LEAST_JUMPS = 0.5, 3
+
+
+def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
+    """A line for each contradiction in what a corner's messages hold before anything missing is filled in."""
+
+    def series(message: str, signal: str) -> Series | None:
+        found = messages.get(message.format(corner), {}).get(signal)
+        return found if isinstance(found, Series) and len(found.time_ns) >= _LEAST else None
+
+    angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
+    force = series("RIG_{}_Force", "ClampForceRef")
+    lines = []
+    for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
+        if found is not None and not np.ptp(found.values):
+            lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
+    if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
+        return lines
+    if jump := _starts_anew(angle.values):
+        return [
+            *lines,
+            f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`",
+        ]
+    if current is not None and np.ptp(current.values):
+        lines += _turned_current(angle, current)
+    if force is not None and np.ptp(force.values):
+        lines += _turned_force(angle, force)
+    return lines
+
+
+def _starts_anew(values: np.ndarray) -> float:
+    """Size of the jumps of a value that starts anew again and again; 0 if it does not."""
+    jumps = np.abs(np.diff(values))
+    jumps = jumps[jumps > _ANEW * np.ptp(values)]
+    return float(np.median(jumps)) if len(jumps) >= _LEAST_JUMPS else 0.0
+
+
+def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
+    """Means of another signal over the lowest and the highest part of the travel that hold enough samples."""
+    at = other.sampled(angle.time_ns)
+    known = np.isfinite(at)
+    part = np.minimum(_PARTS * (angle.values - angle.values.min()) / np.ptp(angle.values), _PARTS - 1).astype(int)
+    means = [np.mean(at[known & (part == n)]) for n in range(_PARTS) if np.sum(known & (part == n)) >= _LEAST_IN_PART]
+    return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
+
+
+def _without_inertia(angle: Series, current: Series) -> Series | None:
+    """The current that does not accelerate the motor; None where load and acceleration cannot be told apart, as in a sine."""
+    acceleration = np.gradient(angle.derivative().values, 1e-9 * angle.time_ns)
+    at = current.sampled(angle.time_ns)
+    known = np.isfinite(at) & np.isfinite(acceleration)
+    if np.sum(known) < _LEAST or not np.ptp(acceleration[known]):
+        return None
+    columns = np.stack([np.ones(np.sum(known)), angle.values[known], acceleration[known]], axis=1)
+    if abs(np.corrcoef(columns[:, 1], columns[:, 2])[0, 1]) > _TOLD_APART:
+        return None
+    return Series(angle.time_ns[known], at[known] - np.linalg.lstsq(columns, at[known])[0][2] * acceleration[known])
+
+
+def _turned_current(angle: Series, current: Series) -> list[str]:
+    if (current := _without_inertia(angle, current)) is None:
+        return []
+    low, high = _by_travel(angle, current)
+    enough = _HOLDS * np.quantile(np.abs(current.values), 0.99)
+    if max(abs(low), abs(high)) < enough:
+        return []
+    if high < -max(enough, _MORE * abs(low)):
+        return [
+            f"CurrentQ is {high:.3g} A where MotorAngle is largest; positive current clamps: `scale: -1` of one of the two?"
+        ]
+    if abs(low) > _MORE * abs(high):
+        return [
+            f"CurrentQ is {low:.3g} A where MotorAngle is least and {high:.3g} A where it is largest; a brake clamps at large "
+            f"angles with positive current: `scale: -1` of MotorAngle and MotorSpeed{' and CurrentQ' if low < 0.0 else ''}?"
+        ]
+    return []
+
+
+def _turned_force(angle: Series, force: Series) -> list[str]:
+    low, high = _by_travel(angle, force)
+    largest = float(np.quantile(np.abs(force.values), 0.99))
+    if abs(high - low) < _FOLLOWS * largest:
+        return []
+    if (reached := np.max(np.abs(force.values))) < _LEAST_CLAMP_N:
+        return [f"ClampForceRef reaches {reached:.3g} N, which clamps nothing; is its unit right?"]
+    if high < low:
+        what = "ClampForceRef" if abs(high) > abs(low) else "MotorAngle and MotorSpeed"
+        return [f"ClampForceRef falls from {low:.4g} N to {high:.4g} N while MotorAngle rises: `scale: -1` of {what}?"]
+    return []

@@ -1,0 +1,99 @@
+"""The simulated car on another rig's bus: our frames leave as the rig's, by the mapping that reads them back."""
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+from emb_daemon.logs.live import open_buses
+from emb_daemon.logs.mapping import Mapping, Source
+from emb_daemon.logs.resample import our_messages
+from emb_daemon.runtime.bus import PythonCanBus
+from emb_daemon.wire.layout import signal_columns, unpack
+
+
+class _Theirs:
+    """One message of the rig, and the values of its signals that are mapped; others, checksums too, stay raw zero."""
+
+    def __init__(self, message, channel: str | None):
+        self.message, self.channel = message, channel
+        self.values = {signal.name: signal.offset for signal in message.signals}
+        self.missing: set[str] = set()
+        self._bounds = {signal.name: _bounds(signal) for signal in message.signals}
+
+    def set(self, name: str, value: float) -> None:
+        low, high = self._bounds[name]
+        self.values[name] = min(max(value, low), high)
+        self.missing.discard(name)
+
+    def frame(self):
+        """A python-can Message."""
+        import can
+
+        data = self.message.encode(self.values, strict=False)
+        kind = {"is_extended_id": self.message.is_extended_frame, "is_fd": self.message.is_fd}
+        return can.Message(arbitration_id=self.message.frame_id, data=data, channel=self.channel, **kind)
+
+
+def _bounds(signal) -> tuple[float, float]:
+    """What a cantools signal can carry."""
+    if signal.is_float:
+        return -np.inf, np.inf
+    least, most = (
+        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
+    )
+    ends = least * signal.scale + signal.offset, most * signal.scale + signal.offset
+    return min(ends), max(ends)
+
+
+class SimulatedRig(PythonCanBus):
+    """A bus with the calls of `runtime.bus.PythonCanBus` on which what is sent leaves as the rig's messages.
+
+    Args:
+        bus: python-can's, opened for CAN FD where the rig's messages need it.
+        mapping: by the rig's DBC.
+        ids: of the frames to receive, as they are.
+
+    Raises:
+        InputError: a mapping of tables has no frames, and one signal cannot select what else its message holds.
+    """
+
+    def __init__(self, bus, mapping: Mapping, ids: list[int]):
+        super().__init__(bus, ids)
+        self._theirs: dict[tuple, _Theirs] = {}
+        self._readers: dict[int, list[tuple]] = {}
+        for name, signals in mapping.messages.items():
+            ours, database = our_messages()[name]
+            for signal, source in signals.items():
+                if isinstance(source, Source):
+                    [column] = signal_columns(database, name, (signal,))
+                    self._readers.setdefault(ours.frame_id, []).append((column, source, self._their(mapping, source)))
+
+    def _their(self, mapping: Mapping, source: Source) -> _Theirs:
+        name, _, signal = source.name.rpartition(".")
+        message = mapping.databases[source.bus].get_message_by_name(name)
+        if message.is_multiplexed():
+            raise InputError(f"{mapping.path}: {name} is multiplexed, and which part to send is not known; expected another")
+        theirs = self._theirs.setdefault((source.bus, name), _Theirs(message, mapping.channels[source.bus]))
+        theirs.missing.add(signal)
+        return theirs
+
+    def send(self, frames: np.ndarray) -> None:
+        import can
+
+        changed = {}
+        for frame in frames:
+            for column, source, theirs in self._readers.get(int(frame["can_id"]), ()):
+                value = (float(unpack(frame["data"], column)) - source.offset) / source.scale
+                theirs.set(source.name.rpartition(".")[2], value if source.period is None else value % source.period)
+                changed[id(theirs)] = theirs
+        for theirs in changed.values():
+            if theirs.missing:
+                continue
+            try:
+                self._bus.send(theirs.frame())
+            except can.CanError:
+                self.unsent += 1
+
+
+def open_simulated(options: dict, mapping: Mapping, ids: list[int]) -> SimulatedRig:
+    """A bus by python-can's options (`cli.busoptions`); errors as in `logs.live.open_buses`."""
+    return SimulatedRig(open_buses(options, mapping), mapping, ids)

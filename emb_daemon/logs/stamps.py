@@ -1,0 +1,106 @@
+"""Time stamps as recorders write them: coarse, in bunches, twice, gone back; and values that are only held."""
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from emb_daemon.errors import InputError
+
+#: Step back in time from which a file holds two recordings; frames of two buses stand less out of order, ns.
+_BACK_NS = 1_000_000_000
+#: Share of the mean period up to which two stamps are one: jitter leaves more, a gateway or a queue that is emptied less.
+_ONE = 0.2
+#: Shares of the steps in motion that have to be so short, and to be none at all, for stamps to come in bunches; chance makes
+#: 0.18 and 0 of a sender that sends at random.
+_BUNCHED, _SAME_STAMP = 0.3, 0.05
+#: Share of the steps that are no pauses, and multiple of the longest of them from which a step is one.
+_ORDINARY, _PAUSE = 0.95, 10.0
+#: Bunches over which a mean time is taken: a stamp is then wrong by a twentieth of the time between two.
+_BUNCHES = 20
+#: Changes from which a value can be told to be held, and share of them that have to come in step.
+_LEAST_CHANGES, _IN_STEP = 50, 0.98
+#: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
+_WHOLE = 4
+
+
+def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a recording, int64 ns and rising, and the rows that they belong to.
+
+    What was recorded twice is left out. Stamps that come in bunches, of a coarse clock or of a queue that is emptied now and
+    then, are spread evenly. Both are said on stderr.
+
+    Args:
+        source: what messages call it.
+        columns: of values, shape (n,) each, that tell a repetition from a sample.
+
+    Raises:
+        InputError: time goes back by more than a second, or does not pass.
+    """
+    if len(back := np.flatnonzero(np.diff(time_ns) < -_BACK_NS)):
+        by = 1e-9 * float(time_ns[back[0]] - time_ns[back[0] + 1])
+        raise InputError(f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}; expected one recording in a file")
+    rows = np.argsort(time_ns, kind="stable")
+    times = time_ns[rows]
+    steps = np.diff(times)
+    if len(steps) < 2:
+        return times, rows
+    if times[-1] == times[0]:
+        raise InputError(f"{source}: {len(times)} values, all of them of one time")
+    going_on = steps <= _PAUSE * np.quantile(steps, _ORDINARY)
+    mean = float(np.mean(steps[going_on]))
+    near = steps <= _ONE * mean
+    if not near.any():
+        return times, rows
+    same = np.ones(len(steps), bool)
+    for column in columns:
+        before, after = column[rows[:-1]], column[rows[1:]]
+        same &= (before == after) | (np.isnan(before) & np.isnan(after))
+    moving = np.sum(~same)
+    if np.sum(near & ~same) > _BUNCHED * moving or np.sum((steps == 0) & ~same) > _SAME_STAMP * moving:
+        between = float(np.mean(steps[going_on & ~near]))
+        times = _spread(times, np.flatnonzero(~going_on) + 1, round(_BUNCHES * between / mean))
+        kept = np.concatenate([[True], np.diff(times) > 0])
+        print(f"{source}: stamps come in bunches, one every {1e-6 * between:.3g} ms: spread evenly", file=sys.stderr)
+    else:
+        kept = np.concatenate([[True], ~(near & same) & (steps > 0)])
+        if not kept.all():
+            print(f"{source}: {np.sum(~kept)} of {len(kept)} values were recorded twice: left out", file=sys.stderr)
+    return times[kept], rows[kept]
+
+
+def _spread(times: np.ndarray, pauses: np.ndarray, samples: int) -> np.ndarray:
+    """Rising times, each replaced by where the straight line through ``samples`` of them about it lies; none reaches over a
+    pause, of which the first row after it is given."""
+    from scipy.signal import savgol_filter
+
+    parts = []
+    for part in np.split(times, pauses):
+        width = min(samples, len(part) - 1) | 1
+        offset = (part - part[0]).astype(float)
+        straight = savgol_filter(offset, width, 1) if 3 <= width <= len(part) else offset
+        parts.append(part[0] + np.rint(straight).astype(np.int64))
+    return np.maximum.accumulate(np.concatenate(parts))
+
+
+def held_rows(values: np.ndarray) -> np.ndarray | None:
+    """Rows of a column at which it was sampled, where each sample is repeated until the next, as in a table of a finer raster
+    than the signal's; None where it is not."""
+    changes = np.flatnonzero(np.diff(values) != 0.0) + 1
+    runs = np.diff(changes)
+    if len(runs) < _LEAST_CHANGES or (least := int(runs.min())) < 2:
+        return None
+    held = float(np.mean(runs[runs <= least + (least > _WHOLE)]))
+    off = np.abs(runs - held * np.rint(runs / held))
+    # A value that stays may do so for long, over which the length in samples is not known well enough.
+    judged = runs < 0.5 * held * held if least > _WHOLE else np.ones(len(runs), bool)
+    if np.mean(off[judged] <= (1.0 if least > _WHOLE else 0.0)) < _IN_STEP:
+        return None
+    starts = np.concatenate([[0], changes])
+    ends = np.concatenate([changes, [len(values)]])
+    return np.concatenate(
+        [
+            start + np.rint(np.arange(0.0, end - start - 0.5 * held, held)).astype(int)
+            for start, end in zip(starts, ends, strict=True)
+        ]
+    )

@@ -1,0 +1,195 @@
+"""Recordings as recorders make them: what their stamps and columns get wrong, and what a mapping states wrongly."""
+
+import foreignkit
+import numpy as np
+import pytest
+
+from emb_daemon.cli.main import main
+from emb_daemon.errors import InputError
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.stamps import held_rows, in_time
+from emb_daemon.offline import load_log
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return foreignkit.truth(foreignkit.random(seconds=3.0))
+
+
+def _read(folder, columns: dict, mapping: str = foreignkit.COLUMNS):
+    foreignkit.write_rig(folder, mapping)
+    table = foreignkit.write_table(folder / "a.parquet", columns)
+    return load_log(table, read=Mapping(folder / "mapping.yaml").read)
+
+
+def _twice(columns):
+    rows = np.sort(np.concatenate([np.arange(len(columns["time_s"])), np.arange(0, len(columns["time_s"]), 3)]))
+    return {name: values[rows] for name, values in columns.items()}
+
+
+def _coarse(resolution_s):
+    return lambda columns: columns | {"time_s": np.floor(columns["time_s"] / resolution_s) * resolution_s}
+
+
+def _in_batches(columns):
+    """Five frames each time that an adapter's queue is emptied, 50 us apart."""
+    row = np.arange(len(columns["time_s"]))
+    ends = np.minimum(row // 5 * 5 + 4, len(row) - 1)
+    return columns | {"time_s": columns["time_s"][ends] + 5e-5 * (row % 5)}
+
+
+def _shuffled(columns):
+    rows = np.arange(len(columns["time_s"]))
+    rows[100:105] = rows[100:105][::-1]
+    return {name: values[rows] for name, values in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "most_s"),
+    [
+        (_twice, "were recorded twice: left out", 0.0001),
+        (_coarse(0.010), "stamps come in bunches, one every 10 ms", 0.0015),
+        (_coarse(0.005), "stamps come in bunches, one every 5 ms", 0.0015),
+        (_coarse(0.0156), "stamps come in bunches, one every 15.6 ms", 0.0015),
+        (_in_batches, "stamps come in bunches, one every 19.8 ms", 0.0015),
+        (_shuffled, "", 0.0001),
+    ],
+    ids=["twice", "10 ms", "5 ms", "15.6 ms", "batches", "out of order"],
+)  # fmt: skip
+def test_stamps_of_recorders_are_put_right(truth, tmp_path, capsys, change, said, most_s):
+    """Sample by sample the log is the one with right stamps, but for a delay that all its signals share."""
+    columns = foreignkit.sampled(truth, 250.0)
+    samples = _read(tmp_path, columns).samples
+    assert capsys.readouterr().err == ""
+    log = _read(tmp_path, change(columns))
+    assert said in capsys.readouterr().err
+    assert len(log.samples) == len(samples)
+    for name in ("angle", "speed", "current_q", "reasons"):
+        assert np.array_equal(log.samples[name][20:-20], samples[name][20:-20]), name
+    late = log.time_s - 0.004 * np.arange(len(samples))
+    assert np.ptp(late[20:-20]) < 2.0 * most_s
+
+
+def test_a_signal_that_is_held_in_a_finer_raster_is_taken_at_its_own_rate(truth, tmp_path):
+    """A current of 250 Hz in a table of 1 kHz is a mean over 4 ms, and a force of 25 Hz does not go by steps."""
+    fine = foreignkit.sampled(truth, 1000.0)
+    own = foreignkit.sampled(truth, 250.0)
+    row = np.maximum(np.searchsorted(own["time_s"], fine["time_s"] + 1e-9, side="right") - 1, 0)
+    held = fine | {"current_A": own["current_A"][row]}
+    late, right = ((_read(tmp_path, columns).samples["current_q"]) for columns in (held, fine))
+    assert np.std((late - right)[5:]) < 0.5
+    slow = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
+    stairs = np.repeat(slow["force_N"][::10], 10)[: len(slow["time_s"])]
+    assert np.abs(_read(tmp_path, slow | {"force_N": stairs}).force_N - slow["force_N"])[20:-20].max() < 250.0
+    assert np.abs(stairs - slow["force_N"]).max() > 500.0
+
+
+@pytest.mark.parametrize("step", [0.02, 0.5])
+def test_steps_of_resolution_are_not_taken_for_a_raster(truth, step):
+    values = np.round(foreignkit.sampled(truth, 1000.0)["angle_rad"] / step) * step
+    assert held_rows(values) is None
+
+
+def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
+    time_ns = np.cumsum(np.random.default_rng(1).exponential(1e7, 2000)).astype(np.int64)
+    times, rows = in_time("a", time_ns, [np.arange(2000.0)])
+    assert np.array_equal(times, time_ns) and np.array_equal(rows, np.arange(2000))
+
+
+@pytest.mark.parametrize(
+    ("time_s", "said"),
+    [
+        (lambda t: 1e3 * t, "one value every 4 s; expected 1e-05 to 1 s; is the unit of time right?"),
+        (lambda t: 1e6 * t, "one value every 4e+03 s"),
+        (lambda t: 1e-6 * t, "one value every 4e-09 s"),
+        (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right?"),
+        (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
+        (lambda t: 0.0 * t, "749 values, all of them of one time"),
+        (lambda t: np.concatenate([t[:400], t[: len(t) - 400]]), "time goes back by 1.596 s after value 400"),
+    ],
+    ids=["ms", "us", "s as us", "year", "outlier", "no clock", "two recordings"],
+)
+def test_times_that_cannot_be_are_refused(truth, tmp_path, time_s, said):
+    columns = foreignkit.sampled(truth, 250.0)
+    with pytest.raises(InputError) as caught:
+        _read(tmp_path, columns | {"time_s": time_s(columns["time_s"])})
+    assert said in str(caught.value) and str(caught.value).startswith(f"{tmp_path / 'a.parquet'}: ")
+
+
+def test_a_clock_that_is_set_while_recording_costs_no_memory(truth, tmp_path):
+    """The first stamp of a computer whose clock was not yet set, in a log of another rate than ours."""
+    columns = foreignkit.sampled(truth, 500.0)
+    time_s = foreignkit.START_S + columns["time_s"]
+    time_s[:5] -= foreignkit.START_S
+    log = _read(tmp_path, columns | {"time_s": time_s})
+    assert 0.99 * 750 < len(log.samples) < 1.01 * 750
+    assert np.ptp(log.samples["angle"]) > 15.0
+
+
+def _wrong(columns: dict, *names: str, factor: float = -1.0) -> dict:
+    return columns | {name: factor * columns[name] for name in names}
+
+
+_MOTION = ("angle_rad", "speed_rad_per_s")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "factor", "said"),
+    [
+        (("current_A",), -1.0, "A where MotorAngle is largest; positive current clamps"),
+        (_MOTION, -1.0, "`scale: -1` of MotorAngle and MotorSpeed?"),
+        ((*_MOTION, "current_A"), -1.0, "`scale: -1` of MotorAngle and MotorSpeed and CurrentQ?"),
+        (("force_N",), -1.0, "`scale: -1` of ClampForceRef?"),
+        (("force_N",), 1e-3, "N, which clamps nothing; is its unit right?"),
+        (("current_A",), 1e3, "CurrentQ is beyond"),
+        (("current_A",), 0.0, "CurrentQ is 0 throughout"),
+        (("speed_rad_per_s",), -1.0, "a direction turned round"),
+        (("speed_rad_per_s",), 30.0 / np.pi, "rpm taken for rad/s, or the reverse"),
+        (("angle_rad",), 180.0 / np.pi, "degrees taken for radians, or the reverse"),
+        (("angle_rad",), 1.0 / 12.0, "a wrong unit or gear"),
+    ],
+)
+def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said):
+    columns = foreignkit.sampled(truth, 250.0)
+    _read(tmp_path, _wrong(columns, *wrong, factor=factor))
+    assert said in capsys.readouterr().err
+
+
+def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 500.0)
+    _read(tmp_path, columns | {"angle_rad": columns["angle_rad"] % (2.0 * np.pi)})
+    assert "does it start anew? Then state its `period`" in capsys.readouterr().err
+
+
+def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):
+    """Neither hard motion alone nor a clamped, a held, or a released brake alone says that anything is turned round."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    for start in range(0, len(columns["time_s"]) - 400, 800):
+        _read(tmp_path, {name: values[start : start + 400] for name, values in columns.items()})
+        assert "scale: -1" not in capsys.readouterr().err, start
+
+
+@pytest.mark.parametrize("rate_Hz", [12.5, 250.0])
+def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, rate_Hz):
+    """At the top of a fast sine the current brakes the motor; between slow samples the motor goes its way."""
+    time_s = foreignkit.FINE_S * np.arange(round(8.0 / foreignkit.FINE_S))
+    sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 5.0 * time_s)
+    _read(tmp_path, foreignkit.sampled(foreignkit.truth(sine if rate_Hz > 100.0 else foreignkit.random()), rate_Hz))
+    assert capsys.readouterr().err == ""
+
+
+def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):
+    """The last count of its encoder goes to and fro."""
+    rng, count = np.random.default_rng(1), 800
+    noise = {"speed_rad_per_s": 0.3, "current_A": 0.2, "plate_C": 0.0, "force_N": 20.0}
+    columns = {"time_s": 0.004 * np.arange(count), "angle_rad": 5.0 + 0.0015 * rng.integers(0, 2, count)}
+    _read(tmp_path, columns | {name: rng.normal(0.0, sigma, count) for name, sigma in noise.items()})
+    assert capsys.readouterr().err == ""
+
+
+def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = foreignkit.write_table(tmp_path / "a.csv", {name: np.tile(values, 2) for name, values in columns.items()})
+    assert main(["replay", str(table), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"{table}: time goes back by")
