@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from emb_daemon.calibration import terms as calibration_terms
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
@@ -41,6 +42,7 @@ from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import EpisodeErrors, rmse
+from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import random_angle, simulate_log, training
 from emb_daemon.resources import resource
@@ -383,8 +385,9 @@ def test_what_has_a_name_is_called_by_it(viscous):
     assert named.candidates[term].reason == "an effect of the catalogue says the same"
 
 
-def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
-    """As it happens where something else was still missing when the order was chosen."""
+def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkeypatch):
+    """As it happens where something else was still missing when the order was chosen; beyond what its port may bear it is
+    refused, and the search goes on."""
     bench = Bench(
         [log_of(_logs(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})[0])], calibration
     )
@@ -394,7 +397,8 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
     side = harmonic("gear_gain", 2.6, bench.middle, ripples.covered)
     [lobe] = ripples._run([side])
     effect = made_effect(side, "term:gear_gain:motor_angle")
-    wrong = grammar._enter(selection, Candidate(effect, "torque", evidence=lobe.evidence), side)
+    candidate = Candidate(effect, "torque", evidence=lobe.evidence)
+    wrong = grammar._enter(selection, candidate, side)
     right = grammar._with_orders_again(wrong, "torque")
     orders = []
     for found in (wrong, right):
@@ -403,6 +407,9 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration):
         orders.append(1.0 / term.scale)
     assert abs(orders[0] - 3.0) > 0.1
     assert orders[1] == pytest.approx(3.0, rel=0.01)
+    monkeypatch.setattr(calibration_terms, "_FACTOR", 1e-3)
+    refused = grammar._enter(selection, candidate, side).candidates[effect.name]
+    assert not refused.accepted and "port may bear" in refused.reason
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):
@@ -463,6 +470,16 @@ def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_pa
     assert page(result)
 
 
+def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(calibration):
+    """Friction that rises for seconds after each stroke, whichever way: a hidden state driven by a power of the speed."""
+    hidden = {"size": 1.5, "signal": PLANT_SIGNALS.index("motor_speed"), "exponent": 1.5, "other": -1.0, "lag_s": 2.5}
+    frames, _ = _logs(calibration, 33, {"drawn_gear_friction": hidden}, stops=3)
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
+    best = Search(model, "torque", grammar._signals(model)).prospects()[0]
+    assert best.means == ("gear_friction", "motor_speed") and best.form.memory == "response"
+    assert best.form.memory_scale == pytest.approx(2.5, rel=0.3)
+
+
 @pytest.fixture(scope="module")
 def coupled(calibration):
     """(search, fit log, validation log) of a brake that clamps harder as it brakes, which no catalogue holds."""
@@ -471,7 +488,9 @@ def coupled(calibration):
 
 
 def test_what_no_effect_explains_is_said_with_what_it_depends_on(calibration, coupled, monkeypatch):
-    monkeypatch.setattr(search, "make_terms", lambda selection, progress: selection)
+    [term] = coupled[0].accepted
+    bare = coupled[0].without(term, "to see what is said where no term is made")
+    monkeypatch.setattr(diagnosis, "select", lambda bench, progress: bare)
     result = diagnose(coupled[1:2], calibration)
     assert all(finding.in_calibration for finding in result.accepted)
     assert result.unexplained.strongest.signal in ("brake_torque", "disc_speed")
@@ -685,7 +704,7 @@ def _path_effects(result):
 
 def _undeclared(rig, case):
     """Fit and validation log of the simulated rig: training, random angle and the first stops."""
-    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), 150.0) for name in ("fit", "val")]
+    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), 110.0) for name in ("fit", "val")]
 
 
 def _first(log, seconds):

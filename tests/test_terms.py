@@ -148,7 +148,7 @@ def test_a_harmonic_has_two_coefficients_and_turns_about_its_centre():
     np.testing.assert_allclose(over(term, x), 0.1 * np.cos(u) - 0.2 * np.sin(u), rtol=1e-12)
 
 
-def test_memories_lag_and_slip():
+def test_memories_lag_slip_and_respond():
     base = {"name": "term:x", "port": "stiffness", "signal": "brake_torque", "shape": "odd_power", "coefficient": 0.5}
     x = np.where(np.arange(2000) < 10, 0.0, 1.0)
     passed = DT * np.arange(2000 - 10)
@@ -156,6 +156,15 @@ def test_memories_lag_and_slip():
     np.testing.assert_allclose(lag, 0.5 * (1.0 - np.exp(-(passed + DT) / 2.0)), rtol=1e-9)
     deficit = over(Term(**base, memory="deficit", memory_scale=2.0, low=0.0, high=1.0), x)[10:]
     np.testing.assert_allclose(deficit, lag - 0.5, rtol=1e-9)
+    # Heat follows the square of what makes it, whichever way that turns.
+    there_and_back = np.where(np.arange(2000) % 2, 1.0, -1.0)
+    shape = base | {"shape": "even_power", "exponent": 2.0, "scale": 2.0, "low": -1.0, "high": 1.0, "memory_scale": 2.0}
+    np.testing.assert_allclose(over(Term(**shape, memory="response"), there_and_back), 0.5 * 0.25, rtol=1e-9)
+    response = over(Term(**shape, memory="response"), x)[10:]
+    np.testing.assert_allclose(response, 0.25 * lag, rtol=1e-9)
+    # Signals that stay at their edge for ever would make more of it than a friction may lose or gain.
+    hot = Term(**base | {"port": "gear_friction", "coefficient": 12.0}, memory="response", memory_scale=2.0, low=0.0, high=1.0)
+    np.testing.assert_allclose(over(hot, x)[10:], np.minimum(24.0 * lag, 0.9), rtol=1e-9)
     there_and_back = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)])
     slip = over(Term(**base, memory="slip", memory_scale=0.2, low=0.0, high=1.0), there_and_back)
     assert slip[100] == pytest.approx(0.5) and slip[-1] == pytest.approx(-0.5) and slip[121] == pytest.approx(0.0, abs=1e-9)
@@ -273,6 +282,8 @@ for calibration in sys.argv[3:5]:
              memory_scale=900.0, low=0.0, high=2e4),
         Term(name="term:x", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
              scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
+        Term(name="term:x", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
+             coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0),
     ],
     ids=lambda term: term.memory,
 )  # fmt: skip

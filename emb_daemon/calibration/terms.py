@@ -28,7 +28,8 @@ class Term(Struct, kw_only=True):
     #: What it is a function of.
     signal: Literal[tuple(SIGNALS)]
     #: none; lag: z follows the signal with the time constant memory_scale, s; deficit: what of that is still to come; slip: a
-    #: Maxwell slip element of stretch memory_scale, in the signal's unit.
+    #: Maxwell slip element of stretch memory_scale, in the signal's unit; response: z is the signal, and what the shape makes
+    #: of it passes through the lag: heat follows a power of what makes it, whichever way that turns.
     memory: Literal[MEMORIES] = "none"
     #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
     #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).
@@ -61,14 +62,26 @@ class Term(Struct, kw_only=True):
             raise InvalidValue("high: expected more than low")
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
-        most = _MOST_AT.get(self.port, _FACTOR)
-        if self.largest > most:
-            raise InvalidValue(f"coefficient: the term reaches {self.largest:.3g} {self.unit}, expected {most:g} at most")
+        if not self.is_bounded:
+            raise InvalidValue(
+                f"coefficient: the term reaches {self.largest:.3g} {self.unit}, expected {self.limit:g} at most"
+            )
 
     @property
     def unit(self) -> str:
         """Of the coefficient."""
         return HOOKS[self.port].unit
+
+    @property
+    def limit(self) -> float:
+        """Most that it may add, in the port's unit."""
+        return _MOST_AT.get(self.port, _FACTOR)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether it stays within its limit. What a response reaches, the time for which its signal stays says: the kernel
+        holds it there."""
+        return self.memory == "response" or self.largest <= self.limit
 
     @property
     def largest(self) -> float:
@@ -92,6 +105,7 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["gate"] = GATES.index(term.gate)
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
+        row["limit"] = term.limit if term.memory == "response" else np.inf
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

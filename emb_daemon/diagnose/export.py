@@ -1,5 +1,7 @@
 """A found term as an effect file, in the form that a person would have written (docs: adding an effect)."""
 
+import numpy as np
+
 from emb_daemon.calibration.terms import Term
 from emb_daemon.effects.terms import SIGNALS
 
@@ -38,6 +40,12 @@ _MEMORIES = {
 """,
 }
 _MEMORIES["deficit"] = _MEMORIES["lag"]
+#: What comes after the shape instead of before it.
+_RESPONSE = """    y = {shaped}
+    if not s.begun:
+        s.begun, s.memory = True, y
+    s.memory += (1.0 - exp(-dt / p.memory_scale)) * (y - s.memory)
+"""
 _SIZES = {
     "scale": "over which it changes",
     "centre": "where it is centred",
@@ -68,11 +76,14 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
     gate = _GATES[term.gate].replace("_FORCE]", "signals[_FORCE]")
     looked_at = {"_SIGNAL": signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
     shaped = "p.coefficient * cos(u) + p.sine * sin(u)" if term.shape == "harmonic" else _SHAPED[term.shape]
-    body = f"({shaped})" + (f" * {gate}" if gate else "")
+    response = _RESPONSE.format(shaped=shaped) if term.memory == "response" else ""
+    body = ("s.memory" if response else f"({shaped})") + (f" * {gate}" if gate else "")
     if term.shape != "harmonic":
         body = f"p.coefficient * {body}"
-    z = {"none": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
-    functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in body + _MEMORIES.get(term.memory, "")]
+    if response and np.isfinite(term.limit):
+        body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
+    z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
+    functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in body + response + _MEMORIES.get(term.memory, "")]
     arguments = "p, signals" if term.memory == "none" else "p, s, signals, dt" if term.memory != "slip" else "p, s, signals"
     off = "p.coefficient == 0.0" + (" and p.sine == 0.0" if term.shape == "harmonic" else "")
     lines = [
@@ -108,7 +119,7 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
     lines += _MEMORIES.get(term.memory, "").splitlines()
     if term.shape != "constant":
         lines.append(f"    u = ({z} - p.centre) / p.scale")
-    lines += [f"    return {body}", "", "", "EFFECT = Effect("]
+    lines += [*response.splitlines(), f"    return {body}", "", "", "EFFECT = Effect("]
     lines += [f'    name="{effect_name(term)}",', f'    hook="{term.port}",', "    term=term,", "    parameters=("]
     lines += [f"        {line}" for line in _parameters(term)]
     lines += ["    ),", f'    equation="{equation}",', f'    source="found by diagnose, {term.provenance or "no log named"}",']

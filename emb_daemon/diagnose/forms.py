@@ -158,8 +158,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         # as good. The residual of the torque path is current itself, but the constant's own column takes that shadow.
         for exponent in _EXPONENTS:
             yield "none", "even_power", reach, 0.0, exponent, 1.0
-            for time in _TIMES_S:
-                yield "lag", "even_power", reach, 0.0, exponent, time
+        yield from _responses(reach)
         for share in _SCALES:
             yield "none", "decay", share * reach, 0.0, 1.0, 1.0
         return
@@ -181,6 +180,8 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         yield "none", "even_power" if even else "odd_power", max(abs(low - centre), abs(high - centre)), centre, exponent, 1.0
     for share in _SCALES:
         yield "none", "saturation" if signed and not even else "decay", share * reach, 0.0, 1.0, 1.0
+    if even:
+        yield from _responses(reach)
     if signed:
         return
     for place in _PLACES:
@@ -188,6 +189,13 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", max(abs(low - centre), abs(high - centre)), centre, 1.0, time
+
+
+def _responses(reach: float) -> Iterator[_Shape]:
+    """What follows slowly on a signal that has either sign: heat, or a film, is driven by a power of its size."""
+    for exponent in _EXPONENTS:
+        for time in _TIMES_S:
+            yield "response", "even_power", reach, 0.0, exponent, time
 
 
 def made_effect(form: Form, name: str) -> Effect:
@@ -224,6 +232,7 @@ def equation(term: Term) -> str:
     x = term.signal.replace("_", " ")
     z = {
         "none": x,
+        "response": x,
         "lag": f"[{x} through a lag of {term.memory_scale:.3g} s]",
         "deficit": f"[what of {x} is still to come with {term.memory_scale:.3g} s, negative]",
         "slip": f"[slip of {x}, ±1 within {term.memory_scale:.3g} {own}]",
@@ -240,6 +249,8 @@ def equation(term: Term) -> str:
         "harmonic": f"cos and sin of {1.0 / term.scale:.4g} × {x}",
         "bump": f"exp(−[{u}]²)",
     }[term.shape]
+    if term.memory == "response":
+        shaped = f"lag of {term.memory_scale:.3g} s of {shaped}"
     gate = {"always": "", "load": " × F/F_max"}.get(term.gate, f", {term.gate}")
     size = f"{np.hypot(term.coefficient, term.sine):.3g}" if term.shape == "harmonic" else f"{term.coefficient:.3g}"
     if not term.coefficient and not term.sine:

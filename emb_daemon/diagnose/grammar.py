@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.forms import Form, made_effect
-from emb_daemon.diagnose.held_heat import follow_signals, record_heat
+from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     COARSE,
@@ -197,11 +197,10 @@ def _made(selection: Selection, channel: str) -> list[str]:
 def _signals(model: Model) -> list[np.ndarray] | None:
     """What terms see, by log; None where an angle lost its zero."""
     result = []
-    for trial in model.bench.trials:
-        parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
-        heat = record_heat(trial.log.samples, parameters)
+    for trial, heat in zip(model.bench.trials, model.heat, strict=True):
         if heat is None:
             return None
+        parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
         result.append(follow_signals(trial.log.samples, parameters, heat))
     return result
 
@@ -259,6 +258,8 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     worse = model.noise(channel) >= before.noise(channel)
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
         return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+    if not next(term for term in bench.calibrated(model.values).terms if term.name == name).is_bounded:
+        return selection.noted([replace(candidate, reason="fitted with everything else it is more than its port may bear")])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
     return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -55,6 +56,11 @@ class Model:
                 coordinates += effect_coordinates(bench.calibration, effect, channel).values()
         start = about_middle({c: c.start for c in coordinates}, bench.middle)
         return cls(bench, start, bench.residuals(start), centre=start)
+
+    @cached_property
+    def heat(self) -> list[np.ndarray | None]:
+        """Heat of each log (`held_heat.record_heat`): coordinates that stand at nothing do not change it."""
+        return self.bench.heat(self.values)
 
     def own(self, channel: str) -> list[Coordinate]:
         """What is fitted in a channel."""

@@ -178,7 +178,7 @@ def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
     own = [coordinate_of(index, channel, form, "coefficient", "")]
     if form.shape == "harmonic":
         own.append(coordinate_of(index, channel, form, "sine", ""))
-    return bench.regressors(model.values, [Probe(c) for c in own], model.residual)
+    return bench.regressors(model.values, [Probe(c) for c in own], model.residual, model.heat)
 
 
 def with_term(bench: Bench, term: Term) -> Bench:
@@ -227,7 +227,7 @@ def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
 def _record_of(form: Form) -> np.void:
     record = np.zeros(1, PARAMETERS)[0]
     fill_terms(record, (form.term(),))
-    record["term"][0]["coefficient"] = 1.0
+    record["term"][0]["coefficient"], record["term"][0]["limit"] = 1.0, np.inf
     return record["term"][0]
 
 

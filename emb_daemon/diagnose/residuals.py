@@ -238,21 +238,30 @@ class Bench:
             result["brake_torque"] = np.where(sliding, left, 0.0)
         return result
 
-    def regressors(self, values: Values, probes: Sequence["Probe"], at: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    def heat(self, values: Values) -> list[np.ndarray | None]:
+        """Heat of each log (`held_heat.record_heat`)."""
+        return list(self._map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
+
+    def regressors(
+        self,
+        values: Values,
+        probes: Sequence["Probe"],
+        at: Mapping[str, np.ndarray],
+        heat: Sequence[np.ndarray | None] = (),
+    ) -> list[np.ndarray]:
         """How the probed coordinates' own channels answer: minus the derivative of the residual.
 
-        Pads and disc stay as warm as they are at ``values`` while a coordinate of a force path moves: what a hundredth of the
-        force does to its own heat is a hundredth of a hundredth of it."""
-        heat: list = []
-        if any(probe.coordinate.channel in FORCE_CHANNELS for probe in probes):
-            heat = list(self._map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
+        Pads and disc stay as warm as they are at ``values`` (``heat``, if that is known) while a coordinate of a force path
+        moves: what a hundredth of the force does to its own heat is a hundredth of a hundredth of it."""
+        if not heat and any(probe.coordinate.channel in FORCE_CHANNELS for probe in probes):
+            heat = self.heat(values)
 
         def answer(probe: Probe) -> np.ndarray:
             coordinate, tried = probe.coordinate, {**values, **dict(probe.shape)}
             now = tried.get(coordinate, coordinate.start)
             step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
             tried[coordinate] = now + step
-            known = [] if coordinate.name == HISTORY_TIME else heat
+            known = () if coordinate.name == HISTORY_TIME else heat
             return (at[coordinate.channel] - self._probed(tried, coordinate.channel, known)) / step
 
         return list(self._map(answer, probes))

@@ -131,7 +131,8 @@ class Screening:
             for shape in shapes[effect.name][0]
             for p in effect.amplitudes
         ]
-        columns = dict(zip(probes, model.bench.regressors(model.values, probes, model.residual), strict=True))
+        columns = model.bench.regressors(model.values, probes, model.residual, model.heat)
+        columns = dict(zip(probes, columns, strict=True))
         found = [self._best(model, effect, *shapes[effect.name], columns) for effect in effects]
         chances = np.array([c.p_value for c in found] + [1.0] * (len(REGISTRY) - len(found)))
         return [replace(c, q_value=float(q)) for c, q in zip(found, false_discovery(chances), strict=False)]

@@ -42,8 +42,8 @@ SIGNALS = {
     "friction_power": "W",
 }
 #: What a term remembers of its signal x: nothing; z of τ dz/dt + z = x; z − x, what is still to come; a Maxwell slip element
-#: of stretch ``memory_scale``, z in [-1, 1].
-MEMORIES = ("none", "lag", "deficit", "slip")
+#: of stretch ``memory_scale``, z in [-1, 1]; a response: the same lag of what the shape makes of x.
+MEMORIES = ("none", "lag", "deficit", "slip", "response")
 #: Of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
 SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset", "harmonic", "bump")
 #: When a term acts; ``load`` multiplies it by the clamp force over the largest.
@@ -51,7 +51,7 @@ GATES = ("always", "load", "closing", "opening", "turning", "standing")
 
 (_ANGLE, _TRAVEL, _SPEED, _FORCE, _RATE, _CURRENT, _PADS, _DISC, _CALIPER, _WHEEL, _BRAKE, _ENERGY, _CLAMPED, _RELEASED,
  _WINDING, _HOUSING, _SURFACE, _POWER) = range(len(SIGNALS))  # fmt: skip
-_NONE, _LAG, _DEFICIT, _SLIP = range(len(MEMORIES))
+_NONE, _LAG, _DEFICIT, _SLIP, _RESPONSE = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 _THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE = range(4)
@@ -62,7 +62,7 @@ CLAMPED_N, TURNING_RAD_PER_S = 150.0, 0.5
 TERM = np.dtype(
     [
         *fields("i8", "port signal memory shape gate"),
-        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high"),
+        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit"),
     ],
     align=True,
 )
@@ -106,7 +106,7 @@ def _follow(signal, s, m):
 
 @njit
 def _remembered(q, t, k, x, dt):
-    """What term ``k`` makes of its signal's history."""
+    """What term ``k`` makes of the history of ``x``."""
     if q.memory == _NONE:
         return x
     if t.begun[k] == 0:
@@ -162,9 +162,14 @@ def _value(q, t, k, dt, maximum_force):
     x = t.signal[q.signal]
     if not np.isfinite(x):
         return 0.0
-    z = _remembered(q, t, k, min(max(x, q.low), q.high), dt)
-    shaped = _shaped(q, z) * _gate(q, t.signal, maximum_force)
-    return shaped if q.shape == _HARMONIC else q.coefficient * shaped
+    x = min(max(x, q.low), q.high)
+    if q.memory == _RESPONSE:
+        shaped = _remembered(q, t, k, _shaped(q, x), dt)
+    else:
+        shaped = _shaped(q, _remembered(q, t, k, x, dt))
+    shaped *= _gate(q, t.signal, maximum_force)
+    added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
+    return min(max(added, -q.limit), q.limit)
 
 
 @njit
@@ -203,7 +208,9 @@ def look(e, s, p, m):
 @njit
 def _follow_all(e, t, signals, dt, maximum_force, values):
     for row in range(len(signals)):
-        t.signal[:] = signals[row]
+        # Its own, and those that gates look at.
+        for which in (e.signal, _FORCE, _SPEED, _WHEEL):
+            t.signal[which] = signals[row, which]
         values[row] = _value(e, t, 0, dt[row], maximum_force)
 
 
