@@ -104,8 +104,9 @@ def test_a_name_of_somebody_else_that_leads_here_gets_nothing(web):
 def test_a_taken_port_is_told(web, capsys):
     assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--web", str(web.port)]) == 1
     assert capsys.readouterr().err == f"--web {web.port}: Address already in use\n"
-    assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--udp", "nowhere"]) == 2
-    assert "expected HOST:PORT" in capsys.readouterr().err
+    for nowhere in ("nowhere", "127.0.0.1:65536"):
+        assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--udp", nowhere]) == 2
+        assert "expected HOST:PORT" in capsys.readouterr().err
 
 
 @contextlib.contextmanager

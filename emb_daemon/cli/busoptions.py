@@ -32,6 +32,14 @@ def _can_id(text: str) -> int:
     return value
 
 
+def host_and_port(option: str, text: str) -> tuple[str, int]:
+    """Of HOST:PORT, as ``option`` has it; raises InputError of anything else."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 0xFFFF:
+        raise InputError(f"{option} {text}: expected HOST:PORT, such as 127.0.0.1:5555")
+    return host, int(port)
+
+
 def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
     """Raises InputError if an id of `add_id_arguments` is not the server's alone."""
     for name in ("request_id", "response_id"):

@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.busoptions import add_bus_arguments, bus_options, host_and_port
 from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.errors import InputError
@@ -79,10 +79,7 @@ def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
 
     receivers, stopped = [], []
     if arguments.udp is not None:
-        host, _, port = arguments.udp.rpartition(":")
-        if not host or not port.isdecimal():
-            raise InputError(f"--udp {arguments.udp}: expected HOST:PORT, such as 127.0.0.1:9870")
-        receivers.append(Datagrams(host, int(port)))
+        receivers.append(Datagrams(*host_and_port("--udp", arguments.udp)))
     if arguments.web is not None:
         receivers.append(Web(arguments.web, title))
         print(f"http://127.0.0.1:{receivers[-1].port}/", flush=True)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments
+from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, host_and_port
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
@@ -39,13 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _udp(text: str):
-    from emb_daemon.errors import InputError
     from emb_daemon.workshop.measure import Udp
 
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 0xFFFF:
-        raise InputError(f"--udp {text}: expected HOST:PORT, such as 127.0.0.1:5555")
-    transport = Udp(host, int(port))
+    host, port = host_and_port("--udp", text)
+    transport = Udp(host, port)
     return transport, f"UDP {host}:{transport.port}"
 
 
