@@ -34,7 +34,7 @@ SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
 _STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. For that the motor has to stand
-#: for twice the longest delay that the effect `signal_delay` may have, s.
+#: for twice the longest delay of a resolver that a calibration may state, s.
 _AT_REST_S = 0.1
 #: Of a standstill no more than this counts before the next way, s: the speed's offset makes a fifth of `_ZERO_RAD` in it.
 _STOOD_S = 1.0
