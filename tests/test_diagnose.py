@@ -410,6 +410,8 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkey
     monkeypatch.setattr(calibration_terms, "_FACTOR", 1e-3)
     refused = grammar._enter(selection, candidate, side).candidates[effect.name]
     assert not refused.accepted and "port may bear" in refused.reason
+    withdrawn = confirmation.confirm(right, None)[0].candidates[right.accepted[0]]
+    assert not withdrawn.accepted and "port may bear" in withdrawn.reason
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):

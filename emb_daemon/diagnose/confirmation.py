@@ -15,7 +15,7 @@ from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import UNITS, Bench
-from emb_daemon.diagnose.selection import Selection
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
@@ -35,6 +35,8 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
     bench = selection.model.bench
     before, main = errors(bench, bench.calibration), whole(bench)
     while True:
+        for name in _beyond_bounds(selection):
+            selection = selection.without(name, TOO_LARGE)
         after = left_out_errors(selection)
         worse = harm(before, after, main, {selection.channel_of(suspect) for suspect in selection.suspects})
         if worse and selection.suspects:
@@ -44,6 +46,12 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
             selection = selection.without(*veto)
         else:
             return selection, after
+
+
+def _beyond_bounds(selection: Selection) -> list[str]:
+    """Accepted terms that the last fit has made larger than a calibration may hold."""
+    fitted = selection.model.bench.calibrated(selection.applied())
+    return [term.name for term in fitted.terms if term.name in selection.accepted and not term.is_bounded]
 
 
 def left_out_errors(selection: Selection, without: str = "") -> EpisodeErrors:

@@ -28,7 +28,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import LASTING, Selection, find_known, one_round
+from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.terms import MOST, SIGNALS
@@ -259,7 +259,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
         return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
     if not next(term for term in bench.calibrated(model.values).terms if term.name == name).is_bounded:
-        return selection.noted([replace(candidate, reason="fitted with everything else it is more than its port may bear")])
+        return selection.noted([replace(candidate, reason=TOO_LARGE)])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
     return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])

@@ -31,6 +31,8 @@ _UNSURE, _LARGE = 0.05, 0.25
 #: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
 #: noise states (`noise.presliding`); on simulated brakes with nothing hidden it alone brought false terms of 70 to 120 N.
 LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32}
+#: Why a term goes that a calibration may not hold.
+TOO_LARGE = "fitted with everything else it is more than its port may bear"
 
 Progress = Callable[[str, float], None]
 
