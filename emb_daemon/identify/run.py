@@ -12,7 +12,7 @@ from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
-from emb_daemon.identify.validation import Validation, validate, validate_others
+from emb_daemon.identify.validation import Validation, validate, validate_others, why_worse
 
 Progress = Callable[[float, str], None]
 
@@ -84,6 +84,8 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
         there = moved(found.without(fold), mine.values)
         validations += [validate(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
+    for fault in why_worse(validations):
+        campaign.fault(fault)
     steps = (stiff, motor, heat, found)
     calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat))
     progress(1.0, "done")

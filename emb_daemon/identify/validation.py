@@ -16,6 +16,9 @@ from emb_daemon.offline.score import PATHS, force_figures
 from emb_daemon.report.figures import BAND, MODEL, PALE, REFERENCE, Panel, Trace, time_figure
 from emb_daemon.report.page import Page
 
+#: Share of the errors inside two sigma, 95 % of normal ones, below which sigma is too small: errors of several per cent of the
+#: samples last, and no more of them are chance.
+_LEAST_INSIDE = 0.9
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 
 
@@ -89,6 +92,16 @@ def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessS
         if log is not None:
             found.append(validate(f"integrated, {stem(pair.judge)}", "integrated", log, ours))
     return found
+
+
+def why_worse(validations: list[Validation]) -> list[str]:
+    """A line for each log that shows the calibration to be worse than it says."""
+    return [
+        f"{one.name}: {100 * share:.0f} % of the errors inside two sigma, expected {100 * _LEAST_INSIDE:.0f} % or more: the "
+        "calibration is worse than it says"
+        for one in validations
+        if (share := one.figures["inside_two_sigma"]) < _LEAST_INSIDE
+    ]
 
 
 #: Columns of `rows`.
