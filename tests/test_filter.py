@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from emb_daemon.estimator.hypotheses import to_force, to_torque
+from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import add_growth, add_stiffness_jumps, add_torque_jumps, set_priors, set_walks
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -70,7 +71,7 @@ def test_covariance_stays_symmetric_and_positive_over_long_random_input(paramete
     add_stiffness_jumps(P, p)
     add_torque_jumps(P, p)
     for number in range(20_000):
-        set_walks(walked, p, x, rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0), rng.uniform(0.0, 0.2), 0.004)
+        set_walks(walked, p, x, P, *rng.uniform(0.0, 1.0, 2), rng.uniform(0.0, 0.2), rng.uniform(0.0, 1e5), 0.004)
         predict_errors(x, P, rng.uniform(0.9, 1.0), rng.uniform(0.3, 1.0), 3e-4, walked)
         force = rng.uniform(0.0, 3e4)
         heats = rng.uniform(0.0, 1.0, 2)
@@ -116,7 +117,7 @@ def test_filter_is_consistent_on_data_of_its_own_model(parameters):
                 (step / 1e3, step / 4e3),
             )
             to_f, h = _sensitivities(p, *arguments)
-            set_walks(walked, p, np.zeros(STATES), step / 1e3, step / 4e3, 0.0, 0.004)
+            set_walks(walked, p, np.zeros(STATES), P, step / 1e3, step / 4e3, 0.0, 2e4, 0.004)
             truth[FAST], truth[NOISE] = decay * truth[FAST], noise_decay * truth[NOISE]
             drive = walked.copy()
             drive[FAST], drive[NOISE] = 1.0 - decay**2, (1.0 - noise_decay**2) * noise
@@ -175,7 +176,7 @@ def test_an_error_of_each_kind_is_found_from_strokes(parameters, name):
         motor = (p["gear_gain"] + p["load_friction"] * friction) * force + inertia + p["offset_friction"] * friction
         slope = (0.15 * force + 250.0) * (force > 0.0)
         _, h = _sensitivities(p, force, slope, speed, inertia, motor, friction, 0.0, (0.0, 0.0))
-        set_walks(walked, p, x, 0.0, 0.0, 0.0, 0.004)
+        set_walks(walked, p, x, P, 0.0, 0.0, 0.0, 0.0, 0.004)
         predict_errors(x, P, decay, noise_decay, variance, walked)
         innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x
         _update(x, P, gain, innovation, h, variance)
@@ -200,6 +201,26 @@ def test_sigma_grows_while_the_torque_path_is_missing(parameters):
     assert np.all(without["stiffness_sigma"][turning] > with_torque["stiffness_sigma"][turning])
     same_place = without["sigma"][500::126]
     assert np.all(np.diff(same_place[:4]) > 0.0)
+
+
+def test_friction_energy_leaves_the_contact_angle_open(parameters):
+    """A third of a MJ with nothing to see the contact angle by: wear and growth move it by micrometres per MJ, and by nothing
+    where the disc stands."""
+    p = brake.ideal(parameters)
+    rows, _ = brake.samples(p, np.concatenate([brake.clamp(p, 12.0, 1.0), np.full(1000, p["clearance"] + 12.0)]))
+    rows["has_current"][250:] = False
+    grown_m, energy_J = [], []
+    for speed in (0.0, 80.0):
+        rows["wheel_speed"] = speed
+        state = new_state()
+        estimate(rows[:250], p, state)
+        before = state["covariance"][0, CONTACT, CONTACT]
+        estimate(rows[250:], p, state)
+        grown_m.append(p["gear_gain"] * np.sqrt(state["covariance"][0, CONTACT, CONTACT] - before))
+        energy_J.append(4.0 * state["power"][0])
+    assert energy_J[0] == 0.0 and energy_J[1] > 2e5
+    assert grown_m[0] < 0.05e-6
+    assert 0.5e-6 < grown_m[1] < 5e-6
 
 
 def test_force_of_an_ideal_brake_is_found_within_its_sigma(parameters):

@@ -132,7 +132,7 @@ def _predict(s, p, m, spread, warmth, known):
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = s.sensitivity[1]
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
-    set_walks(walked, p, s.error, s.winding, s.housing, softening, m.dt)
+    set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
     # What has just become uncertain of the pads' heat is uncertain of the stiffness from now on.
     walked[SCALE] += max(softening - s.softening, 0.0) * (softening + s.softening)
     s.softening = softening

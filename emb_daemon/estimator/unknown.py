@@ -30,6 +30,10 @@ from emb_daemon.models.fusion import (
 _CONTACT_JUMP_M = 40e-6
 #: Contact angle from one parking to the next start: pads settle by some micrometres, m.
 _SETTLED_M = 5e-6
+#: Contact angle by friction energy: pads wear (linings of 0.03 to 0.1 mm^3 per kJ and some 5000 mm^2: 5 to 20 um/MJ) and discs
+#: grow by some 5 um/MJ more or less than a calibration knows, and by another amount in the next stop of some 60 kJ:
+#: sqrt(2 (5 um/MJ)^2 0.06 MJ) per root of a MJ, m per root of a J.
+_WORN_M_PER_SQRT_J = 1.7e-9
 #: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
@@ -137,13 +141,14 @@ def set_priors(P, p):
 
 
 @njit
-def set_walks(walked, p, x, winding, housing, softening, dt):
-    """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors, ``winding`` and ``housing`` heat,
-    ``softening`` what of the stiffness the pads' unknown temperature leaves open."""
-    faded = abs(x[FADE]) * winding + abs(x[HOUSING]) * housing + _FADE * (winding + housing)
+def set_walks(walked, p, x, P, winding, housing, softening, power, dt):
+    """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors and ``P`` their covariance, ``winding`` and
+    ``housing`` heat, ``softening`` what of the stiffness the pads' unknown temperature leaves open; ``power`` of friction, W."""
+    # What the lags miss is a share of what heat does, not of what it might have done before driving showed it.
+    faded = (x[FADE] ** 2 + P[FADE, FADE]) * winding**2 + (x[HOUSING] ** 2 + P[HOUSING, HOUSING]) * housing**2
     walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = walked[SLOW] = 0.0
-    walked[CONTACT] = p.contact_walk * p.contact_walk * dt
-    walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + (_MISSED * faded) ** 2 / _MISSED_S) * dt
+    walked[CONTACT] = p.contact_walk**2 * dt + (_WORN_M_PER_SQRT_J / p.gear_gain) ** 2 * power * dt
+    walked[GAIN] = (_GAIN_WALK_PER_SQRT_S**2 + _MISSED**2 * faded / _MISSED_S) * dt
     walked[OFFSET] = torque_offset(p) ** 2 * dt / _OFFSET_DRIFTS_S
     walked[SCALE] = ((0.1 * _SCALE_WALK_PER_SQRT_S) ** 2 + 2.0 * softening * softening / _HEAT_CHANGES_S) * dt
     walked[LOAD] = (_FRICTION_WALK_PER_SQRT_S * p.load_friction) ** 2 * dt
