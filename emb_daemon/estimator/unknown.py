@@ -143,7 +143,7 @@ def set_priors(P, p):
 @njit
 def set_walks(walked, p, x, P, winding, housing, softening, power, dt):
     """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors and ``P`` their covariance, ``winding`` and
-    ``housing`` heat, ``softening`` what of the stiffness the pads' unknown temperature leaves open; ``power`` of friction, W."""
+    ``housing`` heat, ``softening`` what of stiffness the pads' unknown temperature leaves open, W of friction ``power``."""
     # What the lags miss is a share of what heat does, not of what it might have done before driving showed it.
     faded = (x[FADE] ** 2 + P[FADE, FADE]) * winding**2 + (x[HOUSING] ** 2 + P[HOUSING, HOUSING]) * housing**2
     walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = walked[SLOW] = 0.0
