@@ -31,9 +31,9 @@ _CONTACT_JUMP_M = 40e-6
 #: Contact angle from one parking to the next start: pads settle by some micrometres, m.
 _SETTLED_M = 5e-6
 #: Contact angle by friction energy: pads wear (linings of 0.03 to 0.1 mm^3 per kJ and some 5000 mm^2: 5 to 20 um/MJ) and discs
-#: grow by some 5 um/MJ more or less than a calibration knows, and by another amount in the next stop of some 60 kJ:
-#: sqrt(2 (5 um/MJ)^2 0.06 MJ) per root of a MJ, m per root of a J.
-_WORN_M_PER_SQRT_J = 1.7e-9
+#: grow by some 3 um/MJ more or less than a calibration knows, and by another amount in the next stop of some 60 kJ:
+#: sqrt(2 (3 um/MJ)^2 0.06 MJ) per root of a MJ, m per root of a J.
+_WORN_M_PER_SQRT_J = 1.0e-9
 #: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
 _SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
