@@ -742,6 +742,6 @@ def test_a_path_that_is_no_number_any_more_has_got_worse():
     errors = {"fused": np.full(400, 10.0), "torque": np.full(400, 10.0)}
     before = EpisodeErrors.of(errors, {}, episode)
     lost = errors | {"torque": np.where(episode > 1, np.nan, 1.0)}
-    assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused", {"torque"})
+    assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused")
     better = errors | {"torque": np.full(400, 1.0)}
-    assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused", {"torque"})
+    assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused")

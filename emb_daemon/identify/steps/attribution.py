@@ -4,8 +4,8 @@ Known effects first, then terms of the grammar. What is accepted stands in the c
 sigma.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from msgspec.structs import replace
@@ -14,11 +14,12 @@ from emb_daemon.calibration.parameters import CLEARANCE, moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
-from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, with_terms
+from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, undecided, with_terms
 from emb_daemon.diagnose.page import sections
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.selection import Progress
 from emb_daemon.diagnose.text import verdict
+from emb_daemon.estimator.heat import TOUCHING_N
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
@@ -35,11 +36,15 @@ class AttributionStep(Step):
         calibration: with what was accepted.
         diagnosis: the search; None where nothing moves at random or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
+        fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
+        undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
     """
 
     calibration: Calibration
     diagnosis: Diagnosis | None = None
     hot: tuple[Errors, ...] = ()
+    fastest_rad_per_s: float = 0.0
+    undecided: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, fold: Fold) -> Calibration:
         """What is known of a fold's pads without their random logs: found effects, and the torque path, by other pads' logs.
@@ -91,6 +96,8 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
         calibration=calibration,
         diagnosis=found,
         hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
+        fastest_rad_per_s=_fastest(hot),
+        undecided=undecided(found.selection),
     )
 
 
@@ -100,7 +107,13 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
         return AttributionStep(calibration=known)
     bench = Bench(hot, known, own_data=True)
     residual = bench.residuals({})["stiffness"]
-    return AttributionStep(calibration=known, hot=tuple(_errors(bench, residual, index) for index in range(len(hot))))
+    left = tuple(_errors(bench, residual, index) for index in range(len(hot)))
+    return AttributionStep(calibration=known, hot=left, fastest_rad_per_s=_fastest(hot))
+
+
+def _fastest(logs: Sequence[Log]) -> float:
+    """Speed of the motor in the hardest clamp of logs, rad/s."""
+    return max((float(np.max(log.samples["speed"], initial=0.0, where=log.force_N > TOUCHING_N)) for log in logs), default=0.0)
 
 
 def words(step: AttributionStep) -> str:
