@@ -11,6 +11,7 @@ another drive; printed are its errors, what the calibration says of itself, and 
 import argparse
 import contextlib
 import io
+import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -197,14 +198,17 @@ def judge(calibration: Calibration, path: Path) -> dict[str, float]:
 def run(seed: int, folder: Path) -> str:
     """One line: the brake, what it hides, what was named, and the errors."""
     stranger = draw_stranger(seed)
+    hidden = {name: {key: round(value, 6) for key, value in values.items()} for name, values in stranger.effects.items()}
+    head = f"seed {seed}: {stranger.calibration.stiffness.maximum_force_N:.0f} N, hides {hidden}"
+    print(f"{head}\n  recording", file=sys.stderr, flush=True)
     campaign = record(stranger, seed, folder)
+    print("  identifying", file=sys.stderr, flush=True)
     begin, said = time.monotonic(), io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         status = emb_daemon(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "r")])
     seconds = time.monotonic() - begin
     (folder / "said.txt").write_text(said.getvalue())
-    hidden = {name: {key: round(value, 6) for key, value in values.items()} for name, values in stranger.effects.items()}
-    head = f"seed {seed}: {stranger.calibration.stiffness.maximum_force_N:.0f} N, hides {hidden}"
+    print(f"  judging, identified in {seconds:.0f} s, status {status}", file=sys.stderr, flush=True)
     if status not in (0, 3):
         return f"{head}\n  identify ended with {status}: {said.getvalue().strip().splitlines()[-1]}"
     calibration = load_calibration(folder / "c.yaml")

@@ -139,6 +139,18 @@ def test_current_noise_tells_what_is_coloured_from_a_difference_of_noisy_speeds(
     assert (sigma, time) == pytest.approx((0.3, 0.02), rel=0.1)
 
 
+def test_what_stays_for_a_manoeuvre_is_in_the_noise_of_the_current():
+    """The density at the slow end, 2 sigma^2 time: what lasts adds its own to it, and nothing is added where nothing does."""
+    plain = _coloured(np.random.default_rng(3), 60_000, 0.3, 0.02)
+    stays = np.repeat(np.random.default_rng(4).normal(0.0, 0.2, 240), 250)
+    sigma, time = noise._with_what_lasts([plain], 0.3, 0.02)
+    assert sigma**2 * time == pytest.approx(0.3**2 * 0.02, rel=0.15)
+    sigma, time = noise._with_what_lasts([plain + stays], 0.3, 0.02)
+    assert sigma == pytest.approx(np.hypot(0.3, 0.2), rel=0.03)
+    assert sigma**2 * time == pytest.approx(0.3**2 * 0.02 + 0.2**2 * 1.0, rel=0.2)
+    assert noise._with_what_lasts([plain[:100]], 0.3, 0.02) == (0.3, 0.02)
+
+
 def test_force_error_levels_tell_floor_from_relative_part():
     rng = np.random.default_rng(23)
     force = rng.uniform(0.0, 20e3, 60_000)
