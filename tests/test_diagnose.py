@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -38,6 +39,7 @@ from emb_daemon.diagnose.unexplained import Left, achieved
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
+from emb_daemon.identify.steps import attribution
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
@@ -538,6 +540,17 @@ def test_a_term_is_made_for_what_no_catalogue_holds(calibration, coupled, tmp_pa
     assert result.unexplained is None
     assert "brake torque" in verdict(result) and "what it does" in page(result)
     assert errors(Bench(logs[1:], calibration), loaded).rmse("fused") == result.after.rmse("fused")
+
+
+def test_a_contact_that_what_was_found_has_moved_is_as_unsure_as_that(calibration):
+    """Logs of curves have found their own contact; of a drive, whose contact the fit of a term has moved, it is not known."""
+    start = calibration.contact.clearance_rad
+    coordinates = base_coordinates(calibration, [start + 1.0, start])[:2]
+    fitted = dict(zip(coordinates, (start + 1.0, start + 0.3), strict=True))
+    found = attribution._contact(SimpleNamespace(applied=lambda: fitted), calibration, 1)
+    assert found.clearance_rad == start
+    assert found.clearance_sigma_rad == pytest.approx(np.hypot(calibration.contact.clearance_sigma_rad, 0.3))
+    assert attribution._contact(SimpleNamespace(applied=dict), calibration, 1) == calibration.contact
 
 
 @pytest.mark.parametrize(("port", "taken"), [("stiffness", True), ("thickness", False)])

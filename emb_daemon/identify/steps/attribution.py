@@ -108,7 +108,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
 
 
 def _contact(selection: Selection, known: Calibration, drives: int) -> Contact:
-    """The contact as known, as unsure as the fit of what was found leaves it: by how much it has moved the contact of logs from
+    """The contact as known, and as unsure as the fit of what was found leaves it: by how much it moves that of logs from
     number ``drives`` on, which fitted no curve and start from what is known."""
     clearances = [value for c, value in selection.applied().items() if c.name == CLEARANCE and c.log >= drives]
     off = [clearance - known.contact.clearance_rad for clearance in clearances]
