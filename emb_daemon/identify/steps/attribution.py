@@ -38,7 +38,7 @@ class AttributionStep(Step):
 
     Attributes:
         calibration: with what was accepted.
-        diagnosis: the search; None where nothing moves at random or the logs are too short for one.
+        diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
         fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
         undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
