@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.fields import Positive, Struct
+from emb_daemon.calibration.types import CONSTANT_GEAR, Travel
 from emb_daemon.wire.contract import PULSES_PER_TURN
 
 #: Relative tolerance of a datasheet's values where it states none: two standard deviations.
@@ -104,8 +105,11 @@ class CampaignFile(Struct, kw_only=True):
 class Actuator(Struct, kw_only=True):
     """Motor, gear and screw."""
 
-    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact.
+    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact. With `travel`, a
+    #: mean of it.
     gear_gain_m_per_rad: Positive
+    #: Of a gear that is not constant; likewise taken as exact.
+    travel: Travel = CONSTANT_GEAR
     #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
     #: Share, two standard deviations.

@@ -1,0 +1,118 @@
+"""A gear that is not constant: travel over angle from a table, seen by pads, torque, plant and identification."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration, Travel, to_parameters
+from emb_daemon.errors import InvalidValue
+from emb_daemon.logs.write import write_frames
+from emb_daemon.models.gear import all_through_gear, back_through_gear, steepest, through_gear
+from emb_daemon.offline import estimate, load_log
+from emb_daemon.plant import scenarios as sc
+from emb_daemon.plant.brake import motor_angle, turned
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.resources import resource
+
+replace = msgspec.structs.replace
+
+
+def ramp(calibration: Calibration, points: int = 13) -> Calibration:
+    """A ball ramp: twice as steep in the clearance as under full force."""
+    angle = np.linspace(0.0, 45.0, points)
+    travel = 1e3 * calibration.motor.gear_gain_m_per_rad * (0.75 * angle + 0.75 * 12.0 * (1.0 - np.exp(-angle / 12.0)))
+    table = Travel(angle_rad=tuple(angle.tolist()), travel_mm=tuple(travel.tolist()))
+    return replace(calibration, motor=replace(calibration.motor, travel=table))
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Calibration:
+    return load_calibration(resource("config/calibration.yaml"))
+
+
+@pytest.fixture(scope="module")
+def drive(shipped, tmp_path_factory):
+    """A log of the ramp's brake, random angles and a park on the latch, and its truth."""
+    plant = plant_from_calibration(ramp(shipped, 121), seed=4)
+    parked = sc.park(9000.0, 4.0).first(2.5) + sc.rest(1.0)
+    schedule = sc.rest(1.0) + sc.random_angle(plant, 12.0, np.random.default_rng(1)) + parked
+    frames, truth = sc.simulate_log(plant, schedule, seed=2)
+    path = tmp_path_factory.mktemp("gear") / "drive.log"
+    write_frames(path, frames)
+    return load_log(path), truth
+
+
+def test_the_table_is_met_at_its_points_and_rises_between(shipped):
+    motor = ramp(shipped).motor
+    gear, angle = motor.gear(), np.array(motor.travel.angle_rad)
+    turned_rad, _ = all_through_gear(gear, angle)
+    assert turned_rad == pytest.approx(1e-3 * np.array(motor.travel.travel_mm) / motor.gear_gain_m_per_rad, abs=2e-3)
+    fine = np.linspace(-5.0, 55.0, 2000)
+    turned_rad, slopes = all_through_gear(gear, fine)
+    assert np.all(slopes > 0.0) and np.gradient(turned_rad, fine)[1:-1] == pytest.approx(slopes[1:-1], rel=2e-3)
+    # The slope of the ramp itself, from a dozen points.
+    inside = (fine >= 0.0) & (fine <= 45.0)
+    assert slopes[inside] == pytest.approx(0.75 * (1.0 + np.exp(-fine[inside] / 12.0)), rel=0.02)
+    assert [back_through_gear(gear, x) for x in turned_rad] == pytest.approx(fine, abs=1e-6)
+    assert steepest(gear) == pytest.approx((slopes.min(), slopes.max()), rel=1e-3)
+
+
+def test_a_constant_gear_is_told_to_the_bit_by_its_angle(shipped):
+    gear = shipped.motor.gear()
+    assert through_gear(gear, 0.1 + 0.2) == (0.1 + 0.2, 1.0) and back_through_gear(gear, 0.7) == 0.7 and gear["step"] == 0.0
+
+
+def test_a_straight_table_is_a_constant_gear(shipped, drive):
+    angle = (0.0, 10.0, 30.0, 60.0)
+    mm = tuple(1e3 * shipped.motor.gear_gain_m_per_rad * a for a in angle)
+    straight = replace(shipped, motor=replace(shipped.motor, travel=Travel(angle_rad=angle, travel_mm=mm)))
+    log, _ = drive
+    constant, table = (estimate(log.samples, to_parameters(c)) for c in (shipped, straight))
+    for name in ("force", "sigma", "torque_force", "contact_angle", "contact_sigma"):
+        assert table[name] == pytest.approx(constant[name], rel=1e-6, abs=1e-4, nan_ok=True), name
+
+
+def test_the_estimate_follows_a_ramp_by_its_datasheet(shipped, drive):
+    log, truth = drive
+    found = estimate(log.samples, to_parameters(ramp(shipped)))
+    error = found["force"] - log.force_N
+    assert np.sqrt(np.mean(error**2)) < 0.003 * shipped.stiffness.maximum_force_N
+    assert np.mean(np.abs(error) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
+    # Torque alone, in contact: the ramp's slope moves by a third there, and a constant gear would be wrong by as much.
+    loaded = np.isfinite(found["torque_force"]) & (log.force_N > 5000.0)
+    for calibration, least, most in ((ramp(shipped), 0.97, 1.03), (shipped, 0.0, 0.92)):
+        force = estimate(log.samples, to_parameters(moved(calibration, {})))["torque_force"][loaded]
+        share = np.sum(force * log.force_N[loaded]) / np.sum(log.force_N[loaded] ** 2)
+        assert least < share < most
+    assert found["contact_angle"][-1] == pytest.approx(truth["contact_angle"][-1, 0], abs=0.1)
+
+
+def test_the_brakes_motor_finds_its_way_back_through_the_gear(shipped):
+    plant = plant_from_calibration(ramp(shipped))
+    for x in (0.5, 7.0, 20.0, 33.0):
+        assert turned(plant, motor_angle(plant, x)) == pytest.approx(x, rel=1e-9)
+    assert sc.angle_at(plant, 10e3) != pytest.approx(sc.angle_at(plant_from_calibration(shipped), 10e3), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("angle", "mm", "says"),
+    [
+        ((0.0, 10.0, 10.0, 60.0), (0.0, 0.4, 0.8, 2.4), r"angle_rad\[2\]: 10 after 10"),
+        ((0.0, 10.0, 20.0, 60.0), (0.0, 0.4, 0.3, 2.4), r"travel_mm\[2\]: 0.3 after 0.4"),
+        ((1.0, 10.0, 20.0), (0.0, 0.4, 0.8), "angle_rad: expected the released position"),
+        ((0.0, 10.0), (0.0, 0.4), "three points"),
+        ((0.0, 10.0, 20.0), (0.0, 0.4), "3 angle_rad and 2 travel_mm"),
+        ((0.0, 10.0, 60.0), (0.0, 4.0, 24.0), "gear_gain_m_per_rad: 3.98e-05 is no mean of travel"),
+        ((0.0, 10.0, 20.0), (0.0, 0.398, 0.796), "motor.travel: ends at 0.796 mm; clearance and the largest force"),
+    ],
+)
+def test_a_table_that_is_none_is_refused_in_words(shipped, angle, mm, says):
+    with pytest.raises(InvalidValue, match=says):
+        travel = Travel(angle_rad=angle, travel_mm=mm)
+        data = msgspec.to_builtins(replace(shipped, motor=replace(shipped.motor, travel=travel)))
+        try:
+            msgspec.convert(data, Calibration)
+        except msgspec.ValidationError as error:
+            raise InvalidValue(str(error)) from None
