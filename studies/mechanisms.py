@@ -1,11 +1,11 @@
-"""Brakes of another mechanism: gears that are not constant, drives at their current's limit, latches.
+"""Brakes of another mechanism: gears that are not constant, drives at their current's limit, latches, release springs.
 
     python -m studies.mechanisms --seeds 0 1 2 3 [--kept DIR]
 
 Four brakes, of which each seed draws one: a ball ramp on a weak drive (12 V: slow, and limited to little more than the
 current of the largest force), a cam on a fast one (400 V), a roller ramp that a latch holds without current in the drive that
-judges, and the same latch on a screw. The datasheet states travel over angle at a dozen points, to the micrometre; the
-brake follows the curve itself. Recorded, identified and judged like `studies.strangers`.
+judges, and a screw with such a latch and a spring that helps release. The datasheet states travel over angle at a dozen
+points, to the micrometre; the brake follows the curve itself. Recorded, identified and judged like `studies.strangers`.
 """
 
 import msgspec
@@ -67,9 +67,14 @@ def draw_mechanism(seed: int) -> Stranger:
     motor = calibration.motor
     faster = (rng.uniform(0.5, 0.7), rng.uniform(1.5, 2.0), 1.0, 1.0)[kind]
     motor = msgspec.structs.replace(motor, maximum_speed_rad_per_s=faster * motor.maximum_speed_rad_per_s)
+    if kind == 3:
+        # At full clamp a tenth of the force or so, several times the friction of the open brake.
+        full_mm = 25e3 * motor.gear_gain_m_per_rad
+        spring = calibration.stiffness.maximum_force_N / full_mm * rng.uniform(0.08, 0.15)
+        motor = msgspec.structs.replace(motor, release_spring_N_per_mm=round(spring, 1))
     calibration = msgspec.structs.replace(calibration, motor=motor)
     table = motor.travel
-    sheet = {}
+    sheet = {"release_spring_N_per_mm": motor.release_spring_N_per_mm}
     if table.angle_rad:
         travel = {"angle_rad": [round(a, 4) for a in table.angle_rad], "travel_mm": [round(mm, 3) for mm in table.travel_mm]}
         sheet["travel"] = {name: values[::_EVERY] for name, values in travel.items()}

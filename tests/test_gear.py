@@ -3,18 +3,25 @@
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, Travel, to_parameters
 from emb_daemon.errors import InvalidValue
+from emb_daemon.identify.calibration import nominal
+from emb_daemon.identify.campaign_file import Datasheet
+from emb_daemon.identify.dynamics import Pads, fit_dynamics, starting_point
+from emb_daemon.identify.example import FILES
+from emb_daemon.identify.steps.torque import TORQUE_CONSTANT, fit_torque
 from emb_daemon.logs.write import write_frames
 from emb_daemon.models.gear import all_through_gear, back_through_gear, steepest, through_gear
+from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.brake import motor_angle, turned
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_S
 
 replace = msgspec.structs.replace
 
@@ -32,16 +39,27 @@ def shipped() -> Calibration:
     return load_calibration(resource("config/calibration.yaml"))
 
 
-@pytest.fixture(scope="module")
-def drive(shipped, tmp_path_factory):
-    """A log of the ramp's brake, random angles and a park on the latch, and its truth."""
-    plant = plant_from_calibration(ramp(shipped, 121), seed=4)
+def record(calibration: Calibration, path):
+    """A log of a brake, random angles and a part of a park, and its truth."""
+    plant = plant_from_calibration(calibration, seed=4)
     parked = sc.park(9000.0, 4.0).first(2.5) + sc.rest(1.0)
     schedule = sc.rest(1.0) + sc.random_angle(plant, 12.0, np.random.default_rng(1)) + parked
     frames, truth = sc.simulate_log(plant, schedule, seed=2)
-    path = tmp_path_factory.mktemp("gear") / "drive.log"
     write_frames(path, frames)
     return load_log(path), truth
+
+
+@pytest.fixture(scope="module")
+def drive(shipped, tmp_path_factory):
+    """`record` of the ramp's brake."""
+    return record(ramp(shipped, 121), tmp_path_factory.mktemp("gear") / "drive.log")
+
+
+def torque_over_force(log, calibration: Calibration) -> float:
+    """What the torque path makes of the force, in contact, over what it is."""
+    found = estimate(log.samples, to_parameters(calibration))["torque_force"]
+    loaded = np.isfinite(found) & (log.force_N > 5000.0)
+    return float(np.sum(found[loaded] * log.force_N[loaded]) / np.sum(log.force_N[loaded] ** 2))
 
 
 def test_the_table_is_met_at_its_points_and_rises_between(shipped):
@@ -80,13 +98,48 @@ def test_the_estimate_follows_a_ramp_by_its_datasheet(shipped, drive):
     error = found["force"] - log.force_N
     assert np.sqrt(np.mean(error**2)) < 0.003 * shipped.stiffness.maximum_force_N
     assert np.mean(np.abs(error) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
-    # Torque alone, in contact: the ramp's slope moves by a third there, and a constant gear would be wrong by as much.
-    loaded = np.isfinite(found["torque_force"]) & (log.force_N > 5000.0)
-    for calibration, least, most in ((ramp(shipped), 0.97, 1.03), (shipped, 0.0, 0.92)):
-        force = estimate(log.samples, to_parameters(moved(calibration, {})))["torque_force"][loaded]
-        share = np.sum(force * log.force_N[loaded]) / np.sum(log.force_N[loaded] ** 2)
-        assert least < share < most
+    assert torque_over_force(log, ramp(shipped)) == pytest.approx(1.0, abs=0.03)
+    assert torque_over_force(log, shipped) < 0.92
     assert found["contact_angle"][-1] == pytest.approx(truth["contact_angle"][-1, 0], abs=0.1)
+
+
+def test_curve_and_torque_path_are_identified_through_the_gear(shipped, drive):
+    log, _ = drive
+    sheet = msgspec.convert(yaml.safe_load((FILES / "datasheet.yaml").read_text()), Datasheet)
+    start = ramp(nominal(sheet, "ramp", 10.0, [10.0]))
+    torque = fit_torque([log], start, sheet)
+    motor, noise = shipped.motor, shipped.noise
+    from_speed = np.sqrt(2.0) * motor.inertia_kg_m2 * noise.speed_rad_per_s / CYCLE_S / motor.torque_constant_Nm_per_A
+    assert torque.rms_A < 1.05 * np.hypot(noise.current_A, from_speed)
+    assert torque.values[TORQUE_CONSTANT] == pytest.approx(motor.torque_constant_Nm_per_A, rel=0.02)
+    # A constant gear takes the ramp's slope for another motor, and leaves more current over.
+    screw = fit_torque([log], nominal(sheet, "screw", 10.0, [10.0]), sheet)
+    assert screw.rms_A > 1.1 * torque.rms_A
+    assert screw.values[TORQUE_CONSTANT] > 1.05 * motor.torque_constant_Nm_per_A
+    curve = fit_dynamics([Pads(10.0, (log,))], starting_point([Pads(10.0, (log,))], start)).curves[0]
+    x = np.array([4.0, 8.0, 12.0])
+    expected = [characteristic_curve(at, to_parameters(shipped)["curve"])[0] for at in x]
+    assert curve.force(x) == pytest.approx(expected, rel=0.02)
+    assert curve.clearances_rad == pytest.approx([shipped.contact.clearance_rad], abs=0.1)
+
+
+def test_a_release_spring_takes_torque_and_is_no_clamp_force(shipped, tmp_path):
+    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_mm=3000.0))
+    log, _ = record(sprung, tmp_path / "sprung.log")
+    assert torque_over_force(log, sprung) == pytest.approx(1.0, abs=0.03)
+    assert torque_over_force(log, shipped) > 1.15
+    found = estimate(log.samples, to_parameters(sprung))
+    assert np.mean(np.abs(found["force"] - log.force_N) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
+
+
+def test_a_start_in_contact_leaves_the_gears_slope_open(shipped, drive):
+    log, _ = drive
+    begin = int(np.argmax(log.force_N > 8000.0))
+    samples = log.samples[begin : begin + 200].copy()
+    samples["park_brake"], samples["brake_request"], samples["has_status"] = 0.0, 1.0, True
+    found = estimate(samples, to_parameters(ramp(shipped)))
+    error = found["force"] - log.force_N[begin : begin + 200]
+    assert np.mean(np.abs(error) < 2.0 * found["sigma"]) > 0.95
 
 
 def test_the_brakes_motor_finds_its_way_back_through_the_gear(shipped):

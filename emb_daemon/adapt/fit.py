@@ -97,7 +97,7 @@ def unexplained_step(s, p, row):
     # What driving has found of friction at low and at high speed; a training's fit has neither.
     slow = (
         s.friction_mean
-        * (p.offset_friction + p.load_friction * force * s.gear_slope)
+        * (p.offset_friction + p.load_friction * (force + s.spring_force) * s.gear_slope)
         * exp(-0.5 * abs(row.speed + speed) / SLOW_RAD_PER_S)
     )
     return torque - leverage * force - s.error[SLOW] * slow - s.error[VISCOUS] * 0.5 * (row.speed + speed)

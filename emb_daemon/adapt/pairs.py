@@ -39,8 +39,8 @@ def _turn(rows, p, gear_zero, turned):
 
 @entry(Array(TRAINING), PARAMETERS, float, Array(np.float64), Array(np.float64))
 def _sliding(rows, p, gear_zero, direction, torque):
-    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque (N m) without it and inertia, over
-    the gear's slope."""
+    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque (N m) without it, inertia
+    and release spring, over the gear's slope."""
     state, variance = 0.0, 1.0
     direction[0] = 0.0
     for i in range(1, len(rows)):
@@ -49,7 +49,8 @@ def _sliding(rows, p, gear_zero, direction, torque):
         usable = row.has_current and abs(mean) >= _TURNED_OVER
         direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
         torque[i] = unexplained_torque(p.torque_constant * row.current_q, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
-        torque[i] /= through_gear(p.gear, 0.5 * (row.angle + last.angle) - gear_zero)[1]
+        past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + last.angle) - gear_zero)
+        torque[i] = torque[i] / slope - p.gear_gain * p.spring * max(past_zero, 0.0)
 
 
 def turned_angles(rows, p, gear_zero):

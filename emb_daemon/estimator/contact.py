@@ -215,7 +215,8 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     slow, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     speed = 0.5 * (m.speed + s.speed)
     slope = s.gear_slope
-    to_torque(h, leverage, slope, s.friction_mean, mean_force, speed, slow, accelerating, needed, s.winding, s.housing)
+    load = mean_force + s.spring_force
+    to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])

@@ -7,7 +7,8 @@ constant, gear, friction, largest force. Each is allowed to be wrong by the boun
     lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
 
 where friction counts against the motion if the motor turns and either way if it stands. Of a gear that is not constant the
-largest gain stands on the left and the least on the right, since no angle is believed here. A force that stays outside for
+largest gain stands on the left and the least on the right, since no angle is believed here,
+and a release spring counts in full on the left and not at all on the right. A force that stays outside for
 `TOLERATED_S` is contradicted. A latched brake needs no current, so with the park brake on there is no upper bound.
 """
 
@@ -56,7 +57,7 @@ def bound(w, p, m):
     taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
     held, held_by_load = (0.0, 0.0) if closing else (dry, load)
     flat, steep = steepest(p.gear)
-    w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep), 0.0)
+    w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep) - p.spring_most, 0.0)
     leverage = p.gear_gain - held_by_load
     latched = not m.has_status or m.park_brake != 0.0
     w.high = p.maximum_force

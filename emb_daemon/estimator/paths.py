@@ -109,7 +109,8 @@ def torque_path(s, p, m):
     gear = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
-    _, slope = turned(s, p, m.angle - 0.5 * travel)
+    middle, slope = turned(s, p, m.angle - 0.5 * travel)
+    s.spring_force = p.spring * max(middle - s.gear_zero, 0.0)
     leverage = (p.gear_gain * gear + p.load_friction * friction * mean) * slope
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0
@@ -117,4 +118,5 @@ def torque_path(s, p, m):
     offset_friction = p.offset_friction * friction
     torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)
+    torque -= leverage * s.spring_force
     return torque, leverage, s.friction_variance + turning * turning

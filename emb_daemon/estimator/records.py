@@ -44,6 +44,8 @@ THERMAL = np.dtype(
 PARAMETERS = np.dtype(
     [
         *fields("f8", "gear_gain torque_constant inertia load_friction offset_friction presliding_angle"),
+        # Of the release spring: N per rad of equivalent angle, and its largest force, N.
+        *fields("f8", "spring spring_most"),
         ("curve", "f8", (CURVE_TERMS,)),
         *fields(
             "f8",
@@ -94,6 +96,8 @@ STATE = np.dtype(
         # Of a gear that is not constant: resolver's angle at its released position, rad, and its slope (`models.gear`). The
         # contact angle and what is past it are equivalent angles.
         *fields("f8", "gear_zero gear_slope"),
+        # Force of the release spring, N: mean over the last cycle.
+        ("spring_force", "f8"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
         # Torque path.

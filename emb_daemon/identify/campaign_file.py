@@ -5,7 +5,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from emb_daemon.calibration.fields import Positive, Struct
+from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.types import CONSTANT_GEAR, Travel
 from emb_daemon.wire.contract import PULSES_PER_TURN
 
@@ -110,6 +110,8 @@ class Actuator(Struct, kw_only=True):
     gear_gain_m_per_rad: Positive
     #: Of a gear that is not constant; likewise taken as exact.
     travel: Travel = CONSTANT_GEAR
+    #: Of a spring that helps release: force on the gear's output per travel from the released position, none there; exact.
+    release_spring_N_per_mm: NonNegative = 0.0
     #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
     #: Share, two standard deviations.

@@ -36,6 +36,12 @@ def slope_at(p, angle):
 
 
 @njit
+def gear_load(p, s):
+    """Force (N) on the gear's output: of pads and release spring."""
+    return s.force + p.release_spring * p.gear_gain * max(turned(p, s.angle), 0.0)
+
+
+@njit
 def motor_angle(p, x):
     """Motor angle (rad) at which `turned` is ``x``."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
@@ -147,7 +153,7 @@ def grown(p, s):
 def _friction_level(p, s):
     """Sliding friction torque of the gear (N m), without direction (thesis 4-1)."""
     e = p.effects
-    level = p.offset_friction + p.load_friction * slope_at(p, s.angle) * s.force
+    level = p.offset_friction + p.load_friction * slope_at(p, s.angle) * gear_load(p, s)
     if e.stribeck_friction.rise != 0.0:
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
@@ -186,7 +192,7 @@ def move_motor(p, s, demand):
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat
     torque = p.torque_constant * factor * s.current
-    load = p.gear_gain * slope_at(p, s.angle) * s.force * (1.0 + drawn(e.drawn_gear_gain, s, 4))
+    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) * (1.0 + drawn(e.drawn_gear_gain, s, 4))
     mesh = e.gear_mesh_ripple
     if mesh.cosine != 0.0 or mesh.sine != 0.0:
         phase = mesh.order_per_turn * (p.released_angle + s.angle)

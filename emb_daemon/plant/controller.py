@@ -5,7 +5,7 @@ daemon is judged on its own.
 """
 
 from emb_daemon.jit import njit
-from emb_daemon.plant.brake import motor_angle, slope_at, static_angle
+from emb_daemon.plant.brake import gear_load, motor_angle, slope_at, static_angle
 from emb_daemon.plant.records import ANGLE, FORCE, LATCH, SUBSTEP_S
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -59,6 +59,6 @@ def current_demand(p, s):
         # Outside of its linear range the integral would wind up.
         s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
     acceleration = min(max(acceleration, -_ACCELERATION), _ACCELERATION)
-    torque = p.gear_gain * slope_at(p, s.angle) * s.force + p.inertia * acceleration + s.speed_integral
+    torque = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) + p.inertia * acceleration + s.speed_integral
     s.position_target += SUBSTEP_S * s.target_rate
     return torque / p.torque_constant

@@ -138,6 +138,7 @@ PLANT_FIELDS = (
     Field("gear_gain", "m/rad", "clamp travel per motor angle; torque per clamp force"),
     Field("travel_angle", "rad", "motor angles past the released position of a gear that is not constant", (TRAVEL_POINTS,)),
     Field("travel", "m", "clamp travel there, rising straight on beyond; all zero for a constant gear", (TRAVEL_POINTS,)),
+    Field("release_spring", "N/m", "force on the gear's output per travel from the released position"),
     Field("maximum_speed", "rad/s", "motor speed at which the supply's voltage is used up"),
     Field("maximum_current", "A", "inverter limit"),
     Field("current_time", "s", "time constant of the current controller"),

@@ -138,8 +138,11 @@ class _Regression:
         self.log, self.calibration = log, calibration
         self.rows = r = rows[full_rate & known]
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
-        # What the reduction carries of it: a force on a constant gear.
-        self.load = self.force * all_through_gear(calibration.motor.gear(), 0.5 * (angle[r] + angle[r - 1]) - angle[0])[1]
+        # What the reduction carries, as force on a constant gear.
+        motor = calibration.motor
+        turned, slope = all_through_gear(motor.gear(), 0.5 * (angle[r] + angle[r - 1]) - angle[0])
+        spring = 1e3 * motor.release_spring_N_per_mm * motor.gear_gain_m_per_rad * np.maximum(turned, 0.0)
+        self.load = (self.force + spring) * slope
         self.current = samples["current_q"][r]
         self.acceleration = (speed[r] - speed[r - 1]) / CYCLE_S
         self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
@@ -252,7 +255,7 @@ class Unexplained:
         rows: of the log.
         current_A: left unexplained.
         friction_mean: friction state, -1 to 1.
-        force_N: mean force, times the gear's slope over its mean.
+        force_N: mean force that the reduction carries: with the release spring's, times the gear's slope over its mean.
     """
 
     found: TorqueFit
