@@ -5,9 +5,14 @@ import numpy as np
 import pytest
 import yaml
 
+from emb_daemon.adapt.fit import fit_training
+from emb_daemon.adapt.records import ACCEPTED, TRAINING
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, Travel, to_parameters
 from emb_daemon.errors import InvalidValue
+from emb_daemon.estimator.monitor import LEAST_GAIN, MONITOR, MOST_GAIN, bound
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import Pads, fit_dynamics, starting_point
@@ -140,6 +145,40 @@ def test_a_start_in_contact_leaves_the_gears_slope_open(shipped, drive):
     found = estimate(samples, to_parameters(ramp(shipped)))
     error = found["force"] - log.force_N[begin : begin + 200]
     assert np.mean(np.abs(error) < 2.0 * found["sigma"]) > 0.95
+
+
+def test_the_monitors_bounds_hold_the_force_wherever_the_gear_may_be(shipped):
+    motor = replace(ramp(shipped).motor, release_spring_N_per_mm=2000.0)
+    p = to_parameters(replace(shipped, motor=motor))
+    m = np.zeros(1, SAMPLE)
+    m["dt"], m["has_current"], m["has_status"] = 0.004, True, True
+    force = 10e3
+    for slope in steepest(p["gear"]):
+        for spring in (0.0, p["spring_most"]):
+            w = np.zeros(1, MONITOR)
+            # Of a brake whose motor is at either end of what the monitor grants, and without friction while it stands.
+            for gain in (LEAST_GAIN, MOST_GAIN):
+                m["current_q"] = p["gear_gain"] * slope * (force + spring) / (gain * p["torque_constant"])
+                for _ in range(300):
+                    bound(w[0], p, m[0])
+                assert w["low"][0] < force < w["high"][0], (slope, spring, gain)
+
+
+def test_a_training_is_learned_from_through_the_gear(shipped, tmp_path):
+    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_mm=1000.0))
+    plant = plant_from_calibration(ramp(sprung, 121), pad_thickness_mm=8.0)
+    path = tmp_path / "training.log"
+    write_frames(path, sc.simulate_log(plant, sc.rest(1.0) + sc.training(plant, 42.0, 19e3), seed=3)[0])
+    log, calibration, state = load_log(path), ramp(sprung), new_state()
+    before = estimate(log.samples, to_parameters(calibration), state)["stiffness_force"]
+    rows = np.zeros(len(log.samples), TRAINING)
+    for name in set(TRAINING.names) & set(log.samples.dtype.names):
+        rows[name] = log.samples[name]
+    rows["factor"] = 1.0
+    found = fit_training(rows, calibration, calibration, state[0])
+    assert found.outcome == ACCEPTED and found.evidence["pairs_difference"] < 0.015
+    after = estimate(log.samples, to_parameters(moved(calibration, found.values)))["stiffness_force"]
+    assert np.std(after - log.force_N) < 0.3 * np.std(before - log.force_N)
 
 
 def test_the_brakes_motor_finds_its_way_back_through_the_gear(shipped):
