@@ -69,12 +69,12 @@ def draw_mechanism(seed: int) -> Stranger:
     motor = msgspec.structs.replace(motor, maximum_speed_rad_per_s=faster * motor.maximum_speed_rad_per_s)
     if kind == 3:
         # At full clamp a tenth of the force or so, several times the friction of the open brake.
-        full_mm = 25e3 * motor.gear_gain_m_per_rad
-        spring = calibration.stiffness.maximum_force_N / full_mm * rng.uniform(0.08, 0.15)
-        motor = msgspec.structs.replace(motor, release_spring_N_per_mm=round(spring, 1))
+        full_m = 25.0 * motor.gear_gain_m_per_rad
+        spring = calibration.stiffness.maximum_force_N / full_m * rng.uniform(0.08, 0.15)
+        motor = msgspec.structs.replace(motor, release_spring_N_per_m=float(round(spring)))
     calibration = msgspec.structs.replace(calibration, motor=motor)
     table = motor.travel
-    sheet = {"release_spring_N_per_mm": motor.release_spring_N_per_mm}
+    sheet = {"release_spring_N_per_m": motor.release_spring_N_per_m}
     if table.angle_rad:
         travel = {"angle_rad": [round(a, 4) for a in table.angle_rad], "travel_mm": [round(mm, 3) for mm in table.travel_mm]}
         sheet["travel"] = {name: values[::_EVERY] for name, values in travel.items()}

@@ -1,5 +1,7 @@
 """A gear that is not constant: travel over angle from a table, seen by pads, torque, plant and identification."""
 
+from itertools import product
+
 import msgspec
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from emb_daemon.identify.dynamics import Pads, fit_dynamics, starting_point
 from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import TORQUE_CONSTANT, fit_torque
 from emb_daemon.logs.write import write_frames
-from emb_daemon.models.gear import all_through_gear, back_through_gear, steepest, through_gear
+from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_spring, steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
@@ -129,7 +131,7 @@ def test_curve_and_torque_path_are_identified_through_the_gear(shipped, drive):
 
 
 def test_a_release_spring_takes_torque_and_is_no_clamp_force(shipped, tmp_path):
-    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_mm=3000.0))
+    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_m=3e6))
     log, _ = record(sprung, tmp_path / "sprung.log")
     assert torque_over_force(log, sprung) == pytest.approx(1.0, abs=0.03)
     assert torque_over_force(log, shipped) > 1.15
@@ -137,35 +139,39 @@ def test_a_release_spring_takes_torque_and_is_no_clamp_force(shipped, tmp_path):
     assert np.mean(np.abs(found["force"] - log.force_N) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
 
 
-def test_a_start_in_contact_leaves_the_gears_slope_open(shipped, drive):
-    log, _ = drive
-    begin = int(np.argmax(log.force_N > 8000.0))
-    samples = log.samples[begin : begin + 200].copy()
+@pytest.mark.parametrize("spring", [0.0, 5e6])
+def test_a_start_in_contact_leaves_the_gears_slope_open(shipped, tmp_path, spring):
+    """At full force the ramp is a third flatter than where the table begins."""
+    brake = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_m=spring))
+    plant = plant_from_calibration(ramp(brake, 121), seed=4)
+    write_frames(tmp_path / "a.log", sc.simulate_log(plant, sc.rest(1.0) + sc.park(27e3, 6.0), seed=2)[0])
+    log = load_log(tmp_path / "a.log")
+    rows = slice(int(np.argmax(log.force_N > 26e3)), None)
+    samples, force_N = log.samples[rows][:200].copy(), log.force_N[rows][:200]
     samples["park_brake"], samples["brake_request"], samples["has_status"] = 0.0, 1.0, True
-    found = estimate(samples, to_parameters(ramp(shipped)))
-    error = found["force"] - log.force_N[begin : begin + 200]
-    assert np.mean(np.abs(error) < 2.0 * found["sigma"]) > 0.95
+    found = estimate(samples, to_parameters(ramp(brake)))
+    assert np.mean(np.abs(found["force"] - force_N) < 2.0 * found["sigma"]) > 0.95
 
 
 def test_the_monitors_bounds_hold_the_force_wherever_the_gear_may_be(shipped):
-    motor = replace(ramp(shipped).motor, release_spring_N_per_mm=2000.0)
+    motor = replace(ramp(shipped).motor, release_spring_N_per_m=5e6)
     p = to_parameters(replace(shipped, motor=motor))
     m = np.zeros(1, SAMPLE)
     m["dt"], m["has_current"], m["has_status"] = 0.004, True, True
-    force = 10e3
-    for slope in steepest(p["gear"]):
-        for spring in (0.0, p["spring_most"]):
-            w = np.zeros(1, MONITOR)
-            # Of a brake whose motor is at either end of what the monitor grants, and without friction while it stands.
-            for gain in (LEAST_GAIN, MOST_GAIN):
-                m["current_q"] = p["gear_gain"] * slope * (force + spring) / (gain * p["torque_constant"])
-                for _ in range(300):
-                    bound(w[0], p, m[0])
-                assert w["low"][0] < force < w["high"][0], (slope, spring, gain)
+    # While the motor opens, friction takes no torque, and while it closes, it holds no force.
+    for slope, spring, gain, speed in product(
+        steepest(p["gear"]), (0.0, most_of_spring(p)), (LEAST_GAIN, MOST_GAIN), (-10.0, 10.0)
+    ):
+        w = np.zeros(1, MONITOR)
+        m["current_q"] = p["gear_gain"] * slope * (10e3 + spring) / (gain * p["torque_constant"])
+        m["speed"] = speed
+        for _ in range(300):
+            bound(w[0], p, m[0])
+        assert w["low"][0] < 10e3 < w["high"][0], (slope, spring, gain, speed)
 
 
 def test_a_training_is_learned_from_through_the_gear(shipped, tmp_path):
-    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_mm=1000.0))
+    sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_m=1e6))
     plant = plant_from_calibration(ramp(sprung, 121), pad_thickness_mm=8.0)
     path = tmp_path / "training.log"
     write_frames(path, sc.simulate_log(plant, sc.rest(1.0) + sc.training(plant, 42.0, 19e3), seed=3)[0])

@@ -50,7 +50,7 @@ def _sliding(rows, p, gear_zero, direction, torque):
         direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
         torque[i] = unexplained_torque(p.torque_constant * row.current_q, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
         past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + last.angle) - gear_zero)
-        torque[i] = torque[i] / slope - p.gear_gain * p.spring * max(past_zero, 0.0)
+        torque[i] = torque[i] / slope - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
 
 
 def turned_angles(rows, p, gear_zero):

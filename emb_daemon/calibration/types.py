@@ -67,7 +67,7 @@ class Motor(Struct, kw_only=True):
     #: Of a gear that is not constant.
     travel: Travel = CONSTANT_GEAR
     #: Of a spring that helps release: force on the gear's output per travel from the released position, none there.
-    release_spring_N_per_mm: Annotated[NonNegative, usual(100.0)] = 0.0
+    release_spring_N_per_m: Annotated[NonNegative, usual(1e5)] = 0.0
 
     def __post_init__(self):
         if not self.travel.angle_rad:
@@ -457,7 +457,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["inertia"] = c.motor.inertia_kg_m2
     p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
     p["gear"] = c.motor.gear()
-    p["spring"] = 1e3 * c.motor.release_spring_N_per_mm * c.motor.gear_gain_m_per_rad
+    p["spring"] = c.motor.release_spring_N_per_m
     p["load_friction"] = c.friction.load_m_per_rad
     p["offset_friction"] = c.friction.offset_Nm
     p["presliding_angle"] = c.friction.presliding_angle_rad
@@ -466,7 +466,6 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["maximum_force"] = c.stiffness.maximum_force_N
     p["clearance"] = c.contact.clearance_rad
     p["clearance_sigma"] = c.contact.clearance_sigma_rad
-    p["spring_most"] = p["spring"] * (p["clearance"] + travel_at(p["maximum_force"], p["curve"])) if p["spring"] else 0.0
     p["contact_walk"] = c.contact.walk_rad_per_sqrt_s
     p["stiffness_sigma"] = c.noise.stiffness_N
     p["stiffness_relative_sigma"] = c.noise.stiffness_relative

@@ -64,7 +64,7 @@ from emb_daemon.models.fusion import (
     force_variance,
     predict_errors,
 )
-from emb_daemon.models.gear import steepest
+from emb_daemon.models.gear import most_of_spring, steepest
 from emb_daemon.models.plausibility import (
     AGREE,
     STIFFNESS_WRONG,
@@ -263,7 +263,8 @@ def _beside_force(s, p):
     if s.unknown or s.plausibility.verdict == STIFFNESS_WRONG:
         least, most = steepest(p.gear)
         middle = 0.5 * (least + most)
-        return middle, middle / least - 1.0, 0.5 * p.spring_most, 0.5 * p.spring_most
+        half = 0.5 * most_of_spring(p)
+        return middle, middle / least - 1.0, half, half
     return s.gear_slope, 0.0, s.spring_force, 0.0
 
 

@@ -17,7 +17,7 @@ from math import exp
 import numpy as np
 
 from emb_daemon.jit import njit
-from emb_daemon.models.gear import steepest
+from emb_daemon.models.gear import most_of_spring, steepest
 
 #: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
 #: outside, s: a whole stroke of acceleration and braking.
@@ -57,7 +57,7 @@ def bound(w, p, m):
     taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
     held, held_by_load = (0.0, 0.0) if closing else (dry, load)
     flat, steep = steepest(p.gear)
-    w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep) - p.spring_most, 0.0)
+    w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep) - most_of_spring(p), 0.0)
     leverage = p.gear_gain - held_by_load
     latched = not m.has_status or m.park_brake != 0.0
     w.high = p.maximum_force

@@ -110,7 +110,7 @@ def torque_path(s, p, m):
     friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
     middle, slope = turned(s, p, m.angle - 0.5 * travel)
-    s.spring_force = p.spring * max(middle - s.gear_zero, 0.0)
+    s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
     leverage = (p.gear_gain * gear + p.load_friction * friction * mean) * slope
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0

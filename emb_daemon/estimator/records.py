@@ -44,8 +44,8 @@ THERMAL = np.dtype(
 PARAMETERS = np.dtype(
     [
         *fields("f8", "gear_gain torque_constant inertia load_friction offset_friction presliding_angle"),
-        # Of the release spring: N per rad of equivalent angle, and its largest force, N.
-        *fields("f8", "spring spring_most"),
+        # Of the release spring, N per m of clamp travel.
+        ("spring", "f8"),
         ("curve", "f8", (CURVE_TERMS,)),
         *fields(
             "f8",

@@ -35,7 +35,7 @@ def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: S
         gear_gain_m_per_rad=actuator.gear_gain_m_per_rad,
         maximum_speed_rad_per_s=actuator.max_motor_speed_rad_per_s,
         travel=actuator.travel,
-        release_spring_N_per_mm=actuator.release_spring_N_per_mm,
+        release_spring_N_per_m=actuator.release_spring_N_per_m,
     )
     clearance, _ = through_gear(motor.gear(), actuator.pad_clearance_rad)
     return Calibration(

@@ -111,7 +111,7 @@ class Actuator(Struct, kw_only=True):
     #: Of a gear that is not constant; likewise taken as exact.
     travel: Travel = CONSTANT_GEAR
     #: Of a spring that helps release: force on the gear's output per travel from the released position, none there; exact.
-    release_spring_N_per_mm: NonNegative = 0.0
+    release_spring_N_per_m: NonNegative = 0.0
     #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
     #: Share, two standard deviations.

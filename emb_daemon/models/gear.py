@@ -8,6 +8,7 @@ dx/dθ over the gear gain, by virtual work. So one brake model serves both kinds
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import travel_at
 
 #: Intervals into which the range of a travel table is divided: a table of a datasheet has fewer points.
 INTERVALS = 64
@@ -70,6 +71,14 @@ def steepest(gear):
     for slope in gear.slope:
         least, most = min(least, slope), max(most, slope)
     return least, most
+
+
+@njit
+def most_of_spring(p):
+    """Largest force (N) of the release spring, that of the largest clamp force."""
+    if p.spring == 0.0:
+        return 0.0
+    return p.spring * p.gear_gain * (p.clearance + travel_at(p.maximum_force, p.curve))
 
 
 def rising_slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:

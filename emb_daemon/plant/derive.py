@@ -78,7 +78,7 @@ def plant_from_calibration(
         p["travel"] = p["gear_gain"] * all_through_gear(c.motor.gear(), p["travel_angle"])[0]
     p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
     # Enough to hold the largest force against friction, and to accelerate.
-    p["release_spring"] = 1e3 * c.motor.release_spring_N_per_mm
+    p["release_spring"] = c.motor.release_spring_N_per_m
     steep = steepest(c.motor.gear())[1] * c.motor.gear_gain_m_per_rad
     p["maximum_current"] = 1.5 * steep * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
     p["current_time"] = 0.001

@@ -141,7 +141,7 @@ class _Regression:
         # What the reduction carries, as force on a constant gear.
         motor = calibration.motor
         turned, slope = all_through_gear(motor.gear(), 0.5 * (angle[r] + angle[r - 1]) - angle[0])
-        spring = 1e3 * motor.release_spring_N_per_mm * motor.gear_gain_m_per_rad * np.maximum(turned, 0.0)
+        spring = motor.release_spring_N_per_m * motor.gear_gain_m_per_rad * np.maximum(turned, 0.0)
         self.load = (self.force + spring) * slope
         self.current = samples["current_q"][r]
         self.acceleration = (speed[r] - speed[r - 1]) / CYCLE_S
