@@ -48,6 +48,18 @@ class Travel(Struct, kw_only=True):
                 if after <= before:
                     raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected more")
 
+    def check_mean(self, gear_gain: float) -> None:
+        """Raise `InvalidValue` if a gear gain (m/rad) is none of this travel's."""
+        if not self.angle_rad:
+            return
+        slopes = 1e-3 * np.diff(self.travel_mm) / np.diff(self.angle_rad)
+        # A hundredth: both are rounded.
+        if not 0.99 * slopes.min() <= gear_gain <= 1.01 * slopes.max():
+            raise InvalidValue(
+                f"gear_gain_m_per_rad: {gear_gain:g} is no mean of travel, which rises by {slopes.min():.3g} to "
+                f"{slopes.max():.3g} m/rad"
+            )
+
 
 #: One object: what is left out of a file is told by identity.
 CONSTANT_GEAR = Travel()
@@ -70,15 +82,7 @@ class Motor(Struct, kw_only=True):
     release_spring_N_per_m: Annotated[NonNegative, usual(1e5)] = 0.0
 
     def __post_init__(self):
-        if not self.travel.angle_rad:
-            return
-        slopes = 1e-3 * np.diff(self.travel.travel_mm) / np.diff(self.travel.angle_rad)
-        # A hundredth: both are rounded.
-        if not 0.99 * slopes.min() <= self.gear_gain_m_per_rad <= 1.01 * slopes.max():
-            raise InvalidValue(
-                f"gear_gain_m_per_rad: {self.gear_gain_m_per_rad:g} is no mean of travel, which rises by "
-                f"{slopes.min():.3g} to {slopes.max():.3g} m/rad"
-            )
+        self.travel.check_mean(self.gear_gain_m_per_rad)
 
     def gear(self) -> np.void:
         """GEAR record (`models.gear`) of `travel`."""

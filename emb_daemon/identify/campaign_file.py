@@ -127,6 +127,9 @@ class Actuator(Struct, kw_only=True):
     #: Motor angle between the released position and contact; half of it must surely be free of contact.
     pad_clearance_rad: Positive
 
+    def __post_init__(self):
+        self.travel.check_mean(self.gear_gain_m_per_rad)
+
 
 class Resolver(Struct, kw_only=True):
     """Motor angle sensor."""

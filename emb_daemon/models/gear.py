@@ -75,7 +75,7 @@ def steepest(gear):
 
 @njit
 def most_of_spring(p):
-    """Largest force (N) of the release spring, that of the largest clamp force."""
+    """Force (N) of the release spring at the largest clamp force; PARAMETERS record ``p``."""
     if p.spring == 0.0:
         return 0.0
     return p.spring * p.gear_gain * (p.clearance + travel_at(p.maximum_force, p.curve))

@@ -76,9 +76,9 @@ def plant_from_calibration(
     if c.motor.travel.angle_rad:
         p["travel_angle"] = np.linspace(0.0, c.motor.travel.angle_rad[-1], TRAVEL_POINTS)
         p["travel"] = p["gear_gain"] * all_through_gear(c.motor.gear(), p["travel_angle"])[0]
+    p["release_spring"] = c.motor.release_spring_N_per_m
     p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
     # Enough to hold the largest force against friction, and to accelerate.
-    p["release_spring"] = c.motor.release_spring_N_per_m
     steep = steepest(c.motor.gear())[1] * c.motor.gear_gain_m_per_rad
     p["maximum_current"] = 1.5 * steep * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
     p["current_time"] = 0.001
