@@ -68,6 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
     daemon.pipeline.distrust(keyless)
     if arguments.share:
         daemon.share(arguments.share)
+        if configuration.xcp.calibrate:
+            daemon.take_pages(arguments.share)
     signal.signal(signal.SIGHUP, lambda *_: daemon.reload())
     daemon.warm_up()
     if compiled_for_the_next_start():
