@@ -191,6 +191,17 @@ def test_no_page_is_taken_or_left_but_at_rest(daemon, caplog, circumstance, said
         assert ask(daemon, Page({}, {})) == Answer(said, later=True) and in_use(daemon) == of({CLEARANCE: 7.0})
 
 
+def test_a_loop_that_reading_kept_from_hearing_gets_a_moment_to_hear(daemon):
+    silent(daemon.pipeline)
+    request = Request(page({CLEARANCE: 7.0}))
+    daemon.ask_page(request)
+    follow(daemon, lambda: request.read_ns)
+    assert in_use(daemon) == of({})
+    rest(daemon.pipeline)
+    follow(daemon, lambda: daemon._page is None)
+    assert request.wait() == Answer() and in_use(daemon) == of({CLEARANCE: 7.0})
+
+
 def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
     """Whatever ends the check."""
     monkeypatch.setattr("emb_daemon.runtime.pages.moved", lambda *_, **__: 1 / 0)
@@ -201,8 +212,9 @@ def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
 def test_a_page_that_was_checked_too_late_is_not_taken(daemon):
     """Whoever asked for it no longer waits."""
     request = Request(page({CLEARANCE: 7.0}))
-    daemon._asked = request, time.monotonic_ns() - 4 * 10**9
-    follow(daemon, lambda: daemon._asked is None and daemon._reader is None)
+    request.asked_ns -= 4 * 10**9
+    daemon.ask_page(request)
+    follow(daemon, lambda: daemon._asked is None and daemon._page is None)
     assert request.wait().later and in_use(daemon) == of({})
 
 

@@ -43,6 +43,8 @@ _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
+#: How long a page that was read waits for the car to be seen at rest: reading may have kept the loop from hearing it.
+_SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
 
@@ -148,10 +150,10 @@ class Daemon:
         self._calibrations = dict(setup.calibrations)
         self._read: dict[str, tuple[Calibration, Store | None]] | None = None
         self._waiting: dict[str, tuple[Calibration, Store | None]] = {}
-        #: Who asks for a page and since when; whose page is being checked; and corners that are estimated with one.
+        #: Who asks for a page, whose page is being checked or taken, and corners that are estimated with one.
         self._listener: PageListener | None = None
-        self._asked: tuple[Request, int] | None = None
-        self._checked: tuple[Request, int] | None = None
+        self._asked: Request | None = None
+        self._page: Request | None = None
         self._on_page: set[str] = set()
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
@@ -176,7 +178,7 @@ class Daemon:
 
     def ask_page(self, request: Request) -> None:
         """Have a page checked and taken, or refused, by the loop; one at a time."""
-        self._asked = request, time.monotonic_ns()
+        self._asked = request
 
     def _leave_page(self) -> None:
         if self._on_page:
@@ -229,7 +231,7 @@ class Daemon:
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
-            if self._reload_wanted or self._reader is not None or self._waiting or self._asked is not None:
+            if self._reload_wanted or self._reader is not None or self._waiting or self._asked or self._page:
                 self._follow_reload()
             if watchdog_ns and now >= next_ping:
                 # One that is withheld is thought of again soon: a stall that is over is no hang.
@@ -314,21 +316,23 @@ class Daemon:
     def _follow_reload(self) -> None:
         """Have the calibrations read, one reading at a time, and let corners go over to those that changed."""
         if self._reader is not None and not self._reader.is_alive():
-            self._reader, read, self._read = None, self._read, None
-            if self._checked is not None:
-                self._take_page(*self._checked, read or {})
-                self._checked = None
-            else:
-                self._waiting = read if read is not None else self._waiting
+            self._reader = None
+            if self._page is None:
+                if self._read is not None:
+                    self._waiting, self._read = self._read, None
                 if not self._reload_wanted:
                     self._manager.notify("READY=1")
-        if self._reload_wanted and self._reader is None:
-            self._reload_wanted = False
-            self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-            self._read_beside(self._read_calibrations)
-        elif self._asked is not None and self._reader is None:
-            self._checked, self._asked = self._asked, None
-            self._read_beside(self._read_calibrations, self._checked[0])
+        if self._page is not None and self._reader is None and (answer := self._answer_to(self._page)):
+            self._page.answer(answer)
+            self._page = None
+        if self._reader is None and self._page is None:
+            if self._reload_wanted:
+                self._reload_wanted = False
+                self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+                self._read_beside(self._read_calibrations)
+            elif self._asked is not None:
+                self._page, self._asked = self._asked, None
+                self._read_beside(self._read_calibrations, self._page)
         for name in [name for name in self._waiting if self._released(name)]:
             self._begin_anew(name, *self._waiting.pop(name))
 
@@ -336,25 +340,28 @@ class Daemon:
         self._reader = threading.Thread(target=read, args=arguments, name="reload", daemon=True)
         self._reader.start()
 
-    def _take_page(self, request: Request, asked_ns: int, read: dict[str, tuple[Calibration, Store | None]]) -> None:
-        """Go over to a page that was checked, all of its corners in one tick, or refuse it."""
-        answer = Answer(request.fault)
+    def _answer_to(self, request: Request) -> Answer | None:
+        """Go over to a page that was read, all of its corners in one tick, or refuse it; None while it may yet be taken."""
+        now_ns, answer = time.monotonic_ns(), Answer(request.fault)
+        request.read_ns = request.read_ns or now_ns
         if not request.fault:
-            if time.monotonic_ns() - asked_ns > 1e9 * PATIENCE_S:
+            if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
                 answer = Answer("it took too long to be checked", later=True)
             elif self._waiting:
                 answer = Answer("a reload waits for the brakes' release", later=True)
-            elif read and (why_not := self.pipeline.why_not_at_rest()):
+            elif request.read and (why_not := self.pipeline.why_not_at_rest()):
+                if now_ns - request.read_ns < _SETTLING_NS:
+                    return None
                 answer = Answer(why_not, later=True)
         if answer.refused:
             log.error("page refused: %s", answer.refused)
-        else:
-            for name, (calibration, learned) in read.items():
-                count = len(request.page.values.get(name, ()))
-                self._begin_anew(name, calibration, learned, on_page=count > 0)
-                if count:
-                    log.warning("corner %s: %d numbers are not the file's, and nothing is learned", name, count)
-        request.answer(answer)
+            return answer
+        for name, (calibration, learned) in request.read.items():
+            count = len(request.page.values.get(name, ()))
+            self._begin_anew(name, calibration, learned, on_page=count > 0)
+            if count:
+                log.warning("corner %s: %d numbers are not the file's, and nothing is learned", name, count)
+        return answer
 
     def _released(self, name: str) -> bool:
         state = self.pipeline.states[CORNERS.index(name)]
@@ -382,8 +389,9 @@ class Daemon:
                 log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
                 waiting[name] = calibration, self._adaptation.read(name, calibration) if self._adaptation else None
         if request:
-            request.fault = ""
-        self._read = waiting
+            request.read, request.fault = waiting, ""
+        else:
+            self._read = waiting
 
     def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None, on_page: bool = False) -> None:
         """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what

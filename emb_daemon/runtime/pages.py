@@ -9,6 +9,7 @@ import os
 import queue
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -75,10 +76,12 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Request:
-    """A page, and who waits for the answer."""
+    """A page that was asked for at ``asked_ns``, what was ``read`` for it by ``read_ns``, and who waits for the answer."""
 
     def __init__(self, page: Page):
-        self.page = page
+        self.page, self.asked_ns = page, time.monotonic_ns()
+        self.read: dict = {}
+        self.read_ns: int | None = None
         #: What is wrong with the page; whoever checks it says that nothing is.
         self.fault = "could not be checked"
         self._answer: queue.SimpleQueue = queue.SimpleQueue()
