@@ -186,7 +186,7 @@ class Adaptation:
                      float(adapter["factor_sigma"]))  # fmt: skip
 
     def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
-        if state["started"] and corner not in self._on_page:
+        if corner not in self._on_page:
             snapshot = np.zeros(1, restart.SNAPSHOT)[0]
             if not restart.take_snapshot(state, parameters, snapshot):
                 return
