@@ -208,6 +208,21 @@ def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, cap
         assert ("another motion" in capsys.readouterr().err) == (share > 0.0)
 
 
+def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
+    """A motor that swings at 20 Hz, sampled at 67: between two samples nobody knows the way."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    time_s = 0.015 * np.arange(2000)
+    still = 0.0 * time_s
+    columns = {
+        "time_s": time_s,
+        "angle_rad": 0.15 * np.sin(125.6 * time_s),
+        "speed_rad_per_s": 18.84 * np.cos(125.6 * time_s),
+    }
+    columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
+    load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    assert "times as fast" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [

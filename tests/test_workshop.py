@@ -24,7 +24,7 @@ from emb_daemon.monitor.listener import Listener
 from emb_daemon.runtime.bus import open_bus
 from emb_daemon.wire.contract import CURRENT_LOST, DEGRADED, INIT, REASONS, RESOLVER_LOST, RUNNING
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import CORNERS
+from emb_daemon.wire.layout import CORNERS, ESTIMATOR_STATUS
 from emb_daemon.workshop import trouble
 from emb_daemon.workshop.trouble import (
     CONFIRMED,
@@ -170,7 +170,10 @@ class _Served:
             self.diagnostics.step()
 
     def broadcast(self, reasons: int, times: int = 3) -> None:
+        """Each is heard before the next comes: of what comes at once, the server takes the newest."""
+        status = self.diagnostics.listener.corners[FL].streams[ESTIMATOR_STATUS]
         for _ in range(times):
+            heard, deadline = status.received, time.monotonic() + 30.0
             now, counter = time.monotonic_ns(), self._counter % 15
             self._counter += 1
             self.daemon.send(np.concatenate([
@@ -180,8 +183,9 @@ class _Served:
                 wirekit.frame("EMB_FL_EstimatorStatus", now, counter, 1, Mode=3, StiffnessFactor=0.912, ContactAngle=-73.1,
                               DegradedReasons=reasons),
             ]))  # fmt: skip
-            time.sleep(0.03)
-        time.sleep(0.1)
+            while status.received == heard:
+                assert time.monotonic() < deadline, "a broadcast was not heard"
+                time.sleep(0.01)
 
     def stop(self) -> None:
         self._stop.set()
@@ -316,12 +320,14 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path):
         assert "requests 0x710, responses 0x718" in process.stdout.readline()
         request = np.zeros(1, FRAME)
         request["can_id"], request["length"], request["data"] = 0x710, 8, 0x3E02
-        # As often as the daemon: of what comes at once, the server takes the newest.
-        for counter in range(6):
+        # Until the code is kept: of what comes at once, the server takes the newest.
+        deadline, counter = time.monotonic() + 30.0, 0
+        while b'"occurrences": 1' not in (tmp_path / trouble.FILE).read_bytes():
+            assert time.monotonic() < deadline, "no trouble code was kept"
             daemon.send(wirekit.frame("EMB_RR_EstimatorStatus", time.monotonic_ns(), counter, 1, Mode=3, DegradedReasons=1))
+            counter = (counter + 1) % 15
             time.sleep(0.1)
         daemon.send(request)
-        deadline = time.monotonic() + 10.0
         while not len(heard := daemon.drain()):
             assert time.monotonic() < deadline, "no answer to tester present"
             daemon.wait(1.0)

@@ -40,6 +40,9 @@ _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
 #: Way from which an angle tells how fast it changes, rad; correlation of both from which it does; and how far their ratio may
 #: be from 1: a filter's delay makes some hundredths of it.
 _WAY_RAD, _CORRELATED, _OTHER_SCALE = 1.0, 0.8, 0.1
+#: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
+#: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
+_RESOLVED = 0.95
 #: Ratios of units that are taken for one another.
 _RATIOS = {
     30.0 / np.pi: "rpm taken for rad/s, or the reverse",
@@ -232,7 +235,8 @@ def _another_motion(angle: Series, speed: Series) -> str:
         and abs(ratio := float(way[known] @ turned[known] / (turned[known] @ turned[known]))) > 0.0
     ):
         correlation = float(np.corrcoef(way[known], turned[known])[0, 1])
-        if abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
+        resolved = np.corrcoef(at[1:][known], at[:-1][known])[0, 1] > _RESOLVED
+        if resolved and abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
     share = float(np.mean(apart[near]))
