@@ -235,6 +235,17 @@ def test_a_reload_goes_back_to_the_file(daemon):
     assert not daemon._on_page
 
 
+def test_a_page_ends_though_the_file_is_bad_by_then(daemon, folder, caplog):
+    ask(daemon, page({CLEARANCE: 7.0}))
+    (folder / "calibration.yaml").write_text("[")
+    daemon.reload()
+    follow(daemon, lambda: in_use(daemon) == of({}))
+    assert "the old one stays" in caplog.text and not daemon._on_page
+    daemon.reload()
+    follow(daemon, lambda: daemon._reader is None and not daemon._reload_wanted)
+    assert in_use(daemon) == of({})
+
+
 def test_nothing_is_learned_or_written_on_a_page(daemon, folder):
     state = folder / "state"
     daemon._adaptation._stores[0] = adaptkit.accepted(daemon._adaptation._stores[0])
@@ -308,9 +319,10 @@ def test_what_is_no_page_is_refused_and_the_next_is_heard(daemon, folder, caplog
         assert client.ask(page({CLEARANCE: float("nan")})).refused
         assert in_use(daemon) == of({}) and client.ask(page({CLEARANCE: 7.0})) == Answer()
     assert "page refused: not understood" in caplog.text
-    daemon._listener.close()
     client.close()
+    daemon._listener.close()
     assert not path.exists() and client.ask(page({})).later, "no daemon"
+    wait(lambda: "pages" not in [thread.name for thread in threading.enumerate()])
 
 
 def test_without_the_key_nothing_is_heard_or_written(tmp_path):

@@ -155,6 +155,8 @@ class Daemon:
         self._asked: Request | None = None
         self._page: Request | None = None
         self._on_page: set[str] = set()
+        #: Calibrations by corner that a file had last: without a page they are those in use.
+        self._of_files = dict(setup.calibrations)
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
@@ -379,7 +381,10 @@ class Daemon:
                 request.fault = str(error)
             else:
                 log.error("calibration not reloaded, the old one stays: %s", error)
-            return
+            if request or not self._on_page:
+                return
+            # A page does not stay because a file is bad.
+            calibrations = self._of_files
         waiting = {}
         for name, calibration in calibrations.items():
             words = {"corner": name, "calibration": calibration_hash(calibration)}
@@ -397,6 +402,8 @@ class Daemon:
         """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what
         it starts from, belong to that."""
         self._calibrations[name] = calibration
+        if not on_page:
+            self._of_files[name] = calibration
         self._on_page = self._on_page | {name} if on_page else self._on_page - {name}
         if self._shared:
             self._shared.tell_page(bool(self._on_page))

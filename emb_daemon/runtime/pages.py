@@ -144,7 +144,9 @@ class PageListener:
         return request.wait()
 
     def close(self) -> None:
-        """Take the socket away."""
+        """Take the socket away, and end the thread unless it hears somebody."""
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
