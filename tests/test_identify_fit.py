@@ -114,7 +114,7 @@ def test_the_free_regression_is_exact_on_data_of_its_form():
     force[0] = 0.0
     for row in range(1, len(force)):
         force[row] = (static[row] + ratio * force[row - 1]) / (1.0 + ratio)
-    coefficients, time_constant = regress_free(log, truth.clearance)
+    coefficients, time_constant = regress_free(log, log.samples["angle"] - truth.clearance)
     # alpha_0 = tau / (tau + dt), read as exp(-dt / tau).
     assert time_constant == pytest.approx(-0.004 / np.log(0.03 / 0.034), rel=1e-6)
     assert coefficients == pytest.approx(truth.curves[4.0], rel=1e-4)

@@ -58,7 +58,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     stiff = stiffness.identify(pads, start)
     progress(0.3, "torque path")
     motor = torque.identify(campaign, pads, start)
-    zero = contact.identify(stiff, sheet.resolver.count_rad, sheet.actuator.pad_clearance_rad)
+    zero = contact.identify(stiff, sheet.resolver.count_rad, start.contact.clearance_rad)
     for note in zero.notes:
         campaign.fault(f"contact: {note}")
     progress(0.4, "each thickness from the others")
