@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean deb fuzz soak mutation silent sbom audit fleet measurement
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb image fuzz soak mutation silent sbom audit fleet measurement
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -30,6 +30,11 @@ wheel: $(READY)
 DEB_MACHINE ?= $(shell uname -m)
 deb: wheel
 	$(VENV)/bin/python packaging/make_deb.py dist/*.whl --machine $(DEB_MACHINE)
+
+# An OCI image for replay, identification and fleets; CONTAINER=docker or buildah makes it as well.
+CONTAINER ?= podman
+image: wheel
+	$(CONTAINER) build --file packaging/Containerfile --tag emb-daemon .
 
 # What a user gets: the wheel in an environment with nothing else in it.
 wheel-demo: wheel

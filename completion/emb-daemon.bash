@@ -28,7 +28,7 @@ _emb_daemon() {
         export) options="--calibration --output --kernels" ;;
         uds) options="--config --state --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         xcp) options="--config --share --udp --can --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        a2l) options="--config --output" ;;
+        a2l) options="--config --output --udp --can --request-id --response-id -b --bitrate" ;;
         bench) options="--seconds --corners --json" ;;
         adaptation) options="--state --corner --yes" ;;
     esac

@@ -20,6 +20,7 @@ from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping as Mapping
 from emb_daemon.logs.resample import Series, fill_missing, frames_of
+from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.logs.write import reference_columns, table_columns
 from emb_daemon.offline import Log, corner_index, estimate, log_of
 from emb_daemon.offline import load_log as load_log
@@ -116,7 +117,8 @@ def log_of_arrays(
     """Measurements of any sampling rate as a log for `run`, brought to the daemon's rate as a mapping file's are.
 
     Args:
-        time_s: of each sample, ascending, shape (n,).
+        time_s: of each sample, shape (n,). What was recorded twice is left out, and stamps that come in bunches are spread
+            evenly, as of a file; both are said on stderr.
         angle_rad: motor angle, multi-turn, any zero; without one it is the speed added up.
         speed_rad_per_s: motor speed; without one it is the angle's change.
         current_A: torque-producing current; None if it was not measured.
@@ -128,11 +130,12 @@ def log_of_arrays(
             measured, or constants. One backing plate stands for both.
 
     Raises:
-        InputError: neither angle nor speed, an unknown column, another number of values than times, no backing plate.
+        InputError: neither angle nor speed, an unknown column, another number of values than times, no backing plate, times
+            that go back by more than a second, do not pass, or are no numbers.
     """
     corner_index(corner)
     columns |= {"angle_rad": angle_rad, "speed_rad_per_s": speed_rad_per_s, "current_A": current_A}
-    stamps = np.rint(1e9 * np.asarray(time_s, float)).astype(np.int64)
+    stamps, rows = _in_time(np.asarray(time_s, float), columns)
     messages = {"VEH_Status": {"AmbientTemp": ambient_C, "ParkBrake": 0.0, "BrakeRequest": 0.0, "VehicleSpeed": 0.0}}
     for name, values in columns.items():
         if name not in _ARRAYS:
@@ -140,7 +143,7 @@ def log_of_arrays(
         if values is None:
             continue
         message, signal = (part.format(corner) for part in _ARRAYS[name])
-        source = float(values) if np.ndim(values) == 0 else _series(name, stamps, np.asarray(values, float))
+        source = float(values) if np.ndim(values) == 0 else Series.of(stamps, np.asarray(values, float)[rows])
         if name == "current_A" and isinstance(source, Series):
             source = source.averaged(None if current_mean_s is None else 1e9 * current_mean_s)
         messages.setdefault(message, {})[signal] = source
@@ -152,10 +155,15 @@ def log_of_arrays(
     return log_of(frames_of({name: fill_missing(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
 
 
-def _series(name: str, time_ns: np.ndarray, values: np.ndarray) -> Series:
-    if values.shape != time_ns.shape:
-        raise InputError(f"{name}: expected as many values as times, found shape {values.shape} beside {time_ns.shape}")
-    return Series.of(time_ns, values)
+def _in_time(time_s: np.ndarray, columns: dict) -> tuple[np.ndarray, np.ndarray]:
+    """`in_time` of times in s and of what was measured at them."""
+    measured = {name: np.asarray(values, float) for name, values in columns.items() if values is not None and np.ndim(values)}
+    for name, values in measured.items():
+        if values.shape != time_s.shape:
+            raise InputError(f"{name}: expected as many values as times, found shape {values.shape} beside {time_s.shape}")
+    if not np.all(np.abs(time_s) < LATEST_S):
+        raise InputError(f"time_s: {time_s[~(np.abs(time_s) < LATEST_S)][0]:g} is no time in s")
+    return in_time("arrays", np.rint(1e9 * time_s).astype(np.int64), list(measured.values()))
 
 
 def _calibration(given: Calibration | str | Path | None) -> Calibration:

@@ -11,6 +11,7 @@ import numpy as np
 
 from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator.answer import answer
+from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.jit import Array, entry, fields, njit
 from emb_daemon.wire import contract
@@ -123,6 +124,26 @@ class Pipeline:
         self.states[corner] = new_state()[0]
         for name in ("started", "cycle", "announced", "predicted", "late_ns", "agreed"):
             self.corners[name][corner] = 0
+
+    def why_not_at_rest(self) -> str:
+        """What keeps the car from being seen to stand with its brakes released, in words; empty if nothing does."""
+        status, wheels = self.receptions[wire.VEHICLE_STATUS], self.receptions[wire.WHEEL_SPEED]
+        for index in np.flatnonzero(self.corners["active"]):
+            corner, name = self.corners[index], wire.CORNERS[index]
+            now = corner["sample_ns"]
+            if not corner["started"] or corner["predicted"]:
+                return f"corner {name} is not heard"
+            if self.states[index]["contact"]["engaged"]:
+                return f"corner {name} is not released"
+            if now - status["time_ns"] >= _USABLE_NS:
+                return "the vehicle's status is not heard"
+            if now - wheels["time_ns"] < _USABLE_NS and wheels["values"][index] > TURNING_RAD_PER_S:
+                return f"wheel {name} turns"
+        if status["values"][wire.VEHICLE_SPEED] > 0.0:
+            return "the vehicle moves"
+        if status["values"][wire.BRAKE_REQUEST] != 0.0:
+            return "the brake is asked for"
+        return ""
 
     def distrust(self, corners) -> None:
         """Call the estimates of these corners a fault: whose they or their inputs are nobody can prove."""

@@ -11,6 +11,7 @@ another drive; printed are its errors, what the calibration says of itself, and 
 import argparse
 import contextlib
 import io
+import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -41,10 +42,13 @@ _REFERENCE_N = 25.0
 
 @dataclass
 class Stranger:
-    """A brake, what is special about it, and its campaign's schedules by file name with the pad thickness (mm) of each."""
+    """A brake, what is special about it, and its campaign's schedules by file name with the pad thickness (mm) of each.
+    ``sheet`` is what its datasheet says of the actuator beside the usual, ``limit`` the drive's current over the usual."""
 
     calibration: Calibration
     effects: dict[str, dict[str, float]]
+    sheet: dict = field(default_factory=dict)
+    limit: float = 1.0
     logs: dict[str, tuple[sc.Schedule, float]] = field(default_factory=dict)
 
 
@@ -102,6 +106,13 @@ def draw_stranger(seed: int) -> Stranger:
     drive = _drive(calibration, np.random.default_rng(seed), 4)
     foreign = sized(base, schedule + drive, calibration, draw_foreign(rng), size, seed)
     stranger = Stranger(calibration, effects | foreign)
+    plan(stranger, seed, rng)
+    return stranger
+
+
+def plan(stranger: Stranger, seed: int, rng: np.random.Generator) -> None:
+    """What a rig records of the brake."""
+    calibration = stranger.calibration
     high = calibration.stiffness.maximum_force_N
     for thickness in _THICKNESSES_MM:
         plant = _plant(stranger, seed, thickness)
@@ -114,11 +125,12 @@ def draw_stranger(seed: int) -> Stranger:
         stranger.logs[name] = _heat(calibration, rng), 10.0
     for name in ("fit", "judge", "val"):
         stranger.logs[name] = _drive(calibration, rng, 25), 10.0
-    return stranger
 
 
 def _plant(stranger: Stranger, seed: int, thickness: float) -> np.void:
-    return plant_from_calibration(stranger.calibration, seed=seed, effects=stranger.effects, pad_thickness_mm=thickness)
+    plant = plant_from_calibration(stranger.calibration, seed=seed, effects=stranger.effects, pad_thickness_mm=thickness)
+    plant["maximum_current"] *= stranger.limit
+    return plant
 
 
 def _random(plant: np.void, rng: np.random.Generator, high: float) -> sc.Schedule:
@@ -158,7 +170,7 @@ def record(stranger: Stranger, seed: int, folder: Path) -> Path:
         "max_motor_speed_rad_per_s": c.motor.maximum_speed_rad_per_s,
         "rated_clamp_force_N": c.stiffness.maximum_force_N,
         "pad_clearance_rad": float(c.contact.clearance_rad * off(0.05)),
-    }
+    } | stranger.sheet
     (folder / "datasheet.yaml").write_text(yaml.safe_dump(sheet))
     of = {t: {"pad_thickness_mm": t} for t in (*_THICKNESSES_MM, 5.0)}
     campaign = {
@@ -194,17 +206,19 @@ def judge(calibration: Calibration, path: Path) -> dict[str, float]:
     }
 
 
-def run(seed: int, folder: Path) -> str:
+def run(stranger: Stranger, seed: int, folder: Path) -> str:
     """One line: the brake, what it hides, what was named, and the errors."""
-    stranger = draw_stranger(seed)
+    hidden = {name: {key: round(value, 6) for key, value in values.items()} for name, values in stranger.effects.items()}
+    head = f"seed {seed}: {stranger.calibration.stiffness.maximum_force_N:.0f} N, hides {hidden}"
+    print(f"{head}\n  recording", file=sys.stderr, flush=True)
     campaign = record(stranger, seed, folder)
+    print("  identifying", file=sys.stderr, flush=True)
     begin, said = time.monotonic(), io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         status = emb_daemon(["identify", str(campaign), "--output", str(folder / "c.yaml"), "--report", str(folder / "r")])
     seconds = time.monotonic() - begin
     (folder / "said.txt").write_text(said.getvalue())
-    hidden = {name: {key: round(value, 6) for key, value in values.items()} for name, values in stranger.effects.items()}
-    head = f"seed {seed}: {stranger.calibration.stiffness.maximum_force_N:.0f} N, hides {hidden}"
+    print(f"  judging, identified in {seconds:.0f} s, status {status}", file=sys.stderr, flush=True)
     if status not in (0, 3):
         return f"{head}\n  identify ended with {status}: {said.getvalue().strip().splitlines()[-1]}"
     calibration = load_calibration(folder / "c.yaml")
@@ -213,8 +227,8 @@ def run(seed: int, folder: Path) -> str:
     return f"{head}\n  named: {found}\n  {errors}  says {calibration.provenance.achieved}  {seconds:.0f} s, status {status}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(draw=draw_stranger, text=__doc__) -> None:
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--kept", type=Path, metavar="DIR", help="logs, calibrations and reports stay there")
     arguments = parser.parse_args()
@@ -224,7 +238,7 @@ def main() -> None:
             if arguments.kept:
                 folder = arguments.kept / str(seed)
                 folder.mkdir(parents=True, exist_ok=True)
-            print(run(seed, folder), flush=True)
+            print(run(draw(seed), seed, folder), flush=True)
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def best_fit_line(log: Log) -> tuple[float, np.ndarray, np.ndarray]:
         (clearance in rad, coefficients, residual in N at each sample with a reference).
     """
     x, known = _travel(log), np.isfinite(log.force_N)
-    force, guess = log.force_N[known], clearance_guess(log)
+    force, guess = log.force_N[known], clearance_guess(log, x)
     span = float(x.max() - guess)
     scale = span ** np.arange(1, 4)
 

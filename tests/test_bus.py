@@ -12,7 +12,7 @@ from emb_daemon.calibration.configuration import Bus
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.errors import Unavailable
 from emb_daemon.runtime.bus import open_bus
-from emb_daemon.wire.frames import ERROR
+from emb_daemon.wire.frames import ERROR, FRAME
 
 #: Of its own for each run, so that two test runs on one machine do not hear each other.
 _GROUP = f"239.74.163.{os.getpid() % 250 + 3}"
@@ -83,6 +83,22 @@ def test_error_frames_are_heard(virtual):
     ours, theirs = virtual
     theirs.send(can.Message(arbitration_id=0x20, is_error_frame=True, is_extended_id=False))
     assert ours.drain()["flags"].tolist() == [ERROR]
+
+
+def test_what_could_not_be_sent_is_counted_and_the_rest_goes_out(virtual, monkeypatch):
+    ours, theirs = virtual
+    send = ours._bus.send
+
+    def refuse_one(message):
+        if message.arbitration_id == 0x102:
+            raise can.CanOperationError("no buffer space")
+        send(message)
+
+    monkeypatch.setattr(ours._bus, "send", refuse_one)
+    frames = np.zeros(3, FRAME)
+    frames["can_id"] = 0x101, 0x102, 0x103
+    ours.send(frames)
+    assert ours.unsent == 1 and [theirs.recv(1.0).arbitration_id for _ in range(2)] == [0x101, 0x103]
 
 
 def _options(command_line: str, defaults=None) -> dict:

@@ -177,6 +177,15 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
         assert messages[-1] == b"STOPPING=1"
 
 
+def test_the_service_manager_is_told_the_state_again_and_again(setup: Setup, monkeypatch):
+    monkeypatch.setattr("emb_daemon.runtime.daemon._STATUS_NS", 20_000_000)
+    manager, told = ServiceManager(environment={}), []
+    manager.notify = lambda *assignments: told.extend(assignments)
+    with Running(setup, manager) as running:
+        running.wait_for(lambda _: sum(" ticks, " in words for words in told) >= 3)
+    assert told[1] == "STATUS=waiting for inputs" and told[2].startswith("STATUS=") and told[2].endswith("frames dropped")
+
+
 def test_a_stop_keeps_what_is_known_at_that_moment(setup: Setup, drive, tmp_path: Path):
     with Running(setup, state=tmp_path) as running:
         for frames in drive[:200]:

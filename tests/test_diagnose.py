@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
-from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
+from emb_daemon.diagnose import confirmation, diagnosis, grammar, prospects, search
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.diagnosis import diagnose
@@ -38,6 +39,7 @@ from emb_daemon.diagnose.unexplained import Left, achieved
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
+from emb_daemon.identify.steps import attribution
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
@@ -432,6 +434,27 @@ def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monke
     assert "viscous_friction" not in result.calibration.effects
 
 
+def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monkeypatch):
+    """What the contact angle learns of the other path is no word on it; what is left of its own on left-out episodes is."""
+    judge_left_out, left_out = confirmation.left_out_errors, confirmation._left_out_residuals
+
+    def worse_while_learning(selection, without=""):
+        errors = judge_left_out(selection, without)
+        errors.sums[errors.paths.index("torque")] *= 100.0
+        return errors
+
+    monkeypatch.setattr(confirmation, "left_out_errors", worse_while_learning)
+    assert [finding.effect.name for finding in judged().accepted] == ["viscous_friction"]
+
+    def worse(selection, without=""):
+        found = left_out(selection, without)
+        return found | {"torque": found["torque"] * (4.0 if selection.accepted and not without else 1.0)}
+
+    monkeypatch.setattr(confirmation, "_left_out_residuals", worse)
+    refused = next(f for f in judged().findings if f.effect.name == "viscous_friction")
+    assert not refused.accepted and "left of the torque path goes from" in refused.reason
+
+
 def test_validation_has_a_veto(calibration, judged):
     """The fit log is of a brake with viscous friction, the validation log of one without: nothing carries over."""
     result = judged(log_of(_logs(calibration, 54, {}, stops=3)[1]))
@@ -517,6 +540,41 @@ def test_a_term_is_made_for_what_no_catalogue_holds(calibration, coupled, tmp_pa
     assert result.unexplained is None
     assert "brake torque" in verdict(result) and "what it does" in page(result)
     assert errors(Bench(logs[1:], calibration), loaded).rmse("fused") == result.after.rmse("fused")
+
+
+def test_a_contact_that_what_was_found_has_moved_is_as_unsure_as_that(calibration):
+    """Logs of curves have found their own contact; of a drive, whose contact the fit of a term has moved, it is not known."""
+    start = calibration.contact.clearance_rad
+    coordinates = base_coordinates(calibration, [start + 1.0, start])[:2]
+    fitted = dict(zip(coordinates, (start + 1.0, start + 0.3), strict=True))
+    found = attribution._contact(SimpleNamespace(applied=lambda: fitted), calibration, 1)
+    assert found.clearance_rad == start
+    assert found.clearance_sigma_rad == pytest.approx(np.hypot(calibration.contact.clearance_sigma_rad, 0.3))
+    assert attribution._contact(SimpleNamespace(applied=dict), calibration, 1) == calibration.contact
+
+
+@pytest.mark.parametrize(("port", "taken"), [("stiffness", True), ("thickness", False)])
+def test_a_term_is_taken_where_its_port_is_sure_though_its_signal_is_not(coupled, monkeypatch, port, taken):
+    """Three in five resampled episodes choose another: of the same port it is taken, and the noise holds the difference."""
+    [name] = coupled[0].accepted
+    bare = coupled[0].without(name, "to be made again")
+    offered = ("brake_torque", "disc_speed") if taken else ("brake_torque",)
+    enumerated = prospects.enumerate_forms
+    some = lambda *of: [f for f in enumerated(*of) if f.signal in offered and f.port in ("stiffness", port)]  # noqa: E731
+    monkeypatch.setattr(prospects, "enumerate_forms", some)
+    rival = (port, offered[-1])
+    monkeypatch.setattr(
+        grammar, "_shares", lambda _, found: dict.fromkeys((p.means for p in found), 0.0) | {
+            ("stiffness", "brake_torque"): 0.4, rival: 0.6}
+    )  # fmt: skip
+    found = grammar._one_more(bare, "stiffness")
+    [term] = [c for name, c in found.candidates.items() if name not in bare.candidates]
+    assert term.accepted == taken and term.confounded_with == " over ".join(rival).replace("_", " ") and term.manoeuvre
+    undecided = diagnosis.undecided(found)
+    before = found.model.bench.calibration
+    after = diagnosis._with_noise(before, found).noise.stiffness_relative
+    assert (undecided.get("noise.stiffness_relative", 0.0) > 0.0) == taken
+    assert not taken or after >= undecided["noise.stiffness_relative"]
 
 
 def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):
@@ -742,6 +800,6 @@ def test_a_path_that_is_no_number_any_more_has_got_worse():
     errors = {"fused": np.full(400, 10.0), "torque": np.full(400, 10.0)}
     before = EpisodeErrors.of(errors, {}, episode)
     lost = errors | {"torque": np.where(episode > 1, np.nan, 1.0)}
-    assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused", {"torque"})
+    assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused")
     better = errors | {"torque": np.full(400, 1.0)}
-    assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused", {"torque"})
+    assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused")

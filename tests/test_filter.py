@@ -60,7 +60,7 @@ def _sensitivities(p, force, slope, speed, accelerating, motor_torque, friction_
     to_force(to_f, p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
     to_t[:] = to_f
     slow = friction_mean * np.exp(-abs(speed) / 10.0)
-    to_torque(to_t, leverage, friction_mean, force, speed, slow, accelerating, motor_torque, *heats)
+    to_torque(to_t, leverage, 1.0, friction_mean, force, speed, slow, accelerating, motor_torque, *heats)
     return to_f, to_t
 
 

@@ -146,11 +146,12 @@ _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,#N/A") + "0.4,10,25,1.5,22,Over\n", "out, the first of"),
         ((_HEADER + "\n" + _table(100)).replace("\n", "\r"), ""),
         ((_HEADER + "\n" + _table(100)).replace(",", "|"), ""),
+        (("# a tool's words\n# " + _HEADER + "\n" + _table(100, " {t:8.3f}, {a:.1f},25.0,1.5,22,0")).replace(",", "  "), ""),
         ("sep=;\n" + (_HEADER + "\n" + _table(100, "{t:g},{a:g},25,1.5,22,0")).replace(",", ";").replace(".", ","), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off", "two headers", "words",
-        "old Mac", "bars", "late decimal commas",
+        "old Mac", "bars", "blanks", "late decimal commas",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
@@ -356,11 +357,29 @@ def test_arrays_are_a_log(truth):
         ({"current_mA": motion[2]}, "current_mA: no such column; expected one of angle_rad"),
         ({"force_N": force_N[:5]}, "force_N: expected as many values as times"),
         ({"caliper_C": 20.0}, "expected inner_backplate_C or outer_backplate_C"),
+        ({"time_s": np.roll(time_s, 150)}, "arrays: time goes back by"),
+        ({"time_s": 1e9 * time_s + 1e10}, "is no time in s"),
+        ({"time_s": np.where(time_s > 1.0, np.nan, time_s)}, "time_s: nan is no time in s"),
     ):
         with pytest.raises(InputError, match=expected):
-            emb_daemon.log_of_arrays(time_s, *motion, **wrong)
+            emb_daemon.log_of_arrays(**{"time_s": time_s, "angle_rad": motion[0]} | wrong)
     with pytest.raises(InputError, match="expected one of them"):
         emb_daemon.log_of_arrays(time_s, current_A=motion[2])
+
+
+def test_stamps_of_arrays_are_put_right_as_a_files(truth, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    time_s, angle_rad = columns["time_s"], columns["angle_rad"]
+    right = emb_daemon.log_of_arrays(time_s, angle_rad).samples
+    assert capsys.readouterr().err == ""
+    twice = np.sort(np.concatenate([np.arange(len(time_s)), np.arange(0, len(time_s), 3)]))
+    for stamps, rows, said in (
+        (time_s[twice], twice, f"arrays: {len(twice) - len(time_s)} of {len(twice)} values were recorded twice"),
+        (np.floor(time_s / 0.01) * 0.01, slice(None), "arrays: stamps come in bunches, one every 10 ms: spread evenly"),
+    ):
+        samples = emb_daemon.log_of_arrays(stamps, angle_rad[rows]).samples
+        assert said in capsys.readouterr().err
+        assert len(samples) == len(right) and np.allclose(samples["angle"][20:-20], right["angle"][20:-20], atol=2e-4)
 
 
 def test_a_log_of_other_ids_is_told_by_them(bus, capsys):

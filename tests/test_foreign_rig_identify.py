@@ -13,6 +13,7 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.identify import validation
 from emb_daemon.identify.example import FILES
+from emb_daemon.identify.steps import attribution
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant import scenarios as sc
@@ -138,5 +139,6 @@ def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
         return estimates
 
     monkeypatch.setattr(validation, "estimate", overconfident)
+    monkeypatch.setattr(attribution, "identify", lambda _, hot, known, progress: attribution._unsearched(hot, known))
     main(["identify", str(tmp_path / "campaign.yaml"), "--output", str(output)])
     assert re.search(r"judge: \d+ % of the errors inside two sigma, .* worse than it says", capsys.readouterr().err)

@@ -1,18 +1,23 @@
 """Identification finds what simulated rigs were given, and says how well it knows it."""
 
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from synthetic_rig import datasheet, draw, pads
 
+from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
+from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
-from emb_daemon.identify.steps import noise, stiffness
+from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.identify.steps.thickness import left_out_errors
 from emb_daemon.identify.steps.torque import fit_torque
+from emb_daemon.resources import resource
 
 
 def _datasheet_of(truth, rng) -> Datasheet:
@@ -109,7 +114,7 @@ def test_the_free_regression_is_exact_on_data_of_its_form():
     force[0] = 0.0
     for row in range(1, len(force)):
         force[row] = (static[row] + ratio * force[row - 1]) / (1.0 + ratio)
-    coefficients, time_constant = regress_free(log, truth.clearance)
+    coefficients, time_constant = regress_free(log, log.samples["angle"] - truth.clearance)
     # alpha_0 = tau / (tau + dt), read as exp(-dt / tau).
     assert time_constant == pytest.approx(-0.004 / np.log(0.03 / 0.034), rel=1e-6)
     assert coefficients == pytest.approx(truth.curves[4.0], rel=1e-4)
@@ -137,6 +142,43 @@ def test_current_noise_tells_what_is_coloured_from_a_difference_of_noisy_speeds(
     series = [_coloured(rng, 40_000, 0.3, 0.02) + np.diff(white)]
     sigma, time = noise.current_noise(series, difference_A)
     assert (sigma, time) == pytest.approx((0.3, 0.02), rel=0.1)
+
+
+def test_what_stays_for_a_manoeuvre_is_in_the_noise_of_the_current():
+    """The density at the slow end, 2 sigma^2 time: what lasts adds its own to it, and nothing is added where nothing does."""
+    plain = _coloured(np.random.default_rng(3), 60_000, 0.3, 0.02)
+    stays = np.repeat(np.random.default_rng(4).normal(0.0, 0.2, 240), 250)
+    sigma, time = noise._with_what_lasts([plain], 0.3, 0.02)
+    assert sigma**2 * time == pytest.approx(0.3**2 * 0.02, rel=0.15)
+    sigma, time = noise._with_what_lasts([plain + stays], 0.3, 0.02)
+    assert sigma == pytest.approx(np.hypot(0.3, 0.2), rel=0.03)
+    assert sigma**2 * time == pytest.approx(0.3**2 * 0.02 + 0.2**2 * 1.0, rel=0.2)
+    assert noise._with_what_lasts([plain[:100]], 0.3, 0.02) == (0.3, 0.02)
+
+
+def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
+    found = SimpleNamespace(fit=SimpleNamespace(curves=[SimpleNamespace(travel_rad=20.0)]))
+    campaign = SimpleNamespace(datasheet=SimpleNamespace(actuator=SimpleNamespace(max_motor_speed_rad_per_s=200.0)))
+    unseen, seen, faster = (noise._unknown_lag(found, campaign, speed) for speed in (0.0, 150.0, 250.0))
+    assert unseen > 0.0 and seen == pytest.approx(0.25 * unseen) and faster == 0.0
+
+
+@pytest.mark.parametrize(("share", "searched"), [(0.3, False), (0.8, True)])
+def test_without_random_motion_a_campaign_is_searched_where_it_clamps_fast(monkeypatch, share, searched):
+    """Slow motion leaves lag and inertia to the datasheet, and what a search makes of them is none of the brake's."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    speed = share * calibration.motor.maximum_speed_rad_per_s * np.array([0.0, 1.0, 1.5])
+    drive = SimpleNamespace(samples={"speed": speed}, force_N=np.array([0.0, 5e3, 0.0]))
+    without_random = SimpleNamespace(pads=[], fit=SimpleNamespace(curves=[]))
+
+    def search(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr(attribution, "Bench", lambda *_, **__: SimpleNamespace(episodes=EPISODES))
+    monkeypatch.setattr(attribution, "diagnose_bench", search)
+    monkeypatch.setattr(attribution, "_unsearched", lambda hot, known: known)
+    with pytest.raises(InterruptedError) if searched else nullcontext():
+        assert attribution.identify(without_random, [drive], calibration, print) is calibration
 
 
 def test_force_error_levels_tell_floor_from_relative_part():

@@ -167,6 +167,16 @@ def test_a_bad_calibration_is_named_and_the_old_one_stays(daemon, folder, caplog
     assert "the old one stays" in caplog.text and daemon.pipeline.parameters.tobytes() == before.tobytes()
 
 
+def test_corners_are_not_changed_by_a_reload(daemon, folder, caplog):
+    file = folder / "emb.yaml"
+    file.write_text(file.read_text().replace("  FL:", "  FR: {calibration: calibration.yaml}\n  FL:"))
+    save_calibration(moved(SHIPPED, {"contact.clearance_rad": 7.0}), folder / "calibration.yaml")
+    before = daemon.pipeline.parameters.copy()
+    reload_now(daemon)
+    assert "corners: a reload cannot change them" in caplog.text
+    assert daemon.pipeline.parameters.tobytes() == before.tobytes()
+
+
 def test_the_last_of_quick_reloads_counts(daemon, folder):
     """Two requests while the first file is still being read: the second file is read after it, never beside it."""
     reading, go_on, read = [], threading.Event(), daemon._read_calibrations

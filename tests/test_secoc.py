@@ -7,6 +7,7 @@ import sys
 import time
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import cantools
 import numpy as np
@@ -286,6 +287,18 @@ def test_what_was_heard_before_a_restart_is_not_believed_after_it():
     assert fresh(verifier(last).verify(signed(trip=2))) == (len(drive()), 0)
 
 
+def test_the_last_set_comes_no_second_time():
+    """Neither at once nor after a pause: its message counter does not go on, and is taken for the next reset's."""
+    receiver, last = verifier(), of(signed(), AUTH)[-1]
+    heard = receiver.verify(signed()[: last + 1])
+    again = signed()[last - 2 : last + 1].copy()
+    assert set(again["can_id"]) == {0x100, 0x110, AUTH} and not np.any(heard["flags"][-2:])
+    for pause_ns in (100_000, 3_000_000_000):
+        again["time_ns"] += pause_ns
+        repeated = receiver.verify(again)
+        assert not np.any(repeated["flags"] == 0) and np.any(repeated["flags"] == UNAUTHENTIC)
+
+
 def test_keys_of_others_open_nothing():
     """Each sender has its own: the vehicle's cannot speak for a corner, nor can the daemon's."""
     for name in KEYS:
@@ -409,6 +422,25 @@ class TestFreshnessFile:
         assert not first.stale()
         second = opened(tmp_path)
         assert fresh(second.verify(signed()))[0] == 0 and fresh(second.verify(signed(trip=2)))[0] == len(drive())
+
+    def test_what_was_heard_of_a_corner_that_is_left_out_for_a_while_is_not_forgotten(self, tmp_path):
+        file = FreshnessFile(tmp_path)
+        file.keep(Freshness(heard={"EMB_RR_Auth": (7, 9)}))
+        opened(tmp_path).close()
+        assert "EMB_RR_Auth" not in [link.name for link in RECEIVED] and file.load().heard["EMB_RR_Auth"] == (7, 9)
+
+    def test_a_bus_that_is_heard_for_long_keeps_what_it_heard(self, tmp_path):
+        frames, bus = signed(), SimpleNamespace()
+        authentication = opened(tmp_path)
+        secured_bus = SecuredBus(bus, authentication)
+        bus.drain = lambda: frames[:4095]
+        secured_bus.drain()
+        assert authentication.stale()
+        bus.drain = lambda: frames[4095:4096]
+        secured_bus.drain()
+        # What was heard up to then is kept; who drains waits for no disk.
+        authentication._writer.join()
+        assert FreshnessFile(tmp_path).load().heard["EMB_FL_Auth"][0] == 1
 
     def test_a_damaged_file_is_set_aside(self, tmp_path, caplog):
         FreshnessFile(tmp_path).path.write_text("{")

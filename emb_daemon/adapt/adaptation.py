@@ -63,6 +63,7 @@ class Adaptation:
         self._evaluations: dict[int, Evaluation] = {}
         self._snapshots = Snapshots(memory.folder, restart.SNAPSHOT)
         self._resumable: dict[int, tuple[np.void, int]] = {}
+        self._on_page: set[int] = set()
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -85,11 +86,17 @@ class Adaptation:
             log.warning("corner %s: %s", corner, warning)
         return store
 
-    def replace(self, corner: str, calibration: Calibration, store: Store) -> None:
-        """Go over to another calibration between two ticks, and to what `read` found; a training that runs is forgotten."""
+    def replace(self, corner: str, calibration: Calibration, store: Store, on_page: bool = False) -> None:
+        """Go over to another calibration between two ticks, and to what `read` found; a training that runs is forgotten.
+
+        With one that is no file's (``on_page``) nothing is learned, and what the memory holds of the file's stays."""
         index = CORNERS.index(corner)
         self._calibrations[index], self._stores[index] = calibration, store
         self.limits[index] = r.to_limits(calibration)
+        self._on_page.discard(index)
+        if on_page:
+            self._on_page.add(index)
+            self.limits[index]["enabled"] = False
         self._resumable.pop(index, None)
         generation = self.adapters[index]["generation"] + 1
         self.adapters[index] = np.zeros((), r.ADAPTER)
@@ -179,7 +186,7 @@ class Adaptation:
                      float(adapter["factor_sigma"]))  # fmt: skip
 
     def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
-        if state["started"]:
+        if corner not in self._on_page:
             snapshot = np.zeros(1, restart.SNAPSHOT)[0]
             if not restart.take_snapshot(state, parameters, snapshot):
                 return

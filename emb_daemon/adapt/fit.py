@@ -31,7 +31,15 @@ from emb_daemon.adapt.learned import (
     curve_values,
     why_out_of_bounds,
 )
-from emb_daemon.adapt.pairs import ANGLE, FORCE, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes
+from emb_daemon.adapt.pairs import (
+    ANGLE,
+    FORCE,
+    WEIGHT,
+    curve_from_pairs,
+    friction_from_pairs,
+    pairs_of_passes,
+    turned_angles,
+)
 from emb_daemon.calibration.parameters import (
     LOAD_FRICTION,
     OFFSET_FRICTION,
@@ -88,7 +96,9 @@ def unexplained_step(s, p, row):
     force = 0.5 * (before + s.force)
     # What driving has found of friction at low and at high speed; a training's fit has neither.
     slow = (
-        s.friction_mean * (p.offset_friction + p.load_friction * force) * exp(-0.5 * abs(row.speed + speed) / SLOW_RAD_PER_S)
+        s.friction_mean
+        * (p.offset_friction + p.load_friction * (force + s.spring_force) * s.gear_slope)
+        * exp(-0.5 * abs(row.speed + speed) / SLOW_RAD_PER_S)
     )
     return torque - leverage * force - s.error[SLOW] * slow - s.error[VISCOUS] * 0.5 * (row.speed + speed)
 
@@ -169,7 +179,7 @@ def compile_fit(calibration, state):
     x = np.zeros(_CURVE + curve_terms(calibration))
     x[_CURVE] = 1.0
     _Training(rows, calibration, state, np.ones(len(x) - _CURVE)).simulate(x)
-    pairs_of_passes(rows, p)
+    pairs_of_passes(rows, p, 0.0)
     travel_at(0.0, p["curve"])
     characteristic_curve(0.0, p["curve"])
 
@@ -258,12 +268,12 @@ def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=_INERTI
     return _improve(training, first.x, steps, first.spread * prior, free)
 
 
-def _guess(rows, pairs, now, terms):
+def _guess(highest, pairs, now, terms):
     """(fitted values by the pairs of passes, NaN where there are none; unit of each of the curve's coefficients)."""
     contact, start = curve_from_pairs(pairs, terms)
     offset, load = friction_from_pairs(pairs)
     powers = np.arange(1, terms + 1)
-    top = rows["angle"].max() - contact
+    top = highest - contact
     scale = max(start @ top**powers, 1.0) / top**powers
     friction = max(load, 0.0) / now["gear_gain"], max(offset, 1e-5), log(now["presliding_angle"])
     return np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale]), scale
@@ -373,8 +383,9 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
     terms = curve_terms(calibration)
-    pairs = pairs_of_passes(rows, now)
-    x, scale = _guess(rows, pairs, now, terms)
+    zero = float(state["gear_zero"])
+    pairs, highest = pairs_of_passes(rows, now, zero), turned_angles(rows, now, zero).max()
+    x, scale = _guess(highest, pairs, now, terms)
     if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     training = _Training(rows, calibration, state, scale)
@@ -387,7 +398,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     expected, _ = torque_sigma(*_noises(calibration))
     sigma = _deviation(fit.residual)
     sigmas = np.sqrt(np.diag(covariance))
-    top = rows["angle"].max() - x[_CONTACT]
+    top = highest - x[_CONTACT]
     # The torque constant's error scales the whole curve, whose shape is known better than its size.
     along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
     constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)

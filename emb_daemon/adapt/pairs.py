@@ -11,6 +11,7 @@ from emb_daemon.adapt.records import TRAINING
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.jit import Array, entry
 from emb_daemon.models.contact import torque_sigma
+from emb_daemon.models.gear import through_gear
 from emb_daemon.models.torque import friction_state, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -29,9 +30,17 @@ _CANDIDATES = 60
 ANGLE, FORCE, FRICTION, WEIGHT = range(4)
 
 
-@entry(Array(TRAINING), PARAMETERS, Array(np.float64), Array(np.float64))
-def _sliding(rows, p, direction, torque):
-    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque without it and inertia (N m)."""
+@entry(Array(TRAINING), PARAMETERS, float, Array(np.float64))
+def _turn(rows, p, gear_zero, turned):
+    """Equivalent angles (`models.gear`), rad."""
+    for i in range(len(rows)):
+        turned[i] = gear_zero + through_gear(p.gear, rows[i].angle - gear_zero)[0] if p.gear.step > 0.0 else rows[i].angle
+
+
+@entry(Array(TRAINING), PARAMETERS, float, Array(np.float64), Array(np.float64))
+def _sliding(rows, p, gear_zero, direction, torque):
+    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque (N m) without it, inertia
+    and release spring, over the gear's slope."""
     state, variance = 0.0, 1.0
     direction[0] = 0.0
     for i in range(1, len(rows)):
@@ -40,16 +49,25 @@ def _sliding(rows, p, direction, torque):
         usable = row.has_current and abs(mean) >= _TURNED_OVER
         direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
         torque[i] = unexplained_torque(p.torque_constant * row.current_q, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
+        past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + last.angle) - gear_zero)
+        torque[i] = torque[i] / slope - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
 
 
-def pairs_of_passes(rows, p):
-    """Pairs of one training (TRAINING rows, PARAMETERS record); returns (pairs, 4): rad, N, N m, samples."""
-    angle = rows["angle"]
+def turned_angles(rows, p, gear_zero):
+    """Equivalent angles (`models.gear`) of TRAINING rows, rad; PARAMETERS record ``p``, STATE's ``gear_zero``."""
+    turned = np.empty(len(rows))
+    _turn(rows, p, gear_zero, turned)
+    return turned
+
+
+def pairs_of_passes(rows, p, gear_zero=0.0):
+    """Pairs of one training (arguments of `turned_angles`); returns (pairs, 4): equivalent angle in rad, N, N m, samples."""
+    angle = turned_angles(rows, p, gear_zero)
     low = angle.min()
     width = max(angle.max() - low, 1e-9) / _BINS
     sigma, _ = torque_sigma(p["torque_constant"] * p["current_sigma"], p["inertia"] * p["speed_sigma"] / CYCLE_S)
     direction, torque = np.zeros(len(rows)), np.zeros(len(rows))
-    _sliding(rows, p, direction, torque)
+    _sliding(rows, p, gear_zero, direction, torque)
     middle = 0.5 * (angle + np.concatenate([angle[:1], angle[:-1]]))
     # Clamping passes in the first half of the bins, releasing ones in the second.
     bins = np.minimum((middle - low) / width, _BINS - 1).astype(int) + np.where(direction > 0.0, 0, _BINS)

@@ -65,6 +65,14 @@ class Secoc(Struct, kw_only=True):
     keys: str
 
 
+class Xcp(Struct, kw_only=True):
+    """What a measurement tool may do besides measuring."""
+
+    #: Whether it may try other numbers of the calibration, with the car standing and the brakes released, until its server
+    #: ends. Files stay as they are.
+    calibrate: bool = False
+
+
 class Configuration(Struct, kw_only=True):
     """config/emb.yaml."""
 
@@ -80,6 +88,7 @@ class Configuration(Struct, kw_only=True):
     state_directory: str | None = None
     #: Without it nothing is authenticated.
     secoc: Secoc | None = None
+    xcp: Xcp = Xcp()
     realtime: Realtime = Realtime()
     #: What the journal gets: debug, info, warning or error.
     log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"

@@ -35,6 +35,7 @@ _UNITS = {
     "Nm_per_A": "N·m/A",
     "kg_m2": "kg·m²",
     "m_per_rad": "m/rad",
+    "N_per_m": "N/m",
     "rad_per_s": "rad/s",
     "rad_per_sqrt_s": "rad/√s",
     "kg_per_m3": "kg/m³",

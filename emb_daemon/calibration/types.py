@@ -16,11 +16,53 @@ from emb_daemon.calibration.terms import Term, faults_of, fill_terms
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InvalidValue
 from emb_daemon.estimator.records import FORCE_GRID, PARAMETERS, SPEED_GRID, TEMPERATURE_GRID
+from emb_daemon.models.gear import GEAR, fill_gear
+from emb_daemon.models.stiffness import travel_at
 from emb_daemon.models.thermal import mesh
 
 #: Training reaches the forces that hold a parked car: 18 kN, 60 % of what the brake of the shipped calibration can do, and on
 #: weaker brakes the same share.
 _TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
+
+
+class Travel(Struct, kw_only=True):
+    """Clamp travel over motor angle past the released position, of a gear that is not constant (ball or roller ramp, cam),
+    from the datasheet's geometry. Between the points runs a rising cubic. Then every angle of pads in this file (clearance,
+    curves, slip angles) is travel over ``gear_gain_m_per_rad``."""
+
+    #: From zero, ascending.
+    angle_rad: tuple[Annotated[NonNegative, usual(1.0)], ...] = ()
+    #: Likewise; to the largest force with the pads of the softest curve.
+    travel_mm: tuple[Annotated[NonNegative, usual(0.1)], ...] = ()
+
+    def __post_init__(self):
+        if len(self.angle_rad) != len(self.travel_mm):
+            raise InvalidValue(f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected as many")
+        if 0 < len(self.angle_rad) < 3:
+            raise InvalidValue("expected three points or more")
+        for name in ("angle_rad", "travel_mm"):
+            values = getattr(self, name)
+            if values and values[0] != 0.0:
+                raise InvalidValue(f"{name}: expected the released position, zero, as first point")
+            for row, (before, after) in enumerate(pairwise(values), 1):
+                if after <= before:
+                    raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected more")
+
+    def check_mean(self, gear_gain: float) -> None:
+        """Raise `InvalidValue` if a gear gain (m/rad) is none of this travel's."""
+        if not self.angle_rad:
+            return
+        slopes = 1e-3 * np.diff(self.travel_mm) / np.diff(self.angle_rad)
+        # A hundredth: both are rounded.
+        if not 0.99 * slopes.min() <= gear_gain <= 1.01 * slopes.max():
+            raise InvalidValue(
+                f"gear_gain_m_per_rad: {gear_gain:g} is no mean of travel, which rises by {slopes.min():.3g} to "
+                f"{slopes.max():.3g} m/rad"
+            )
+
+
+#: One object: what is left out of a file is told by identity.
+CONSTANT_GEAR = Travel()
 
 
 class Motor(Struct, kw_only=True):
@@ -30,10 +72,23 @@ class Motor(Struct, kw_only=True):
     torque_constant_Nm_per_A: Positive
     #: Lumped inertia of motor and gear at the motor shaft.
     inertia_kg_m2: Positive
-    #: Clamp travel per motor angle; equally motor torque per clamp force. Geometry.
+    #: Clamp travel per motor angle; equally motor torque per clamp force. Geometry. With `travel`, a mean of it.
     gear_gain_m_per_rad: Positive
     #: Fastest that the motor turns.
     maximum_speed_rad_per_s: Positive
+    #: Of a gear that is not constant.
+    travel: Travel = CONSTANT_GEAR
+    #: Of a spring that helps release: force on the gear's output per travel from the released position, none there.
+    release_spring_N_per_m: Annotated[NonNegative, usual(1e5)] = 0.0
+
+    def __post_init__(self):
+        self.travel.check_mean(self.gear_gain_m_per_rad)
+
+    def gear(self) -> np.void:
+        """GEAR record (`models.gear`) of `travel`."""
+        gear = np.zeros(1, GEAR)[0]
+        fill_gear(gear, np.array(self.travel.angle_rad), 1e-3 * np.array(self.travel.travel_mm) / self.gear_gain_m_per_rad)
+        return gear
 
 
 class Friction(Struct, kw_only=True):
@@ -327,6 +382,8 @@ class Calibration(Struct, kw_only=True):
             curve_at(self.stiffness.curves, self.pad_thickness_mm)
         except InputError as error:
             faults.append(str(error))
+        if self.motor.travel.angle_rad:
+            faults += self._out_of_travel()
         if self.training_force_N > self.stiffness.maximum_force_N:
             faults.append(
                 f"adaptation.high_force_N: {self.training_force_N:g} exceeds stiffness.maximum_force_N "
@@ -334,6 +391,18 @@ class Calibration(Struct, kw_only=True):
             )
         if faults:
             raise InvalidValue("\n".join(faults))
+
+    def _out_of_travel(self) -> list[str]:
+        """What of the pads' way to the largest force the gear's table does not cover."""
+        faults, reached = [], self.motor.gear()["turned"][-1]
+        for curve in self.stiffness.curves:
+            needed = self.contact.clearance_rad + travel_at(self.stiffness.maximum_force_N, np.array(curve.coefficients))
+            if needed > reached:
+                faults.append(
+                    f"motor.travel: ends at {self.motor.travel.travel_mm[-1]:g} mm; clearance and the largest force with pads "
+                    f"of {curve.pad_thickness_mm:g} mm need {1e3 * needed * self.motor.gear_gain_m_per_rad:.3g} mm"
+                )
+        return faults
 
     def __reduce__(self):
         # A default that is left out is told by identity: field by field, a copy in another process would state it and have
@@ -391,6 +460,8 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["torque_constant"] = c.motor.torque_constant_Nm_per_A
     p["inertia"] = c.motor.inertia_kg_m2
     p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
+    p["gear"] = c.motor.gear()
+    p["spring"] = c.motor.release_spring_N_per_m
     p["load_friction"] = c.friction.load_m_per_rad
     p["offset_friction"] = c.friction.offset_Nm
     p["presliding_angle"] = c.friction.presliding_angle_rad

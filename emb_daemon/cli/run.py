@@ -75,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
         # A handler does not survive, and without one the signal ends the process; to be ignored does survive.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    if arguments.share and configuration.xcp.calibrate:
+        daemon.take_pages(arguments.share)
     # Not before: a signal that comes while kernels are compiled ends the process at once.
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
     signal.signal(signal.SIGINT, lambda *_: daemon.stop())

@@ -13,7 +13,7 @@ import numpy as np
 
 from emb_daemon import __version__
 from emb_daemon.calibration.curves import curve_at
-from emb_daemon.calibration.parameters import parameter, value_of
+from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, validation_gains
@@ -323,7 +323,25 @@ def _rms(residual: np.ndarray) -> float:
 # -- the calibration --------------------------------------------------------------------------------------------------
 
 
+def undecided(selection: Selection) -> dict[str, float]:
+    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it."""
+    size, result = rmse(selection.screening.signals["clamp_force"]), {}
+    for candidate in map(selection.candidates.__getitem__, selection.accepted):
+        key = f"noise.{candidate.channel}_relative"
+        if candidate.channel in ("stiffness", "torque") and candidate.undecided_N > 0.0:
+            result[key] = float(np.hypot(result.get(key, 0.0), candidate.undecided_N / size))
+    return result
+
+
 def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
+    """The calibration with the noise of its paths as it now is: less of the stiffness path where that was explained, and what
+    rivals of accepted terms do otherwise."""
+    calibration = _with_less_noise(calibration, selection)
+    more = undecided(selection)
+    return moved(calibration, {key: float(np.hypot(value_of(calibration, key), share)) for key, share in more.items()})
+
+
+def _with_less_noise(calibration: Calibration, selection: Selection) -> Calibration:
     """The calibration with the stiffness path's noise as it now is, if what it states contains what has been explained.
 
     The filter would go on trusting the worse path. It is only ever lowered: a rest that nothing explains is no noise."""

@@ -84,6 +84,8 @@ class Form:
         }.get(self.shape, ())  # fmt: skip
         if self.memory == "none":
             return own
+        if self.memory == "lag" and self.signal != "clamp_force":
+            return (*own, "memory_scale")
         return ("memory_scale",) if self.shape == "odd_power" else (*own, "memory_scale")
 
     @property

@@ -38,8 +38,9 @@ from emb_daemon.offline.score import rmse
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
 #: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: then
-#: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all.
-_AS_GOOD, _RIVAL, _MOST = 0.95, 0.2, 0.5
+#: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all, unless
+#: they choose its port: all but a fifth must, because what the term follows there is not sure.
+_AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.2, 0.5, 0.8
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 
@@ -130,7 +131,8 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     shares = _shares(search.screen, prospects)
     rivals = _as_good(best, others, shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
-    made_of = f"same port and signal in {100 * shares[best.means]:.0f} % of bootstraps"
+    at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
+    made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
     manoeuvre = None
     if rivals:
         manoeuvre = _manoeuvre(best.form, rivals[0].form)
@@ -142,7 +144,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
         < _OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
-        made_of: shares[best.means] < _MOST,
+        made_of: shares[best.means] < _MOST and at_port < _SAME_PORT,
     }
     against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
@@ -150,6 +152,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
+        undecided_N=search.undecided(best, rivals),
         over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
     )  # fmt: skip
     if against:

@@ -55,7 +55,8 @@ def _run(samples, parameters, states, held, out, signals):
     s.started = True
     s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
     s.friction_variance = 1.0
-    s.contact_angle = samples[0].angle + p.clearance
+    s.gear_zero = samples[0].angle
+    s.contact_angle = s.gear_zero + p.clearance
     rest(s, p, -p.clearance, 1.0)
     for row in range(len(samples)):
         m, h, o = samples[row], held[row], out[row]

@@ -75,6 +75,11 @@ class Screen:
         """Of regressors (N, k)."""
         return self.scores_of(self.means.of(columns * self.keep[:, None]))
 
+    def explained(self, prospect: "Prospect") -> np.ndarray:
+        """What a form of its size takes from the averaged residual."""
+        columns = self.beside_nuisances(self.means.of(np.column_stack(prospect.columns) * self.keep[:, None]))
+        return columns @ prospect.evidence.values
+
     def scores_of(self, averaged: np.ndarray) -> Scores:
         """Of regressors that are averaged already."""
         averaged = self.beside_nuisances(averaged)
@@ -138,6 +143,11 @@ class Search:
         alone -= noise_left(model, self.channel, samples)
         kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
         return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+    def undecided(self, best: Prospect, rivals: Sequence[Prospect]) -> float:
+        """Largest RMS by which a rival does otherwise than the best, beside all that the path's parameters can do."""
+        does = [self.screen.explained(prospect) for prospect in (best, *rivals)]
+        return max((self.model.rms(float(np.square(does[0] - other).sum()), self.channel) for other in does[1:]), default=0.0)
 
     def chance(self, best: Prospect) -> float:
         """That of the best among all forms; a ripple's is that of its order among as many."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
-from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest
+from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, turned
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import (
     NOTHING,
@@ -20,7 +20,8 @@ from emb_daemon.models.contact import (
     torque_sigma,
     watch_closing,
 )
-from emb_daemon.models.fusion import CONTACT, OFFSET, STATES
+from emb_daemon.models.fusion import CONTACT, GAIN, OFFSET, STATES
+from emb_daemon.models.gear import steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
@@ -112,6 +113,8 @@ def follow_zero(s, p, m):
     s.contact_angle += moved
     s.contact_anchor += moved
     s.start_angle += moved
+    s.gear_zero += moved
+    sigma *= s.gear_slope
     s.covariance[CONTACT, CONTACT] += sigma * sigma
     open_again(s, p)
     s.contact.confirmed = False
@@ -138,12 +141,10 @@ def seek_release(s, p, m):
         s.unknown = not released
         return
     if s.unknown and _passed_clearance(s, p, m):
-        place_contact(s, p, s.start_angle + s.clearance, s.clearance_sigma)
-        s.contact_anchor = s.start_angle + p.clearance
+        place_contact(s, p, s.start_angle)
         s.unknown = False
     elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
-        place_contact(s, p, m.angle + s.clearance, s.clearance_sigma)
-        s.contact_anchor = m.angle + p.clearance
+        place_contact(s, p, m.angle)
         s.unknown = False
         if not loose:
             # Nobody holds a released brake for so long: what is measured flows in no motor.
@@ -169,21 +170,26 @@ def _passed_clearance(s, p, m):
         if s.stood_s > _OFF_S:
             # Where it only turned round, half open, nobody had released it.
             s.start_angle = m.angle
-    closed = s.clearance > 0.0 and m.angle - s.start_angle > _PASSED * s.clearance
+    passed, _ = through_gear(p.gear, m.angle - s.start_angle)
+    closed = s.clearance > 0.0 and passed > _PASSED * s.clearance
     sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
     free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force
     return closed and s.passed > 0.0 and sigma / sqrt(s.passed) < 0.3 * _FREE * p.gear_gain * p.maximum_force and free
 
 
 @njit
-def place_contact(s, p, angle, sigma):
-    """Believe the contact angle ``angle`` rad with standard deviation ``sigma``, whatever was believed before."""
+def place_contact(s, p, released):
+    """Believe that the motor angle ``released`` rad is the released position, from which the clearance counts, whatever was
+    believed before."""
+    s.gear_zero = released
+    angle, sigma = released + s.clearance, s.clearance_sigma
+    x = turned(s, p, s.angle)[0] - angle
     # Pads that have just opened still relax; but what was believed of a contact elsewhere is no force to relax from.
     if abs(angle - s.contact_angle) < _KNOWN_RAD:
-        s.past_contact = s.angle - angle
+        s.past_contact = x
     else:
-        rest(s, p, s.angle - angle, s.factor * s.scale)
-    s.contact_angle = s.contact_anchor = angle
+        rest(s, p, x, s.factor * s.scale)
+    s.contact_angle, s.contact_anchor = angle, released + p.clearance
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
     s.covariance[CONTACT, CONTACT] = sigma * sigma
@@ -208,7 +214,9 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     h = s.sensitivity[0]
     slow, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     speed = 0.5 * (m.speed + s.speed)
-    to_torque(h, leverage, s.friction_mean, mean_force, speed, slow, accelerating, needed, s.winding, s.housing)
+    slope = s.gear_slope
+    load = mean_force + s.spring_force
+    to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
@@ -235,7 +243,10 @@ def watch_contact(s, p, m, force_before, torque, leverage):
         # Power came while the brake was clamped: no angle from which to count the clearance. Or the torque has an offset.
         s.covariance[OFFSET, OFFSET] += seen * seen
         force = seen / leverage
-        friction = (p.offset_friction + p.load_friction * force) * sqrt(s.friction_variance)
+        friction = (p.offset_friction + p.load_friction * force * slope) * sqrt(s.friction_variance)
+        # The gear's slope is as unknown as the released position.
+        least, most = steepest(p.gear)
+        s.covariance[GAIN, GAIN] += (0.5 * (most / least - 1.0)) ** 2
         forget_level(c)
         c.engaged = True
         _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
@@ -258,7 +269,7 @@ def _start_contact(s, p, m, force, sigma, leverage):
     s.contact_angle += s.past_contact - travel
     rest(s, p, travel, s.factor)
     slope = s.factor * max(characteristic_curve(max(travel, 1.0), p.curve)[1], p.curve[0])
-    lag = p.relaxation_time * m.speed
+    lag = p.relaxation_time * m.speed * s.gear_slope
     misread = 1.0 / (leverage * slope)
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = misread * s.covariance[OFFSET, i]

@@ -64,6 +64,7 @@ from emb_daemon.models.fusion import (
     force_variance,
     predict_errors,
 )
+from emb_daemon.models.gear import most_of_spring, steepest
 from emb_daemon.models.plausibility import (
     AGREE,
     STIFFNESS_WRONG,
@@ -109,10 +110,10 @@ def _clear_acceleration(s, m):
 @njit
 def needed_torque(s, p, m, mean_force, leverage):
     """Torques (N m): friction as far as it is slow, what inertia took, and what force, friction and inertia took together."""
-    accelerating = p.inertia * _clear_acceleration(s, m)
-    friction = s.friction_mean * (p.offset_friction + p.load_friction * mean_force)
+    accelerating, load = p.inertia * _clear_acceleration(s, m), mean_force + s.spring_force
+    friction = s.friction_mean * (p.offset_friction + p.load_friction * load * s.gear_slope)
     slow = friction * exp(-0.5 * abs(m.speed + s.speed) / SLOW_RAD_PER_S)
-    return slow, accelerating, leverage * mean_force + p.offset_friction * s.friction_mean + accelerating
+    return slow, accelerating, leverage * load + p.offset_friction * s.friction_mean + accelerating
 
 
 @njit
@@ -146,7 +147,7 @@ def _predict(s, p, m, spread, warmth, known):
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
         place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
-        lag_error = p.relaxation_time * s.slope * (m.speed - (m.angle - s.angle) / m.dt)
+        lag_error = p.relaxation_time * s.slope * s.gear_slope * (m.speed - (m.angle - s.angle) / m.dt)
         s.covariance[FAST, FAST] += (lag_error / spread) ** 2
     share = p.torque_constant * m.current_q / ((p.gear_gain + p.load_friction) * p.maximum_force)
     for_ever = share * share if m.has_current else s.housing
@@ -170,14 +171,16 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state."""
     h, speed, s_mean = s.sensitivity[0], 0.5 * (m.speed + s.speed), s.friction_mean
     moving = _moving_variance(s, p, m)
-    friction_torque = p.offset_friction + p.load_friction * max(mean_force, 0.0)
+    friction_torque = p.offset_friction + p.load_friction * max(mean_force + s.spring_force, 0.0) * s.gear_slope
     white = moving + friction_torque * friction_torque * friction_variance
     out.torque_sigma = sqrt(white) / leverage
     # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
     white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     to_force(h, spread, s.slope, s.force, warmth)
-    to_torque(h, leverage, s_mean, mean_force, speed, slow_friction, accelerating, needed, s.winding, s.housing)
+    slope = s.gear_slope
+    load = mean_force + s.spring_force
+    to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
     fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
     unexplained = torque - leverage * mean_force
     first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
@@ -187,8 +190,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     for kind in range(ALTERNATIVES if not known else 0):
         a = s.alternatives[kind]
         to_force(h, spread, a.slope, s.force + a.shift, warmth)
-        taken, force = needed + leverage * a.shift, mean_force + a.shift
-        to_torque(h, leverage, s_mean, force, speed, slow_friction, accelerating, taken, s.winding, s.housing)
+        taken = needed + leverage * a.shift
+        to_torque(h, leverage, slope, s_mean, load + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
             least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), np.inf)
@@ -254,17 +257,29 @@ def _motor_torque(s, p, m, x):
 
 
 @njit
-def _friction(p, x):
-    """Load friction (m/rad) and offset friction (N m) of a hypothesis with the errors ``x``."""
-    return max(p.load_friction + x[LOAD], 0.0), max(p.offset_friction + x[COULOMB], 0.0)
+def _beside_force(s, p):
+    """Slope of the gear, and how far it may be off, share; force of the release spring, N, and how far that may be off: where
+    the angle is not known from the released position, they may be any that the brake has."""
+    if s.unknown or s.plausibility.verdict == STIFFNESS_WRONG:
+        least, most = steepest(p.gear)
+        middle = 0.5 * (least + most)
+        half = 0.5 * most_of_spring(p)
+        return middle, middle / least - 1.0, half, half
+    return s.gear_slope, 0.0, s.spring_force, 0.0
+
+
+@njit
+def _gear(p, x, slope):
+    """Gear gain and load friction (m/rad) and offset friction (N m) of a hypothesis with the errors ``x``."""
+    return p.gear_gain * slope, max(p.load_friction + x[LOAD], 0.0) * slope, max(p.offset_friction + x[COULOMB], 0.0)
 
 
 @njit
 def _beyond_friction(s, p, m, x, force, spread):
     """`beyond_friction` of a hypothesis with the errors ``x`` and the clamp force ``force`` N."""
     torque = _motor_torque(s, p, m, x) - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
-    load, coulomb = _friction(p, x)
-    return beyond_friction(torque, force, spread, p.gear_gain, load, coulomb)
+    gain, load, coulomb = _gear(p, x, s.gear_slope)
+    return beyond_friction(torque, force + s.spring_force, spread, gain, load, coulomb)
 
 
 @njit
@@ -273,18 +288,21 @@ def take_sides(s, p, m, torque_sigma, out):
     `fuse` returns it."""
     c, x, facts = s.plausibility, s.error, 0
     motor_torque = _motor_torque(s, p, m, x)
-    load, coulomb = _friction(p, x)
-    force, sigma = force_of_torque_alone(c, motor_torque, m.has_current, m.dt, p.gear_gain, load, coulomb)
-    sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / p.gear_gain)
+    slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
+    gain, load, coulomb = _gear(p, x, slope)
+    force, sigma = force_of_torque_alone(c, motor_torque - gain * spring, m.has_current, m.dt, gain, load, coulomb)
+    sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / gain)
+    if slope_unsure > 0.0 or spring_unsure > 0.0:
+        sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
     if np.isfinite(out.innovation):
-        spread = hypot(p.gear_gain * out.stiffness_sigma, torque_sigma)
+        spread = hypot(gain * out.stiffness_sigma, torque_sigma)
         beyond = _beyond_friction(s, p, m, x, s.force, spread)
         for kind in range(DRIFT):
             a = s.alternatives[kind]
             if a.log_odds > _LONG_LIKELY:
                 beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
-    swings = hold(c, m.angle != s.angle, s.force, torque_sigma, p.gear_gain, load, coulomb) if m.has_current else 0
+    swings = hold(c, m.angle != s.angle, s.force, torque_sigma, gain, load, coulomb) if m.has_current else 0
     if swings > 1:
         disbelieve_resolver(c)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt

@@ -216,14 +216,14 @@ def to_force(h, spread, slope, force, warmth):
 
 
 @njit
-def to_torque(h, leverage, friction_mean, force, speed, slow, accelerating, motor_torque, winding, housing):
-    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained; ``slow``,
+def to_torque(h, leverage, slope, friction_mean, force, speed, slow, accelerating, motor_torque, winding, housing):
+    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained. ``slope`` of the gear; ``slow``,
     ``accelerating`` and ``motor_torque`` N m: friction as far as it is slow, what inertia and what everything took."""
     for i in (FAST, CONTACT, SCALE, GROWTH):
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
     h[GAIN], h[FADE], h[HOUSING] = -motor_torque, -motor_torque * winding, -motor_torque * housing
-    h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force, friction_mean, speed
+    h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force * slope, friction_mean, speed
     h[INERTIA] = accelerating
     h[SLOW] = slow
 

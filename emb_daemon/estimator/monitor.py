@@ -6,7 +6,9 @@ constant, gear, friction, largest force. Each is allowed to be wrong by the boun
 
     lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
 
-where friction counts against the motion if the motor turns and either way if it stands. A force that stays outside for
+where friction counts against the motion if the motor turns and either way if it stands. Of a gear that is not constant the
+largest gain stands on the left and the least on the right, since no angle is believed here,
+and a release spring counts in full on the left and not at all on the right. A force that stays outside for
 `TOLERATED_S` is contradicted. A latched brake needs no current, so with the park brake on there is no upper bound.
 """
 
@@ -15,6 +17,7 @@ from math import exp
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.models.gear import most_of_spring, steepest
 
 #: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
 #: outside, s: a whole stroke of acceleration and braking.
@@ -53,12 +56,13 @@ def bound(w, p, m):
     closing, opening = m.speed > _TURNING_RAD_PER_S, m.speed < -_TURNING_RAD_PER_S
     taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
     held, held_by_load = (0.0, 0.0) if closing else (dry, load)
-    w.low = max((least * w.torque - offset - taken) / (p.gear_gain + taken_by_load), 0.0)
+    flat, steep = steepest(p.gear)
+    w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep) - most_of_spring(p), 0.0)
     leverage = p.gear_gain - held_by_load
     latched = not m.has_status or m.park_brake != 0.0
     w.high = p.maximum_force
     if not latched and leverage > _NOT_LOCKED * p.gear_gain:
-        w.high = min(max((most * w.torque + offset + held) / leverage, 0.0), p.maximum_force)
+        w.high = min(max((most * w.torque + offset + held) / (leverage * flat), 0.0), p.maximum_force)
     w.low = min(w.low, w.high)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from emb_daemon.effects import paths as effects
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT
+from emb_daemon.models.gear import through_gear
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 from emb_daemon.models.torque import friction_state, slid_angle, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
@@ -26,13 +27,23 @@ UNCERTAIN_CONTACT_RAD = 0.05
 
 
 @njit
+def turned(s, p, angle):
+    """Equivalent angle (rad) of a motor angle, and its slope; a constant gear's is the motor angle itself."""
+    if p.gear.step == 0.0:
+        return angle, 1.0
+    past_zero, slope = through_gear(p.gear, angle - s.gear_zero)
+    return s.gear_zero + past_zero, slope
+
+
+@njit
 def position(s, p, m):
-    """Motor angle past contact at this sample, rad; advances the effects that act on it."""
+    """Equivalent angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
     effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
-    return m.angle + effects.motor_angle(e, state, m, m.dt) + gained / p.gear_gain + grown - s.contact_angle
+    angle, s.gear_slope = turned(s, p, m.angle + effects.motor_angle(e, state, m, m.dt))
+    return angle + gained / p.gear_gain + grown - s.contact_angle
 
 
 @njit
@@ -43,13 +54,13 @@ def stiffness_path(s, p, m, factor):
     if dt > ONE_CYCLE_S:
         # Over a gap the way is unknown but for its end, which the speed tells and the lag remembers best.
         dt = min(0.5 * m.dt, 2.0 * p.relaxation_time)
-        _deform(s, p, x - dt * m.speed, m.dt - dt, factor)
+        _deform(s, p, x - dt * m.speed * s.gear_slope, m.dt - dt, factor)
     _deform(s, p, x, dt, factor)
 
 
 @njit
 def _deform(s, p, x, dt, factor):
-    """The motor turns steadily to ``x`` rad past contact within ``dt`` s."""
+    """The pads move steadily to ``x`` rad past contact within ``dt`` s."""
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x
@@ -97,11 +108,15 @@ def torque_path(s, p, m):
     e, state, mean_speed = p.effects, s.effects, 0.5 * (m.speed + s.speed)
     gear = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
-    leverage = p.gear_gain * gear + p.load_friction * friction * mean
-    if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain:
+    # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
+    middle, slope = turned(s, p, m.angle - 0.5 * travel)
+    s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
+    leverage = (p.gear_gain * gear + p.load_friction * friction * mean) * slope
+    if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0
     motor_torque = effects.motor_torque(e, state, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
     offset_friction = p.offset_friction * friction
     torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)
+    torque -= leverage * s.spring_force
     return torque, leverage, s.friction_variance + turning * turning

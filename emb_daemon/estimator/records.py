@@ -10,6 +10,7 @@ from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
+from emb_daemon.models.gear import GEAR
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
 
@@ -43,6 +44,8 @@ THERMAL = np.dtype(
 PARAMETERS = np.dtype(
     [
         *fields("f8", "gear_gain torque_constant inertia load_friction offset_friction presliding_angle"),
+        # Of the release spring, N per m of clamp travel.
+        ("spring", "f8"),
         ("curve", "f8", (CURVE_TERMS,)),
         *fields(
             "f8",
@@ -50,6 +53,7 @@ PARAMETERS = np.dtype(
             "stiffness_correlation_time current_sigma current_correlation_time speed_sigma presliding_sigma "
             "torque_relative_sigma contact_walk",
         ),
+        ("gear", GEAR),
         ("thermal", THERMAL),
         ("effects", parameter_record(REGISTRY)),
     ],
@@ -89,6 +93,11 @@ STATE = np.dtype(
         # turned, s; the first is no number where part of the way was not seen.
         *fields("f8", "strayed turned turned_s"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
+        # Of a gear that is not constant: resolver's angle at its released position, rad, and its slope (`models.gear`). The
+        # contact angle and what is past it are equivalent angles.
+        *fields("f8", "gear_zero gear_slope"),
+        # Force of the release spring, N: mean over the last cycle.
+        ("spring_force", "f8"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
         # Torque path.

@@ -31,6 +31,7 @@ from emb_daemon.estimator.status import (
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
+from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.plausibility import disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
@@ -58,7 +59,7 @@ def _start(s, p, m):
         set_priors(s.covariance, p)
         if p.clearance_sigma == 0.0:
             s.covariance[SCALE, SCALE] = 0.0
-    s.start_angle = m.angle
+    s.start_angle = s.gear_zero = m.angle
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
@@ -117,13 +118,23 @@ def step(s, p, m, out):
     bound(s.monitor, p, m)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
-    out.contact_angle = s.contact_angle
+    _tell_contact(s, p, out.contact_sigma, out)
     out.stiffness_factor = s.factor * s.scale
     out.engaged = s.contact.engaged
     tell(s, out)
     out.mode = RUNNING
     tell_status(_look(s, p, m, facts, out) | (ZERO_MOVED if moved_zero else 0), out)
     s.fused, s.fused_sigma = out.force, out.sigma
+
+
+@njit
+def _tell_contact(s, p, sigma, out):
+    """The contact angle as the resolver reads it, and its standard deviation; ``sigma`` in rad of equivalent angle."""
+    out.contact_angle, out.contact_sigma = s.contact_angle, sigma
+    if p.gear.step > 0.0:
+        past_zero = back_through_gear(p.gear, s.contact_angle - s.gear_zero)
+        out.contact_angle = s.gear_zero + past_zero
+        out.contact_sigma = sigma / through_gear(p.gear, past_zero)[1]
 
 
 @njit
@@ -168,14 +179,14 @@ def predict(s, p, age, out):
     out.source = PREDICTED if s.started and age <= SILENCE_S else INVALID
     out.reasons = 0
     # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
-    reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * age, p.curve)
+    _, steep = steepest(p.gear)
+    reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * steep * age, p.curve)
     start, _ = characteristic_curve(s.past_contact, p.curve)
     moved = min(s.factor * s.scale * (reached - start), p.maximum_force)
     out.force = s.fused
     out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
-    out.contact_angle = s.contact_angle
-    out.contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
+    _tell_contact(s, p, sqrt(s.covariance[CONTACT, CONTACT]), out)
     out.stiffness_factor = s.factor * s.scale if s.started else 1.0
     out.innovation = out.innovation_sigma = np.nan
     tell(s, out)

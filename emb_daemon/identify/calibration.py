@@ -16,6 +16,7 @@ from emb_daemon.identify.steps.heat import nominal_thermal
 from emb_daemon.identify.steps.thermal import ThermalStep
 from emb_daemon.identify.text import rounded
 from emb_daemon.identify.validation import Validation
+from emb_daemon.models.gear import through_gear
 from emb_daemon.offline.score import PATHS
 
 
@@ -25,20 +26,26 @@ def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: S
     Only heat may stay as it is here, where no log heats the pads.
     """
     actuator = sheet.actuator
-    curves = tuple(Curve(pad_thickness_mm=mm, coefficients=(1.0, *[0.0] * (TERMS - 1))) for mm in measured_mm)
+    # Full force within a radian: whatever the gear's travel, such a curve lies within it.
+    steep = (actuator.rated_clamp_force_N, *[0.0] * (TERMS - 1))
+    curves = tuple(Curve(pad_thickness_mm=mm, coefficients=steep) for mm in measured_mm)
+    motor = Motor(
+        torque_constant_Nm_per_A=actuator.motor_torque_constant_Nm_per_A,
+        inertia_kg_m2=actuator.lumped_inertia_kg_m2,
+        gear_gain_m_per_rad=actuator.gear_gain_m_per_rad,
+        maximum_speed_rad_per_s=actuator.max_motor_speed_rad_per_s,
+        travel=actuator.travel,
+        release_spring_N_per_m=actuator.release_spring_N_per_m,
+    )
+    clearance, _ = through_gear(motor.gear(), actuator.pad_clearance_rad)
     return Calibration(
         format=1,
         actuator=name,
         pad_thickness_mm=pad_thickness_mm,
-        motor=Motor(
-            torque_constant_Nm_per_A=actuator.motor_torque_constant_Nm_per_A,
-            inertia_kg_m2=actuator.lumped_inertia_kg_m2,
-            gear_gain_m_per_rad=actuator.gear_gain_m_per_rad,
-            maximum_speed_rad_per_s=actuator.max_motor_speed_rad_per_s,
-        ),
+        motor=motor,
         friction=Friction(load_m_per_rad=0.0, offset_Nm=0.0, presliding_angle_rad=1e-2),
         stiffness=Stiffness(curves=curves, relaxation_time_s=0.0, maximum_force_N=actuator.rated_clamp_force_N),
-        contact=Contact(clearance_rad=actuator.pad_clearance_rad, clearance_sigma_rad=1.0, walk_rad_per_sqrt_s=0.0),
+        contact=Contact(clearance_rad=clearance, clearance_sigma_rad=1.0, walk_rad_per_sqrt_s=0.0),
         noise=Noise(
             stiffness_N=1.0,
             stiffness_relative=0.0,

@@ -5,7 +5,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from emb_daemon.calibration.fields import Positive, Struct
+from emb_daemon.calibration.fields import NonNegative, Positive, Struct
+from emb_daemon.calibration.types import CONSTANT_GEAR, Travel
 from emb_daemon.wire.contract import PULSES_PER_TURN
 
 #: Relative tolerance of a datasheet's values where it states none: two standard deviations.
@@ -104,8 +105,13 @@ class CampaignFile(Struct, kw_only=True):
 class Actuator(Struct, kw_only=True):
     """Motor, gear and screw."""
 
-    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact.
+    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact. With `travel`, a
+    #: mean of it.
     gear_gain_m_per_rad: Positive
+    #: Of a gear that is not constant; likewise taken as exact.
+    travel: Travel = CONSTANT_GEAR
+    #: Of a spring that helps release: force on the gear's output per travel from the released position, none there; exact.
+    release_spring_N_per_m: NonNegative = 0.0
     #: This and the inertia are priors, and a unit beyond their tolerances is reported.
     motor_torque_constant_Nm_per_A: Positive
     #: Share, two standard deviations.
@@ -120,6 +126,9 @@ class Actuator(Struct, kw_only=True):
     rated_clamp_force_N: Positive
     #: Motor angle between the released position and contact; half of it must surely be free of contact.
     pad_clearance_rad: Positive
+
+    def __post_init__(self):
+        self.travel.check_mean(self.gear_gain_m_per_rad)
 
 
 class Resolver(Struct, kw_only=True):

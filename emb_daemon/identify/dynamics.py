@@ -10,6 +10,7 @@ from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
+from emb_daemon.models.gear import all_through_gear
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.run import stiffness_force
@@ -152,10 +153,10 @@ def is_slow(log: Log) -> bool:
     return float(np.sum(np.abs(np.diff(angle)))) < 0.25 * float(np.ptp(angle)) * log.time_s[-1]
 
 
-def clearance_guess(log: Log) -> float:
-    """Motor angle from the start of a log to where the reference force first stands clear of its noise, rad."""
+def clearance_guess(log: Log, travel: np.ndarray) -> float:
+    """``travel`` (rad, at each sample) of a log where the reference force first stands clear of its noise."""
     clear = np.flatnonzero(log.force_N > 8.0 * max(_rest_noise(log), 1e-9))
-    return float(log.samples["angle"][clear[0]] - log.samples["angle"][0]) if len(clear) else 0.0
+    return float(travel[clear[0]]) if len(clear) else 0.0
 
 
 def _rest_noise(log: Log) -> float:
@@ -165,17 +166,24 @@ def _rest_noise(log: Log) -> float:
     return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
 
 
-def _travel(log: Log) -> np.ndarray:
-    return log.samples["angle"] - log.samples["angle"][0]
+def _travel(log: Log, calibration: Calibration) -> np.ndarray:
+    """Equivalent angle (`models.gear`) from the start of a log, rad."""
+    return all_through_gear(calibration.motor.gear(), log.samples["angle"] - log.samples["angle"][0])[0]
 
 
-def regress_free(log: Log, clearance: float) -> tuple[np.ndarray, float]:
-    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares.
+def _past_contact(log: Log, calibration: Calibration) -> np.ndarray:
+    """`_travel` past what `clearance_guess` makes of it."""
+    travel = _travel(log, calibration)
+    return travel - clearance_guess(log, travel)
+
+
+def regress_free(log: Log, x: np.ndarray) -> tuple[np.ndarray, float]:
+    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares, ``x`` rad past contact at each sample.
 
     Returns:
         (coefficients of the static curve, time constant in s).
     """
-    x, force = _travel(log) - clearance, log.force_N
+    force = log.force_N
     rows = np.flatnonzero(np.isfinite(force[1:]) & np.isfinite(force[:-1]) & (x[1:] > 0.0)) + 1
     span = max(float(x.max()), 1e-9) ** np.arange(1, TERMS + 1)
     top = np.max(force[rows])
@@ -190,8 +198,8 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
     logs = [log for pads in groups for log in pads.logs]
     # Slow logs hardly show the lag: they count only where there are no others.
     fast = [log for log in logs if not is_slow(log)] or logs
-    time = float(np.clip(np.median([regress_free(log, clearance_guess(log))[1] for log in fast]), 2e-3, 0.5))
-    usual = {"s": _TIMES * time, "rad": _SHARE_OF_TRAVEL * max(_span(log) for log in logs)}
+    time = float(np.clip(np.median([regress_free(log, _past_contact(log, calibration))[1] for log in fast]), 2e-3, 0.5))
+    usual = {"s": _TIMES * time, "rad": _SHARE_OF_TRAVEL * max(_span(log, calibration) for log in logs)}
     values = {RELAXATION: time}
     for effect in effects:
         for p in effect.parameters:
@@ -200,21 +208,21 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
             values[f"effects.{effect.name}.{p.name}"] = float(np.clip(start, p.low, p.high))
     for pads in groups:
         log = pads.logs[-1]
-        coefficients = regress_free(log, clearance_guess(log))[0]
+        coefficients = regress_free(log, _past_contact(log, calibration))[0]
         if coefficients[0] <= 0.0:
-            coefficients = np.nanmax(log.force_N) / TERMS / _scale(pads)
+            coefficients = np.nanmax(log.force_N) / TERMS / _scale(pads, calibration)
         values |= dict(zip(curve_keys(calibration, pads.thickness_mm), coefficients, strict=True))
     return moved(structs.replace(calibration, effects={}), values)
 
 
-def _span(log: Log) -> float:
+def _span(log: Log, calibration: Calibration) -> float:
     """Travel past contact, rad."""
-    return float(_travel(log).max()) - clearance_guess(log)
+    return float(_past_contact(log, calibration).max())
 
 
-def _scale(pads: Pads) -> np.ndarray:
+def _scale(pads: Pads, calibration: Calibration) -> np.ndarray:
     """What makes newtons at full travel of a curve's coefficients."""
-    return max(map(_span, pads.logs)) ** np.arange(1, TERMS + 1)
+    return max(_span(log, calibration) for log in pads.logs) ** np.arange(1, TERMS + 1)
 
 
 def _free(calibration: Calibration, key: str) -> Free:
@@ -236,16 +244,16 @@ class _Model:
         if DELAY in self.shared:
             free[DELAY] = Free(self.delay_s, 1e-7, -0.01, 0.01)
         for pads, own in zip(self.groups, self.curves, strict=True):
-            values, scale = [value_of(self.start, key) for key in own], _scale(pads)
+            values, scale = [value_of(self.start, key) for key in own], _scale(pads, self.start)
             full = float(np.abs(values) @ scale)
             # Force rises from contact: the first coefficient stays positive.
             for n, key in enumerate(own):
                 free[key] = Free(values[n], 2e-5 * full / scale[n], -np.inf if n else 1e-3 * full / scale[0])
         for g, pads in enumerate(self.groups):
-            span = max(map(_span, pads.logs))
+            span = max(_span(log, self.start) for log in pads.logs)
             for number, log in enumerate(pads.logs):
                 # Force stands clear of its noise somewhat past contact.
-                free[g, number] = Free(clearance_guess(log) - 0.02 * span, 5e-6 * span)
+                free[g, number] = Free(clearance_guess(log, _travel(log, self.start)) - 0.02 * span, 5e-6 * span)
         return free
 
     def blocks(self) -> list[Block]:
@@ -277,7 +285,7 @@ class _Model:
                     found.block(own),
                     clearances,
                     np.array([found.sigmas[key] for key in contacts]),
-                    float(max(_travel(log).max() - c for log, c in zip(pads.logs, clearances, strict=True))),
+                    float(max(_travel(log, self.start).max() - c for log, c in zip(pads.logs, clearances, strict=True))),
                 )
             )
         logs = [log for pads in self.groups for log in pads.logs]

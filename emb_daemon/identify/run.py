@@ -58,7 +58,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     stiff = stiffness.identify(pads, start)
     progress(0.3, "torque path")
     motor = torque.identify(campaign, pads, start)
-    zero = contact.identify(stiff, sheet.resolver.count_rad, sheet.actuator.pad_clearance_rad)
+    zero = contact.identify(stiff, sheet.resolver.count_rad, start.contact.clearance_rad)
     for note in zero.notes:
         campaign.fault(f"contact: {note}")
     progress(0.4, "each thickness from the others")
@@ -74,7 +74,8 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     found = attribution.identify(stiff, heat.hot, known, lambda text, share: progress(0.7 + 0.2 * share, text))
     progress(0.9, "validating")
     folds = [fold.under(found.without(fold)) for fold in folds]
-    levels = noise.identify(campaign, stiff, motor, folds, interpolation, found.hot)
+    known_errors = found.hot, found.undecided, found.fastest_rad_per_s
+    levels = noise.identify(campaign, stiff, motor, folds, interpolation, *known_errors)
     calibration = tidy(moved(found.calibration, levels.values))
     heat = thermal.validate(campaign, heat, calibration)
     validations = []

@@ -7,6 +7,8 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 
+#: What int64 nanoseconds hold: the year 2262, s.
+LATEST_S = 9.2e9
 #: Step back in time from which a file holds two recordings; frames of two buses stand less out of order, ns.
 _BACK_NS = 1_000_000_000
 #: Share of the mean period up to which two stamps are one: jitter leaves more, a gateway or a queue that is emptied less.

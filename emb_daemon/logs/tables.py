@@ -12,11 +12,12 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
-from emb_daemon.logs.stamps import in_time
+from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
-_DELIMITERS = (",", ";", "\t", "|")
+#: What parts cells; last, any run of blanks.
+_DELIMITERS = (",", ";", "\t", "|", " ")
 #: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
 #: Share of a column's cells that may be no numbers.
@@ -26,8 +27,6 @@ _CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
-#: What int64 nanoseconds hold: the year 2262, s.
-_LATEST_S = 9.2e9
 #: Cells that say that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -55,7 +54,7 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     # Of a clock, seconds already.
     seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
     known = np.isfinite(seconds)
-    if np.any(np.abs(seconds[known]) > _LATEST_S):
+    if np.any(np.abs(seconds[known]) > LATEST_S):
         raise InputError(
             f"{path}: {time.signal}: {np.max(np.abs(seconds[known])):g} s are no time; is `time.unit`, {time.unit}, right?"
         )
@@ -152,6 +151,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         key=lambda at: (len({*names} & {*_cells(lines[at[0]], at[1])}), -at[0], lines[at[0]].count(at[1])),
     )
     cells = _cells(lines[header], delimiter)
+    if delimiter == " ":
+        content = b"\n".join(b" ".join(line.split()) for line in content.split(b"\n"))
     rows = [_cells(line, delimiter) for line in lines[header + 1 : header + 1 + _UNITS]]
     units = next((row for row, found in enumerate(rows) if any(map(_is_number, found))), 0)
     first = rows[units] if rows else cells
@@ -200,6 +201,9 @@ def _as_utf8(content: bytes) -> bytes:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        # As numpy.savetxt and MATLAB write a header.
+        line = " ".join(line.split()).lstrip("#% ")
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 

@@ -39,7 +39,8 @@ _COLD = np.ones(1)
 @njit
 def _run_paths(samples, factor, parameters, states, force, out):
     p, s = parameters[0], states[0]
-    s.contact_angle = samples[0].angle + p.clearance
+    s.gear_zero = samples[0].angle
+    s.contact_angle = s.gear_zero + p.clearance
     settle_paths(s, p, samples[0], factor[0])
     for row in range(len(samples)):
         m = samples[row]

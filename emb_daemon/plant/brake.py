@@ -2,8 +2,10 @@
 
 from math import cos, exp, sin
 
+import numpy as np
+
 from emb_daemon.jit import njit
-from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS
+from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
 _COLD_C = 22.0
 #: Signals that drawn effects may follow, and their usual sizes.
@@ -16,6 +18,42 @@ _DISC_SPEED, _POWER_W = 40.0, 30000.0
 #: Shapes of drawn effects: a power, what saturates, what begins at the signal's usual size.
 POWER, SATURATION, ONSET = range(3)
 _MAGNETS_C = 25.0
+
+
+@njit
+def turned(p, angle):
+    """Angle (rad) by which a constant gear would have moved the pads as far: all that lies behind the gear is told in it."""
+    if p.travel[TRAVEL_POINTS - 1] == 0.0:
+        return angle
+    return _along(angle, p.travel_angle, p.travel) / p.gear_gain
+
+
+@njit
+def slope_at(p, angle):
+    """Slope of `turned`, by differences over two intervals of the table; 1 for a constant gear."""
+    reach = p.travel_angle[1]
+    return (turned(p, angle + reach) - turned(p, angle - reach)) / (2.0 * reach) if reach > 0.0 else 1.0
+
+
+@njit
+def gear_load(p, s):
+    """Force (N) on the gear's output: of pads and release spring."""
+    return s.force + p.release_spring * p.gear_gain * max(turned(p, s.angle), 0.0)
+
+
+@njit
+def motor_angle(p, x):
+    """Motor angle (rad) at which `turned` is ``x``."""
+    if p.travel[TRAVEL_POINTS - 1] == 0.0:
+        return x
+    return _along(x * p.gear_gain, p.travel, p.travel_angle)
+
+
+@njit
+def _along(x, xs, ys):
+    """Straight between the points of a rising table, and on beyond them."""
+    i = min(max(np.searchsorted(xs, x) - 1, 0), TRAVEL_POINTS - 2)
+    return ys[i] + (x - xs[i]) * (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
 
 
 @njit
@@ -115,7 +153,7 @@ def grown(p, s):
 def _friction_level(p, s):
     """Sliding friction torque of the gear (N m), without direction (thesis 4-1)."""
     e = p.effects
-    level = p.offset_friction + p.load_friction * s.force
+    level = p.offset_friction + p.load_friction * slope_at(p, s.angle) * gear_load(p, s)
     if e.stribeck_friction.rise != 0.0:
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
@@ -154,7 +192,7 @@ def move_motor(p, s, demand):
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat
     torque = p.torque_constant * factor * s.current
-    load = p.gear_gain * s.force * (1.0 + drawn(e.drawn_gear_gain, s, 4))
+    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) * (1.0 + drawn(e.drawn_gear_gain, s, 4))
     mesh = e.gear_mesh_ripple
     if mesh.cosine != 0.0 or mesh.sine != 0.0:
         phase = mesh.order_per_turn * (p.released_angle + s.angle)
@@ -196,7 +234,7 @@ def clamp(p, s):
     than it took. It describes what force sensors show, not a passive material.
     """
     e = p.effects
-    angle = s.angle
+    angle = turned(p, s.angle)
     if e.spindle_lead_error.amplitude_um != 0.0:
         error = sin(e.spindle_lead_error.order_per_turn * angle + e.spindle_lead_error.phase_rad)
         angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error

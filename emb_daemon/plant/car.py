@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_daemon.jit import njit
-from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, move_motor, static_angle
+from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, motor_angle, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
 from emb_daemon.plant.records import (
@@ -233,7 +233,7 @@ def _record(car, p, s, corner, counter, drive, training, truth):
     truth.time_ns, truth.corner, truth.counter = car.time_ns, corner, counter
     truth.force, truth.static_force = s.force, s.static_force
     truth.angle, truth.speed, truth.current = p.released_angle + s.angle, s.speed, s.mean_current
-    truth.contact_angle = p.released_angle + p.contact_angle - grown(p, s)
+    truth.contact_angle = p.released_angle + motor_angle(p, p.contact_angle - grown(p, s))
     truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
     for side in range(2):
         truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
@@ -314,8 +314,9 @@ def _hear(w, frames):
             training.silent = 0
             training.requested = unpack(frame.data, signals[0]) == 1.0
             low = 1e3 * unpack(frame.data, signals[3])
-            training.low = p.contact_angle + (static_angle(p, low) if low > 0.0 else -_BEFORE_CONTACT_RAD)
-            training.high = p.contact_angle + static_angle(p, 1e3 * unpack(frame.data, signals[4]))
+            before = 0.0 if low > 0.0 else _BEFORE_CONTACT_RAD
+            training.low = motor_angle(p, p.contact_angle + static_angle(p, low)) - before
+            training.high = motor_angle(p, p.contact_angle + static_angle(p, 1e3 * unpack(frame.data, signals[4])))
             training.amplitude = unpack(frame.data, signals[5])
             training.frequency = unpack(frame.data, signals[6])
 

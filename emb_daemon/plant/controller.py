@@ -5,7 +5,7 @@ daemon is judged on its own.
 """
 
 from emb_daemon.jit import njit
-from emb_daemon.plant.brake import static_angle
+from emb_daemon.plant.brake import gear_load, motor_angle, slope_at, static_angle
 from emb_daemon.plant.records import ANGLE, FORCE, LATCH, SUBSTEP_S
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -30,7 +30,7 @@ def set_target(p, s, mode, target, rate):
         s.position_target, s.target_rate, s.force_correction = target, rate, 0.0
     elif mode == FORCE and target > 0.0:
         goal = static_angle(p, target)
-        slope = target / max(goal, 0.5)
+        slope = target / max(goal, 0.5) * slope_at(p, s.angle)
         error = target - s.force
         band = _FORCE_BAND_N + _FORCE_BAND * target
         if abs(error) > band and abs(s.position_target - s.angle) < 0.5:
@@ -39,7 +39,7 @@ def set_target(p, s, mode, target, rate):
         # Wear and growth are followed, as a controller does that finds contact at each application; the disc's thickness
         # over the turn is not, or it would not show in the force.
         thicker = 1e-6 * p.effects.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
-        s.position_target = p.contact_angle - thicker / p.gear_gain + goal + s.force_correction
+        s.position_target = motor_angle(p, p.contact_angle - thicker / p.gear_gain + goal) + s.force_correction
     else:
         s.position_target, s.force_correction = 0.0, 0.0
 
@@ -59,6 +59,6 @@ def current_demand(p, s):
         # Outside of its linear range the integral would wind up.
         s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
     acceleration = min(max(acceleration, -_ACCELERATION), _ACCELERATION)
-    torque = p.gear_gain * s.force + p.inertia * acceleration + s.speed_integral
+    torque = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) + p.inertia * acceleration + s.speed_integral
     s.position_target += SUBSTEP_S * s.target_rate
     return torque / p.torque_constant

@@ -4,7 +4,8 @@ import numpy as np
 
 from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.plant.records import EFFECTS, PLANT
+from emb_daemon.models.gear import all_through_gear, steepest
+from emb_daemon.plant.records import EFFECTS, PLANT, TRAVEL_POINTS
 
 #: Standard deviations between what a calibration says and what a unit is, relative where nothing else is said: a well
 #: calibrated unit, some time later.
@@ -72,9 +73,14 @@ def plant_from_calibration(
     p["torque_constant"] = c.motor.torque_constant_Nm_per_A
     p["inertia"] = c.motor.inertia_kg_m2
     p["gear_gain"] = c.motor.gear_gain_m_per_rad
+    if c.motor.travel.angle_rad:
+        p["travel_angle"] = np.linspace(0.0, c.motor.travel.angle_rad[-1], TRAVEL_POINTS)
+        p["travel"] = p["gear_gain"] * all_through_gear(c.motor.gear(), p["travel_angle"])[0]
+    p["release_spring"] = c.motor.release_spring_N_per_m
     p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
     # Enough to hold the largest force against friction, and to accelerate.
-    p["maximum_current"] = 1.5 * c.motor.gear_gain_m_per_rad * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
+    steep = steepest(c.motor.gear())[1] * c.motor.gear_gain_m_per_rad
+    p["maximum_current"] = 1.5 * steep * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
     p["current_time"] = 0.001
     p["magnet_heating"], p["magnet_time"] = 0.02, 60.0
     p["load_friction"] = c.friction.load_m_per_rad

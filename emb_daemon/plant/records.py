@@ -15,6 +15,8 @@ CELLS = 30
 #: Sub-steps of motor angle and current that are kept, for late sensors.
 HISTORY = 64
 CURVE_TERMS = 5
+#: Of the travel of a gear that is not constant, between which it runs straight.
+TRAVEL_POINTS = 257
 PAD_DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
 
 
@@ -134,6 +136,9 @@ PLANT_FIELDS = (
     Field("torque_constant", "N m/A", "motor torque per torque-producing current at 25 degC"),
     Field("inertia", "kg m2", "motor and gear, at the motor shaft"),
     Field("gear_gain", "m/rad", "clamp travel per motor angle; torque per clamp force"),
+    Field("travel_angle", "rad", "motor angles past the released position of a gear that is not constant", (TRAVEL_POINTS,)),
+    Field("travel", "m", "clamp travel there, rising straight on beyond; all zero for a constant gear", (TRAVEL_POINTS,)),
+    Field("release_spring", "N/m", "force on the gear's output per travel from the released position"),
     Field("maximum_speed", "rad/s", "motor speed at which the supply's voltage is used up"),
     Field("maximum_current", "A", "inverter limit"),
     Field("current_time", "s", "time constant of the current controller"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.plant.brake import static_angle
+from emb_daemon.plant.brake import motor_angle, static_angle
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import ANGLE, COMMAND, DRIVE, FORCE, RELEASE
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
@@ -70,7 +70,7 @@ def _approach(angle: np.ndarray) -> np.ndarray:
 
 def angle_at(plant: np.void, force_N: float) -> float:
     """Motor angle past the released position (rad) at which the cold static force is ``force_N``."""
-    return float(plant["contact_angle"] + static_angle(plant, force_N))
+    return float(motor_angle(plant, plant["contact_angle"] + static_angle(plant, force_N)))
 
 
 def curve(plant: np.void, force_N: float = 25000.0, seconds: float = 40.0) -> Schedule:
@@ -96,7 +96,7 @@ def training(plant: np.void, seconds: float = 42.0, high_N: float = 15000.0) -> 
     """Park brake applied; slow clamp and release in 20 s, a sinusoid of 0.8 rad and 6 Hz on top (thesis Fig. 3-9)."""
     schedule = rest(seconds)
     time = CYCLE_S * np.arange(len(schedule))
-    low, high = plant["contact_angle"] - 2.0, angle_at(plant, high_N) - 0.8
+    low, high = angle_at(plant, 0.0) - 2.0, angle_at(plant, high_N) - 0.8
     angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * time / 20.0))
     angle += 0.8 * np.sin(2.0 * np.pi * 6.0 * time)
     schedule.drives["park_brake"] = PARK_APPLIED

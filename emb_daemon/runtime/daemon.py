@@ -24,6 +24,7 @@ from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, Pipeline
 from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
 from emb_daemon.runtime.shared import SharedEstimates
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire import contract
@@ -42,6 +43,8 @@ _TOGETHER_NS = 400_000
 #: How long a disturbance of bus or loop is shown in the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
+#: How long a page that was read waits for the car to be seen at rest: reading may have kept the loop from hearing it.
+_SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
 
@@ -147,6 +150,13 @@ class Daemon:
         self._calibrations = dict(setup.calibrations)
         self._read: dict[str, tuple[Calibration, Store | None]] | None = None
         self._waiting: dict[str, tuple[Calibration, Store | None]] = {}
+        #: Who asks for a page, whose page is being checked or taken, and corners that are estimated with one.
+        self._listener: PageListener | None = None
+        self._asked: Request | None = None
+        self._page: Request | None = None
+        self._on_page: set[str] = set()
+        #: Calibrations by corner that a file had last: without a page they are those in use.
+        self._of_files = dict(setup.calibrations)
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
@@ -163,6 +173,19 @@ class Daemon:
     def share(self, path: Path) -> None:
         """Let other processes read the estimates of every tick in a file. Raises OSError if it cannot be written."""
         self._shared = SharedEstimates(path, self.pipeline)
+
+    def take_pages(self, path: Path) -> None:
+        """Let who shares the estimates in ``path`` ask for other calibrations. Raises Unavailable if he cannot be heard."""
+        self._listener = PageListener(socket_path(path), self.ask_page, self._leave_page)
+
+    def ask_page(self, request: Request) -> None:
+        """Have a page checked and taken, or refused, by the loop; one at a time."""
+        self._asked = request
+
+    def _leave_page(self) -> None:
+        if self._on_page:
+            log.warning("who asked for other calibrations has gone: back to the files'")
+            self._reload_wanted = True
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
@@ -210,7 +233,7 @@ class Daemon:
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
-            if self._reload_wanted or self._reader is not None or self._waiting:
+            if self._reload_wanted or self._reader is not None or self._waiting or self._asked or self._page:
                 self._follow_reload()
             if watchdog_ns and now >= next_ping:
                 # One that is withheld is thought of again soon: a stall that is over is no hang.
@@ -221,6 +244,8 @@ class Daemon:
         self._manager.notify("STOPPING=1")
         if self._adaptation:
             self._adaptation.close(self.pipeline.states, self.pipeline.parameters)
+        if self._listener:
+            self._listener.close()
         if self._shared:
             self._shared.close()
         log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
@@ -294,46 +319,96 @@ class Daemon:
         """Have the calibrations read, one reading at a time, and let corners go over to those that changed."""
         if self._reader is not None and not self._reader.is_alive():
             self._reader = None
-            if self._read is not None:
-                self._waiting, self._read = self._read, None
-            if not self._reload_wanted:
-                self._manager.notify("READY=1")
-        if self._reload_wanted and self._reader is None:
-            self._reload_wanted = False
-            self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-            self._reader = threading.Thread(target=self._read_calibrations, name="reload", daemon=True)
-            self._reader.start()
+            if self._page is None:
+                if self._read is not None:
+                    self._waiting, self._read = self._read, None
+                if not self._reload_wanted:
+                    self._manager.notify("READY=1")
+        if self._page is not None and self._reader is None and (answer := self._answer_to(self._page)):
+            self._page.answer(answer)
+            self._page = None
+        if self._reader is None and self._page is None:
+            if self._reload_wanted:
+                self._reload_wanted = False
+                self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+                self._read_beside(self._read_calibrations)
+            elif self._asked is not None:
+                self._page, self._asked = self._asked, None
+                self._read_beside(self._read_calibrations, self._page)
         for name in [name for name in self._waiting if self._released(name)]:
             self._begin_anew(name, *self._waiting.pop(name))
+
+    def _read_beside(self, read, *arguments) -> None:
+        self._reader = threading.Thread(target=read, args=arguments, name="reload", daemon=True)
+        self._reader.start()
+
+    def _answer_to(self, request: Request) -> Answer | None:
+        """Go over to a page that was read, all of its corners in one tick, or refuse it; None while it may yet be taken."""
+        now_ns, answer = time.monotonic_ns(), Answer(request.fault)
+        request.read_ns = request.read_ns or now_ns
+        if not request.fault:
+            if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
+                answer = Answer("it took too long to be checked", later=True)
+            elif self._waiting:
+                answer = Answer("a reload waits for the brakes' release", later=True)
+            elif request.read and (why_not := self.pipeline.why_not_at_rest()):
+                if now_ns - request.read_ns < _SETTLING_NS:
+                    return None
+                answer = Answer(why_not, later=True)
+        if answer.refused:
+            log.error("page refused: %s", answer.refused)
+            return answer
+        for name, (calibration, learned) in request.read.items():
+            count = len(request.page.values.get(name, ()))
+            self._begin_anew(name, calibration, learned, on_page=count > 0)
+            if count:
+                log.warning("corner %s: %d numbers are not the file's, and nothing is learned", name, count)
+        return answer
 
     def _released(self, name: str) -> bool:
         state = self.pipeline.states[CORNERS.index(name)]
         return not (state["started"] and state["contact"]["engaged"])
 
-    def _read_calibrations(self) -> None:
+    def _read_calibrations(self, request: Request | None = None) -> None:
+        """Read the files, and set the numbers of a page if one is asked for."""
         try:
             setup = Setup(self._setup.path)
             if setup.calibrations.keys() != self._setup.calibrations.keys():
                 raise InputError(f"{setup.path}: corners: a reload cannot change them, restart instead")
+            calibrations = request.page.applied(setup.calibrations) if request else setup.calibrations
         except InputError as error:
-            log.error("calibration not reloaded, the old one stays: %s", error)
-            return
+            if request:
+                request.fault = str(error)
+            else:
+                log.error("calibration not reloaded, the old one stays: %s", error)
+            if request or not self._on_page:
+                return
+            # A page does not stay because a file is bad.
+            calibrations = self._of_files
         waiting = {}
-        for name, calibration in setup.calibrations.items():
+        for name, calibration in calibrations.items():
             words = {"corner": name, "calibration": calibration_hash(calibration)}
             if words["calibration"] == calibration_hash(self._calibrations[name]):
                 log.info("corner %(corner)s: calibration %(calibration)s unchanged", words, extra={"fields": words})
             else:
                 log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
                 waiting[name] = calibration, self._adaptation.read(name, calibration) if self._adaptation else None
-        self._read = waiting
+        if request:
+            request.read, request.fault = waiting, ""
+        else:
+            self._read = waiting
 
-    def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None) -> None:
+    def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None, on_page: bool = False) -> None:
         """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what
         it starts from, belong to that."""
         self._calibrations[name] = calibration
+        if not on_page:
+            self._of_files[name] = calibration
+        self._on_page = self._on_page | {name} if on_page else self._on_page - {name}
+        if self._shared:
+            self._shared.tell_page(bool(self._on_page))
         if self._adaptation:
-            self._adaptation.replace(name, calibration, learned)
+            self._adaptation.replace(name, calibration, learned, on_page)
             calibration = self._adaptation.in_use(name)
         self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
         words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}

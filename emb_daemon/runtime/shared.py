@@ -22,10 +22,12 @@ _READABLE, _AT_ONCE = ROWS // 2, ROWS // 4
 _PARAMETERS_TICKS = 50
 
 #: The whole file. ``written`` counts rows since the daemon's start; row ``n`` stands at ``n % ROWS``.
+#: ``on_page`` is not 0 while a corner is estimated with another calibration than its file's (`runtime.pages`).
 SHARED = np.dtype(
     [
         ("layout", "S16"),
         ("written", "i8"),
+        ("on_page", "i8"),
         ("parameters", PARAMETERS, (len(CORNERS),)),
         ("samples", SAMPLE, (ROWS,)),
         ("estimates", ESTIMATE, (ROWS,)),
@@ -63,7 +65,7 @@ class SharedEstimates:
         write_atomically(path, content.tobytes())
         with open(path, "r+b") as file:
             memory = mmap.mmap(file.fileno(), SHARED.itemsize)
-        self._written = _field(memory, "written")
+        self._written, self._on_page = _field(memory, "written"), _field(memory, "on_page")
         self._copies = [
             (_bytes_of(_field(memory, name)), _bytes_of(rows))
             for name, rows in (("samples", pipeline.samples), ("estimates", pipeline.estimates))
@@ -87,6 +89,10 @@ class SharedEstimates:
         if self._ticks % _PARAMETERS_TICKS == 0:
             corner, (shared, used) = self._ticks // _PARAMETERS_TICKS % len(CORNERS), self._parameters
             shared[corner] = used[corner]
+
+    def tell_page(self, on_page: bool) -> None:
+        """Tell whether a corner is estimated with another calibration than its file's."""
+        self._on_page[0] = on_page
 
     def close(self) -> None:
         """Take the file away."""
@@ -112,6 +118,11 @@ class EstimatesReader:
     def connected(self) -> bool:
         return self._memory is not None
 
+    @property
+    def on_page(self) -> bool:
+        """Whether a corner is estimated with another calibration than its file's."""
+        return self._memory is not None and bool(self._on_page[0])
+
     def look(self) -> None:
         """Find the file of a daemon that has started or started anew; costs a system call."""
         try:
@@ -132,7 +143,7 @@ class EstimatesReader:
             return
         self.trouble = ""
         self.parameters = _field(self._memory, "parameters")
-        self._written = _field(self._memory, "written")
+        self._written, self._on_page = _field(self._memory, "written"), _field(self._memory, "on_page")
         self._rings = [_field(self._memory, name) for name in ("samples", "estimates")]
         self._taken = self._seen = int(self._written[0])
 

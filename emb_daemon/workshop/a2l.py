@@ -1,16 +1,20 @@
-"""The A2L file (ASAM MCD-2 MC 1.61) of what `image` shows: signals of `interface.signals`, numbers of `interface.places`."""
+"""The A2L file (ASAM MCD-2 MC 1.61): signals of `interface.signals` and numbers of `interface.places` as `image` shows them,
+and the numbers of `pages` where they may be written."""
 
 import hashlib
 import sys
 from collections.abc import Mapping
 
 from emb_daemon import __version__
+from emb_daemon.calibration.parameters import parameter
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.interface.places import places
 from emb_daemon.interface.signals import INPUTS, OUTPUTS, Signal
 from emb_daemon.runtime.shared import LAYOUT_DIGEST
 from emb_daemon.wire.contract import MODES, REASONS, SOURCES
 from emb_daemon.wire.layout import CORNERS
+from emb_daemon.workshop import pages
+from emb_daemon.workshop.ifdata import A2ML, Connection, memory_segment, module_block
 from emb_daemon.workshop.image import CORNER_ADDRESS, PARAMETERS_ADDRESS, VERSION_ADDRESS, address_of, is_float
 
 #: Which the slave tells, and the file's name.
@@ -30,16 +34,17 @@ _FRAME = """\
 ASAP2_VERSION 1 61
 /begin PROJECT {name} "Virtual clamp force sensor"
   /begin MODULE {name} "{about}"
-    /begin MOD_COMMON ""
+{interface}    /begin MOD_COMMON ""
       BYTE_ORDER MSB_LAST
       ALIGNMENT_LONG 4
       ALIGNMENT_FLOAT32_IEEE 4
       ALIGNMENT_FLOAT64_IEEE 8
     /end MOD_COMMON
-    /begin MOD_PAR "read only"
+    /begin MOD_PAR "{access}"
       VERSION "{version}"
       ADDR_EPK 0x{address:X}
       EPK "{epk}"
+{segment}\
     /end MOD_PAR
     /begin RECORD_LAYOUT RL.FLOAT64
       FNC_VALUES 1 FLOAT64_IEEE COLUMN_DIR DIRECT
@@ -99,8 +104,16 @@ def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> 
     return _block("MEASUREMENT", head, f"ECU_ADDRESS 0x{address_of(corner, index):X}")
 
 
-def make_a2l(calibrations: Mapping[str, Calibration]) -> bytes:
-    """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC wants it."""
+def version_of(calibrations: Mapping[str, Calibration], calibrate: bool) -> str:
+    """The text at VERSION_ADDRESS: where numbers may be written, it also says where each stands."""
+    return f"{VERSION} {pages.digest(calibrations)}" if calibrate else VERSION
+
+
+def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | None = None, calibrate: bool = False) -> bytes:
+    """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC wants it.
+
+    With ``connection`` it says how the server is reached; with ``calibrate`` it has the numbers that may be written.
+    """
     methods, blocks = _Methods(), []
     for name, calibration in calibrations.items():
         corner, numbers = CORNERS.index(name), places(calibration)
@@ -116,8 +129,22 @@ def make_a2l(calibrations: Mapping[str, Calibration]) -> bytes:
             _group(f"{name}.calibration", calibration.actuator, "REF_CHARACTERISTIC",
                    [f"{name}.{place.key}" for place in numbers]),
         ]  # fmt: skip
+    segment = ""
+    if calibrate:
+        written = pages.numbers(calibrations)
+        for index, (name, key) in enumerate(written):
+            number = parameter(calibrations[name], key)
+            kind = f"VALUE 0x{pages.address_of(index):X} RL.FLOAT64 0 {methods.of_unit(number.unit)}"
+            head = f'{name}.page.{key} "" {kind} {_limit(number.low)} {_limit(number.high)}'
+            blocks.append(_block("CHARACTERISTIC", head, "REF_MEMORY_SEGMENT calibration"))
+        for name in calibrations:
+            members = [f"{name}.page.{key}" for corner, key in written if corner == name]
+            blocks.append(_group(f"{name}.page", "of the files, or of the working page", "REF_CHARACTERISTIC", members))
+        segment = memory_segment(pages.SEGMENT_ADDRESS, pages.NUMBER_BYTES * len(written))
     file = _FRAME.format(
-        name=NAME, about=", ".join(calibrations), version=__version__, address=VERSION_ADDRESS, epk=VERSION,
+        name=NAME, about=", ".join(calibrations), version=__version__, address=VERSION_ADDRESS,
+        epk=version_of(calibrations, calibrate), access="calibration" if calibrate else "read only", segment=segment,
+        interface=(A2ML if connection or calibrate else "") + (module_block(connection, calibrate) if connection else ""),
         content="\n".join([*methods.blocks.values(), *blocks]),
     )  # fmt: skip
     return file.encode("ascii", "replace")

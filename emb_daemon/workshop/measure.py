@@ -1,21 +1,26 @@
 """XCP's server: estimates in, out of the daemon's shared memory, commands in and responses and data out, over UDP or CAN.
 
-It shares nothing with the daemon but memory that it only reads and, over CAN, the bus; it may be killed at any moment.
+It shares nothing with the daemon but memory that it only reads, over CAN the bus, and for calibration the socket of
+`runtime.pages`; it may be killed at any moment.
 """
 
 import select
 import socket
 import struct
+import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import Unavailable
+from emb_daemon.runtime.pages import Answer, Page, PageClient, socket_path
 from emb_daemon.runtime.shared import EstimatesReader
 from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
 from emb_daemon.workshop.image import Image
+from emb_daemon.workshop.pages import Segment
 from emb_daemon.workshop.xcp import CONNECT, ON_CAN, ON_UDP, Slave
 
 #: Estimates are fetched this often, and the daemon's file is looked for that often.
@@ -150,11 +155,17 @@ class Measurement:
         transport: `Udp` or `Can`.
         version: the text by which the A2L file knows its memory.
         name, file: of the A2L file, without ending, and its content.
+        calibrations: of the files, by corner, if they may be written.
     """
 
-    def __init__(self, estimates: Path, transport, version: bytes, name: bytes, file: bytes):
+    def __init__(
+        self, estimates: Path, transport, version: bytes, name: bytes, file: bytes,
+        calibrations: Mapping[str, Calibration] | None = None,
+    ):  # fmt: skip
         self.reader, self.transport, self._image = EstimatesReader(estimates), transport, Image(version)
-        self._slave = Slave(self._image, transport.layer, time.monotonic_ns, name, file)
+        self._pages = PageClient(socket_path(estimates))
+        segment = Segment(calibrations, self._ask, lambda: self.reader.on_page) if calibrations is not None else None
+        self._slave = Slave(self._image, transport.layer, time.monotonic_ns, name, file, segment)
         self._looked = -_LOOK_S
         self._overloaded = False
 
@@ -162,6 +173,14 @@ class Measurement:
     def trouble(self) -> str:
         """Why no estimates come; empty if they do, or no daemon runs."""
         return self.reader.trouble
+
+    def _ask(self, page: Page) -> Answer:
+        # The daemon may have started since it was looked for last.
+        self.reader.look()
+        answer = self._pages.ask(page)
+        if answer.refused:
+            print(f"page refused: {answer.refused}", file=sys.stderr, flush=True)
+        return answer
 
     def step(self) -> None:
         """Answer what is asked and hand out the estimates of a moment."""

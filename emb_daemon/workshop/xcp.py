@@ -1,4 +1,6 @@
-"""The slave's side of XCP (ASAM MCD-1 XCP 1.x): reading and data acquisition, as packets to packets. Nothing is ever written.
+"""The slave's side of XCP (ASAM MCD-1 XCP 1.x): reading, data acquisition and, on request, calibration, as packets to packets.
+
+Nothing is written but the working page of `pages`, which the daemon checks before it uses it.
 
 Whatever a packet holds, it gets one response; without a session none but CONNECT is answered.
 """
@@ -7,31 +9,39 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+from emb_daemon.runtime.pages import Answer
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
 from emb_daemon.workshop.image import Image
+from emb_daemon.workshop.pages import FILES, SEGMENT_ADDRESS, WORKING, Segment
 
 CONNECT = 0xFF
 _RESPONSE, _ERROR, _EVENT = 0xFF, 0xFE, 0xFD
 #: Error codes.
-SYNCH, DAQ_ACTIVE, UNKNOWN, SYNTAX, OUT_OF_RANGE, ACCESS_DENIED = 0x00, 0x11, 0x20, 0x21, 0x22, 0x24
-MODE_NOT_VALID, SEQUENCE, DAQ_CONFIG, MEMORY_OVERFLOW = 0x27, 0x29, 0x2A, 0x30
+SYNCH, DAQ_ACTIVE, UNKNOWN, SYNTAX, OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED = 0x00, 0x11, 0x20, 0x21, 0x22, 0x23, 0x24
+PAGE_NOT_VALID, MODE_NOT_VALID, SEGMENT_NOT_VALID, SEQUENCE, DAQ_CONFIG = 0x26, 0x27, 0x28, 0x29, 0x2A
+MEMORY_OVERFLOW, NOT_NOW = 0x30, 0x33
 #: Event code of what the master was not sent.
 _OVERLOAD = 0x06
 
-#: CONNECT: data acquisition, no page to write; little-endian, byte addresses, GET_COMM_MODE_INFO is there.
-_RESOURCE, _MODE, _VERSION = 0x04, 0x80, 0x01
+#: CONNECT: data acquisition, and calibration where there is a page to write; little-endian, byte addresses,
+#: GET_COMM_MODE_INFO is there.
+_ACQUISITION, _CALIBRATION, _MODE, _VERSION = 0x04, 0x01, 0x80, 0x01
 _DAQ_RUNNING = 0x40
 #: GET_DAQ_PROCESSOR_INFO: dynamic lists, prescaler, time stamps; overload is told by an event.
 _DAQ_PROPERTIES = 0x01 | 0x02 | 0x10 | 0x80
 #: Bits of SET_DAQ_LIST_MODE that are understood, and of START_STOP_DAQ_LIST's answer to it.
 _TIMESTAMP, _SELECTED, _RUNNING = 0x10, 0x01, 0x40
 #: GET_DAQ_EVENT_INFO: for acquisition, data of one event are of one moment; cycle in ms.
-_EVENT_PROPERTIES, _MILLISECONDS = 0x04 | 0x80, 6
+_EVENT_PROPERTIES, MILLISECONDS = 0x04 | 0x80, 6
+#: SET_CAL_PAGE: who is to use the page, and that all segments are meant.
+_BY_DAEMON, _BY_MASTER, _ALL_SEGMENTS = 0x01, 0x02, 0x80
+#: GET_PAGE_INFO: both may be used and read together with the other; the working page can be written, used or not.
+_READ_ONLY, _WRITABLE = 0x0F, 0x3F
 #: No entry has bits of its own.
 _WHOLE = 0xFF
 #: Most lists, entries in all, and ODTs, whose number is a byte below the codes of responses.
-_LISTS, _ENTRIES, _ODTS = 16, 4096, 0xFC
+LISTS, _ENTRIES, _ODTS = 16, 4096, 0xFC
 #: Address extension of a text that the slave offers to be uploaded.
 _TEXT = 0xFF
 
@@ -81,13 +91,17 @@ class Slave:
         clock: monotonic time now, ns.
         name: of the A2L file, without its ending.
         file: the A2L file.
+        segment: the calibration, where it may be written.
 
     Attributes:
         connected: whether there is a session.
     """
 
-    def __init__(self, memory: Image, transport: Transport, clock: Callable[[], int], name: bytes, file: bytes):
-        self._memory, self._transport, self._clock = memory, transport, clock
+    def __init__(
+        self, memory: Image, transport: Transport, clock: Callable[[], int], name: bytes, file: bytes,
+        segment: Segment | None = None,
+    ):  # fmt: skip
+        self._memory, self._transport, self._clock, self._segment = memory, transport, clock, segment
         self._texts = {0: name, 1: name, 4: file}
         self.connected = False
         self._reset()
@@ -110,15 +124,26 @@ class Slave:
                 (0xDE, "BH", self._start_stop_list),
                 (0xDD, "B", self._start_stop),
                 (0xDC, "", lambda: struct.pack("<xHI", 0, self._ticks(self._clock()) & 0xFFFFFFFF)),
-                (0xDA, "", lambda: struct.pack("<BHHBB", _DAQ_PROPERTIES, _LISTS, len(CORNERS), 0, 0)),
+                (0xDA, "", lambda: struct.pack("<BHHBB", _DAQ_PROPERTIES, LISTS, len(CORNERS), 0, 0)),
                 (0xD9, "", self._resolution),
                 (0xD7, "xH", self._event_information),
                 (0xD6, "", self._free),
                 (0xD5, "xH", self._allocate_lists),
                 (0xD4, "xHB", self._allocate_odts),
                 (0xD3, "xHBB", self._allocate_entries),
+                *(() if segment is None else (
+                    (0xF0, "B", self._download),
+                    (0xED, "BxBI", self._short_download),
+                    (0xEB, "BBB", self._set_page),
+                    (0xEA, "BB", self._page),
+                    (0xE9, "", lambda: bytes([1, 0])),
+                    (0xE8, "BBBB", self._segment_information),
+                    (0xE7, "xBB", self._page_information),
+                    (0xE4, "BBBB", self._copy_page),
+                )),
             )
-        }
+        }  # fmt: skip
+        self._packet = b""
 
     def _reset(self) -> None:
         self._lists: list[_List] = []
@@ -143,6 +168,7 @@ class Slave:
             # Longer ones are filled up to the frame's size.
             if len(packet) <= layout.size:
                 raise Refusal(SYNTAX)
+            self._packet = packet
             return bytes([_RESPONSE]) + action(*layout.unpack_from(packet, 1))
         except Refusal as refusal:
             return bytes([_ERROR, *refusal.args])
@@ -155,7 +181,8 @@ class Slave:
     def _connect(self, _mode: int) -> bytes:
         self._reset()
         self.connected = True
-        return struct.pack("<BBBHBB", _RESOURCE, _MODE, self._transport.max_cto, self._transport.max_dto, _VERSION, _VERSION)
+        resource = _ACQUISITION | _CALIBRATION * (self._segment is not None)
+        return struct.pack("<BBBHBB", resource, _MODE, self._transport.max_cto, self._transport.max_dto, _VERSION, _VERSION)
 
     def _disconnect(self) -> bytes:
         self.end()
@@ -183,12 +210,88 @@ class Slave:
         extension, address = self._address
         if not 0 < count < self._transport.max_cto:
             raise Refusal(OUT_OF_RANGE)
-        offered = self._text[address : address + count]
-        content = offered if extension == _TEXT else self._memory.read(extension, address, count)
+        content = self._text[address : address + count] if extension == _TEXT else self._content(extension, address, count)
         if content is None or len(content) < count:
             raise Refusal(ACCESS_DENIED)
         self._address = extension, address + count
         return content
+
+    def _content(self, extension: int, address: int, count: int) -> bytes | None:
+        if self._segment and not extension and (content := self._segment.read(address, count)) is not None:
+            return content
+        return self._memory.read(extension, address, count)
+
+    def _download(self, count: int) -> bytes:
+        return self._write(count, 2)
+
+    def _short_download(self, count: int, extension: int, address: int) -> bytes:
+        self._address = extension, address
+        return self._write(count, 8)
+
+    def _write(self, count: int, header: int) -> bytes:
+        """Take ``count`` bytes that stand behind ``header`` bytes of the packet."""
+        (extension, address), content = self._address, self._packet[header : header + count]
+        if not 0 < count <= self._transport.max_cto - header:
+            raise Refusal(OUT_OF_RANGE)
+        if len(content) < count:
+            raise Refusal(SYNTAX)
+        if extension or not self._segment.covers(address, count):
+            raise Refusal(ACCESS_DENIED)
+        if self._segment.shown != WORKING:
+            raise Refusal(WRITE_PROTECTED)
+        self._check_taken(self._segment.write(address, content))
+        self._address = extension, address + count
+        return b""
+
+    @staticmethod
+    def _check_taken(answer: Answer) -> None:
+        if answer.refused:
+            raise Refusal(NOT_NOW if answer.later else OUT_OF_RANGE)
+
+    def _set_page(self, mode: int, segment: int, page: int) -> bytes:
+        if not mode & (_BY_DAEMON | _BY_MASTER) or mode & ~(_BY_DAEMON | _BY_MASTER | _ALL_SEGMENTS):
+            raise Refusal(MODE_NOT_VALID)
+        self._check_page(0 if mode & _ALL_SEGMENTS else segment, page)
+        if mode & _BY_DAEMON:
+            self._check_taken(self._segment.use(page))
+        if mode & _BY_MASTER:
+            self._segment.shown = page
+        return b""
+
+    def _page(self, mode: int, segment: int) -> bytes:
+        if mode not in (_BY_DAEMON, _BY_MASTER):
+            raise Refusal(MODE_NOT_VALID)
+        self._check_page(segment)
+        return bytes([0, 0, self._segment.used if mode == _BY_DAEMON else self._segment.shown])
+
+    @staticmethod
+    def _check_page(segment: int, page: int = WORKING) -> None:
+        if segment:
+            raise Refusal(SEGMENT_NOT_VALID)
+        if page not in (WORKING, FILES):
+            raise Refusal(PAGE_NOT_VALID)
+
+    def _segment_information(self, mode: int, segment: int, information: int, _mapping: int) -> bytes:
+        """Mode 0: address and length; 1: two pages, no mapping, neither compressed nor encrypted."""
+        self._check_page(segment)
+        if mode == 1:
+            return bytes([2, 0, 0, 0, 0])
+        if mode or information > 1:
+            raise Refusal(OUT_OF_RANGE)
+        return struct.pack("<xxxI", self._segment.size if information else SEGMENT_ADDRESS)
+
+    def _page_information(self, segment: int, page: int) -> bytes:
+        self._check_page(segment, page)
+        return bytes([_WRITABLE if page == WORKING else _READ_ONLY, 0])
+
+    def _copy_page(self, from_segment: int, from_page: int, to_segment: int, to_page: int) -> bytes:
+        self._check_page(from_segment, from_page)
+        self._check_page(to_segment, to_page)
+        if to_page != WORKING or self._segment.used == WORKING:
+            raise Refusal(WRITE_PROTECTED)
+        if from_page == FILES:
+            self._segment.fill()
+        return b""
 
     def _short_upload(self, count: int, extension: int, address: int) -> bytes:
         self._address = extension, address
@@ -203,7 +306,7 @@ class Slave:
         if event >= len(CORNERS):
             raise Refusal(OUT_OF_RANGE)
         self._offer(CORNERS[event].encode())
-        return struct.pack("<6B", _EVENT_PROPERTIES, _LISTS, len(self._text), CYCLE_NS // 1_000_000, _MILLISECONDS, 0)
+        return struct.pack("<6B", _EVENT_PROPERTIES, LISTS, len(self._text), CYCLE_NS // 1_000_000, MILLISECONDS, 0)
 
     def _list(self, number: int, idle: bool = False) -> _List:
         if number >= len(self._lists):
@@ -223,7 +326,7 @@ class Slave:
     def _allocate_lists(self, count: int) -> bytes:
         if self._allocated != 1:
             raise Refusal(SEQUENCE)
-        if count > _LISTS:
+        if count > LISTS:
             raise Refusal(MEMORY_OVERFLOW)
         self._lists, self._allocated = [_List() for _ in range(count)], 2
         return b""

@@ -4,27 +4,32 @@ Known effects first, then terms of the grammar. What is accepted stands in the c
 sigma.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from msgspec.structs import replace
 
 from emb_daemon.calibration.parameters import CLEARANCE, moved
-from emb_daemon.calibration.types import Calibration
+from emb_daemon.calibration.types import Calibration, Contact
 from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
-from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, with_terms
+from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, undecided, with_terms
 from emb_daemon.diagnose.page import sections
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.diagnose.selection import Progress
+from emb_daemon.diagnose.selection import Progress, Selection
 from emb_daemon.diagnose.text import verdict
+from emb_daemon.estimator.heat import TOUCHING_N
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS
 from emb_daemon.offline import Log
+from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
+
+#: Share of the motor's largest speed from which a clamp shows lag and inertia as random motion does.
+_FAST = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,13 +38,17 @@ class AttributionStep(Step):
 
     Attributes:
         calibration: with what was accepted.
-        diagnosis: the search; None where nothing moves at random or the logs are too short for one.
+        diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
+        fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
+        undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
     """
 
     calibration: Calibration
     diagnosis: Diagnosis | None = None
     hot: tuple[Errors, ...] = ()
+    fastest_rad_per_s: float = 0.0
+    undecided: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, fold: Fold) -> Calibration:
         """What is known of a fold's pads without their random logs: found effects, and the torque path, by other pads' logs.
@@ -73,9 +82,10 @@ def _others(bench: Bench, gone: Sequence[bool]) -> np.ndarray:
 def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, progress: Progress) -> AttributionStep:
     """Effects and terms that curves, random logs and ``hot`` ones, which heat the pads, prove beside ``known``.
 
-    Nothing without random logs: slow motion leaves inertia and relaxation to the datasheet, and a search that may move them
-    all would find what they are not."""
-    if not any(pads.random for pads in stiffness.pads):
+    Nothing where no log clamps fast: slow motion leaves inertia and relaxation to the datasheet, and a search that may move
+    them all would find what they are not."""
+    fast = _fastest(hot) > _FAST * known.motor.maximum_speed_rad_per_s
+    if not fast and not any(pads.random for pads in stiffness.pads):
         return _unsearched(hot, known)
     logs, mounted = [], []
     for pads, curve in zip(stiffness.pads, stiffness.fit.curves, strict=True):
@@ -85,13 +95,25 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
     if bench.episodes < EPISODES:
         return _unsearched(hot, known)
     found = diagnose_bench(bench, None, progress)
-    calibration = replace(found.calibration, contact=known.contact, noise=known.noise, provenance=None)
+    contact = _contact(found.selection, known, len(logs))
+    calibration = replace(found.calibration, contact=contact, noise=known.noise, provenance=None)
     return AttributionStep(
         sigmas=found.calibration.provenance.sigmas,
         calibration=calibration,
         diagnosis=found,
         hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
+        fastest_rad_per_s=_fastest(hot),
+        undecided=undecided(found.selection),
     )
+
+
+def _contact(selection: Selection, known: Calibration, drives: int) -> Contact:
+    """The contact as known, and as unsure as the fit of what was found leaves it: by how much it moves that of logs from
+    number ``drives`` on, which fitted no curve and start from what is known."""
+    clearances = [value for c, value in selection.applied().items() if c.name == CLEARANCE and c.log >= drives]
+    off = [clearance - known.contact.clearance_rad for clearance in clearances]
+    sigma = np.hypot(known.contact.clearance_sigma_rad, rmse(np.array(off)) if off else 0.0)
+    return replace(known.contact, clearance_sigma_rad=float(sigma))
 
 
 def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
@@ -100,13 +122,19 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
         return AttributionStep(calibration=known)
     bench = Bench(hot, known, own_data=True)
     residual = bench.residuals({})["stiffness"]
-    return AttributionStep(calibration=known, hot=tuple(_errors(bench, residual, index) for index in range(len(hot))))
+    left = tuple(_errors(bench, residual, index) for index in range(len(hot)))
+    return AttributionStep(calibration=known, hot=left, fastest_rad_per_s=_fastest(hot))
+
+
+def _fastest(logs: Sequence[Log]) -> float:
+    """Speed of the motor in the hardest clamp of logs, rad/s."""
+    return max((float(np.max(log.samples["speed"], initial=0.0, where=log.force_N > TOUCHING_N)) for log in logs), default=0.0)
 
 
 def words(step: AttributionStep) -> str:
     """What was found beside the thesis's models and the stiffness step's effects, and what is left."""
     if step.diagnosis is None:
-        return "The campaign has no random motion, or is too short, to tell what its models lack."
+        return "The campaign has no fast motion, or is too short, to tell what its models lack."
     return verdict(step.diagnosis)
 
 

@@ -4,10 +4,14 @@ The daemon's standard deviation is judged against a reference instrument, so tha
 what is held out contains it too.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.dynamics import EPISODE
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
@@ -29,6 +33,7 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
+NOTHING: Mapping[str, float] = MappingProxyType({})
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -40,12 +45,16 @@ def identify(
     folds: list[Fold],
     interpolation: float,
     hot: tuple[Errors, ...] = (),
+    undecided: Mapping[str, float] = NOTHING,
+    fastest_rad_per_s: float = 0.0,
 ) -> Step:
     """Noise levels from the folds, or from the second halves of the random logs where there are none.
 
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
         hot: errors that the whole model leaves on logs of hot pads; where they are more than what cold ones show, they count.
+        undecided: shares of the force by which a model might be another, by key.
+        fastest_rad_per_s: speed of the motor in the hardest clamp of the ``hot`` logs.
     """
     logs = [log for pads in stiffness.pads for log in pads.logs]
     known, notes = stiffness.fit.calibration, []
@@ -75,19 +84,25 @@ def identify(
         **torque_levels(held_out, gear_gain, speed),
     }
     if not any(pads.random for pads in stiffness.pads):
-        levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign)))
+        levels["stiffness_relative"] = float(
+            np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign, fastest_rad_per_s))
+        )
         notes.append(
             "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
         )
     # The daemon is not told how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
-    return Step(values={f"noise.{name}": value for name, value in levels.items()}, notes=tuple(notes))
+    values = {f"noise.{name}": value for name, value in levels.items()}
+    values |= {key: float(np.hypot(values[key], share)) for key, share in undecided.items()}
+    return Step(values=values, notes=tuple(notes))
 
 
-def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign) -> float:
-    """Relative force error of a lag that no log shows, in a clamp as hard as the motor can."""
+def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s: float) -> float:
+    """Relative force error of a lag in a clamp as hard as the motor can, beyond what clamps of this speed, whose errors are
+    known, show of it."""
     travel = max(curve.travel_rad for curve in stiffness.fit.curves)
-    return USUAL_RELAXATION_S * campaign.datasheet.actuator.max_motor_speed_rad_per_s / travel
+    unseen = max(campaign.datasheet.actuator.max_motor_speed_rad_per_s - fastest_rad_per_s, 0.0)
+    return USUAL_RELAXATION_S * unseen / travel
 
 
 def speed_noise(logs: list[Log]) -> float | None:
@@ -148,6 +163,22 @@ def current_noise(residuals: list[np.ndarray], difference_A: float) -> tuple[flo
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
 
 
+def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float) -> tuple[float, float]:
+    """First-order noise (standard deviation in A, correlation time in s) that has the density of a current's noise and of
+    what stays unexplained for a manoeuvre.
+
+    Likelihood asks a thousand samples a second, most of which tell of the noise alone. What stays for a second the filter
+    would take for an error of the contact angle."""
+    lasts = CYCLE_S * EPISODE
+    means = [s[row : row + EPISODE].mean() for s in residuals for row in range(0, len(s) - EPISODE + 1, EPISODE)]
+    if not means:
+        return sigma_A, time_s
+    # A mean of first-order noise over much longer than its time has this variance.
+    slow = max(rmse(np.array(means)) ** 2 - sigma_A**2 * 2.0 * time_s / lasts, 0.0)
+    total = sigma_A**2 + slow
+    return float(np.sqrt(total)), (sigma_A**2 * time_s + slow * lasts) / total
+
+
 def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
     """Fields of ``noise`` that belong to the torque path, from what fits leave on logs that they did not see."""
     series, turning, excess, gains = [], [], [], []
@@ -178,7 +209,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
-    sigma, time = current_noise(series, difference)
+    sigma, time = _with_what_lasts(series, *current_noise(series, difference))
     return {
         "current_A": sigma,
         "current_correlation_s": time,

@@ -22,6 +22,7 @@ from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import EPISODE, Pads
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.text import stem, with_sigma
+from emb_daemon.models.gear import all_through_gear
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife, valley
 from emb_daemon.offline.run import run_paths
@@ -137,6 +138,11 @@ class _Regression:
         self.log, self.calibration = log, calibration
         self.rows = r = rows[full_rate & known]
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
+        # What the reduction carries, as force on a constant gear.
+        motor = calibration.motor
+        turned, slope = all_through_gear(motor.gear(), 0.5 * (angle[r] + angle[r - 1]) - angle[0])
+        spring = motor.release_spring_N_per_m * motor.gear_gain_m_per_rad * np.maximum(turned, 0.0)
+        self.load = (self.force + spring) * slope
         self.current = samples["current_q"][r]
         self.acceleration = (speed[r] - speed[r - 1]) / CYCLE_S
         self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
@@ -147,11 +153,11 @@ class _Regression:
         parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
-        regressors = np.column_stack([self.force, self.acceleration, s, s * self.force])
+        regressors = np.column_stack([self.load, self.acceleration, s, s * self.load])
         instruments = regressors.copy()
         instruments[:, 1] = self.of_angle
         known = paths["friction_variance"] < _KNOWN
-        spread = np.sqrt(paths["friction_variance"][~known, None]) * np.column_stack([np.ones(len(s)), self.force])[~known]
+        spread = np.sqrt(paths["friction_variance"][~known, None]) * np.column_stack([np.ones(len(s)), self.load])[~known]
         return regressors, instruments, known, spread
 
 
@@ -249,7 +255,7 @@ class Unexplained:
         rows: of the log.
         current_A: left unexplained.
         friction_mean: friction state, -1 to 1.
-        force_N: mean force.
+        force_N: mean force that the reduction carries: with the release spring's, times the gear's slope over its mean.
     """
 
     found: TorqueFit
@@ -265,7 +271,7 @@ def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) ->
     paths = run_paths(log.samples, to_parameters(known))[part.rows]
     use = paths["friction_variance"] < _KNOWN
     residual = (paths["torque"] - paths["leverage"] * part.force) / found.values[TORQUE_CONSTANT]
-    return Unexplained(found, part.rows[use], residual[use], paths["friction_mean"][use], part.force[use])
+    return Unexplained(found, part.rows[use], residual[use], paths["friction_mean"][use], part.load[use])
 
 
 _ROWS = (

@@ -1,0 +1,193 @@
+"""Trying another calibration: what a measurement tool's server asks of the daemon, over a socket beside the estimates' file.
+
+A `Page` says by which numbers each corner's calibration is to differ from its file. Only the daemon's user, and root, reach
+the socket. Nothing of a page is kept: it ends with the server that asked for it, with a reload, and with the daemon.
+"""
+
+import contextlib
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import msgspec
+
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.parameters import keys, moved
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.errors import InputError, Unavailable
+from emb_daemon.runtime.journal import log
+
+#: The largest request: every number of four corners.
+_MOST_BYTES = 200_000
+#: A page that could not be checked within this time is dropped, and the other side waits a little longer.
+PATIENCE_S = 3.0
+_ANSWERED_S = PATIENCE_S + 1.0
+
+
+def tunable(calibration: Calibration) -> list[str]:
+    """Keys of the numbers that a page may set: all but adaptation's. Those are limits of what may be learned, and nothing is
+    learned on a page."""
+    return [key for key in keys(calibration) if not key.startswith("adaptation.")]
+
+
+class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Numbers by corner and key; of each corner that has any, the hash of the calibration that they differ from."""
+
+    values: dict[str, dict[str, float]]
+    files: dict[str, str]
+
+    def applied(self, calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
+        """The calibrations of the files with the page's numbers, checked as a file is.
+
+        Raises:
+            InputError: every fault found.
+        """
+        faults: list[str] = []
+        result = dict(calibrations)
+        for name, values in self.values.items():
+            if name not in calibrations:
+                faults.append(f"corner {name}: not estimated")
+                continue
+            calibration = calibrations[name]
+            if self.files.get(name) != calibration_hash(calibration):
+                faults.append(f"corner {name}: the file is not the one that the page was made from: start emb-daemon xcp anew")
+                continue
+            known = set(tunable(calibration))
+            faults += [f"corner {name}: {key}: no number that a page may set" for key in values if key not in known]
+            if known.issuperset(values):
+                try:
+                    result[name] = moved(calibration, values, checked=True)
+                except InputError as error:
+                    faults += [f"corner {name}: {fault}" for fault in error.faults]
+        if faults:
+            raise InputError("; ".join(faults))
+        return result
+
+
+class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Why a page was not taken, empty if it was; ``later`` if it might be under other circumstances."""
+
+    refused: str = ""
+    later: bool = False
+
+
+class Request:
+    """A page that was asked for at ``asked_ns``, what was ``read`` for it by ``read_ns``, and who waits for the answer."""
+
+    def __init__(self, page: Page):
+        self.page, self.asked_ns = page, time.monotonic_ns()
+        self.read: dict = {}
+        self.read_ns: int | None = None
+        #: What is wrong with the page; whoever checks it says that nothing is.
+        self.fault = "could not be checked"
+        self._answer: queue.SimpleQueue = queue.SimpleQueue()
+
+    def answer(self, answer: Answer) -> None:
+        """Does not wait."""
+        self._answer.put(answer)
+
+    def wait(self) -> Answer:
+        return self._answer.get()
+
+
+def socket_path(estimates: Path) -> Path:
+    """Of the socket beside the estimates' file."""
+    return estimates.with_name(estimates.name + ".pages")
+
+
+class PageListener:
+    """The daemon's side, in a thread.
+
+    Args:
+        path: of the socket.
+        ask: has a request answered; called in the thread.
+        end: called in the thread when a server that asked for something has gone.
+    """
+
+    def __init__(self, path: Path, ask: Callable[[Request], None], end: Callable[[], None]):
+        """Raises Unavailable if the socket cannot be made."""
+        self._path, self._ask, self._end = path, ask, end
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+            # From the start, so that nobody else connects in between.
+            os.fchmod(self._listener.fileno(), 0o600)
+            self._listener.bind(str(path))
+            self._listener.listen(1)
+        except OSError as error:
+            raise Unavailable(f"{path}: {error.strerror or error}") from None
+        threading.Thread(target=self._run, name="pages", daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            with connection, contextlib.suppress(OSError):
+                while content := connection.recv(_MOST_BYTES):
+                    connection.send(msgspec.json.encode(self._answer(content)))
+            self._end()
+
+    def _answer(self, content: bytes) -> Answer:
+        try:
+            request = Request(msgspec.json.decode(content, type=Page))
+        except (msgspec.DecodeError, RecursionError) as error:
+            log.error("page refused: not understood: %s", error)
+            return Answer(f"not understood: {error}")
+        self._ask(request)
+        return request.wait()
+
+    def close(self) -> None:
+        """Take the socket away, and end the thread unless it hears somebody."""
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+
+class PageClient:
+    """The server's side: its connection is what keeps a page in use."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._connection: socket.socket | None = None
+
+    def ask(self, page: Page) -> Answer:
+        """The daemon's answer; one of our own if there is no daemon that hears."""
+        for _ in range(2):
+            # A connection that a daemon has left is found out by using it.
+            known = self._connection is not None
+            try:
+                answered = self._exchange(msgspec.json.encode(page))
+                if answered:
+                    return msgspec.json.decode(answered, type=Answer)
+            except TimeoutError:
+                self.close()
+                return Answer("the daemon did not answer in time", later=True)
+            except (OSError, msgspec.DecodeError) as error:
+                failed = f"{self._path}: {error}"
+            else:
+                failed = f"{self._path}: the daemon has ended"
+            self.close()
+            if not known:
+                break
+        return Answer(failed, later=True)
+
+    def _exchange(self, content: bytes) -> bytes:
+        if self._connection is None:
+            self._connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+            self._connection.settimeout(_ANSWERED_S)
+            self._connection.connect(str(self._path))
+        self._connection.send(content)
+        return self._connection.recv(_MOST_BYTES)
+
+    def close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None

@@ -1,0 +1,130 @@
+"""What adaptation does beside the tick, without a brake: whose evaluation is taken, what of it is kept, and as whose."""
+
+import threading
+
+import adaptkit
+import msgspec
+import numpy as np
+import pytest
+
+from emb_daemon.adapt import adaptation as module
+from emb_daemon.adapt import records as r
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.learned import Evaluation
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.parameters import CLEARANCE, OFFSET_FRICTION, moved
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator import restart
+from emb_daemon.estimator.records import PARAMETERS, new_state
+
+SHIPPED = adaptkit.shipped()
+LEARNED = np.ones(1, PARAMETERS)[0]
+
+
+@pytest.fixture
+def adaptation(tmp_path):
+    return Adaptation({"FL": SHIPPED}, Memory(tmp_path), int)
+
+
+def test_an_evaluation_counts_for_the_training_that_asked_for_it_while_it_waits(adaptation):
+    adapter = adaptation.adapters[0]
+    adapter["generation"] = 3
+    for phase, generation, taken in ((r.EVALUATING, 2, False), (r.IDLE, 3, False), (r.EVALUATING, 3, True)):
+        adapter["phase"] = phase
+        adaptation._take_evaluation(0, generation, Evaluation(r.ACCEPTED, contact_angle=7.0), LEARNED)
+        assert adapter["evaluation_ready"] == taken and (adaptation.learned[0] == LEARNED) == taken
+    assert adapter["contact_angle"] == 7.0
+
+
+def test_another_calibration_forgets_training_and_snapshot(adaptation):
+    """Of neither anything comes back: an evaluation on its way is of an older generation."""
+    adapter = adaptation.adapters[0]
+    adapter["phase"], adapter["generation"] = r.EVALUATING, 3
+    adaptation._resumable[0] = None, 0
+    adaptation.replace("FL", SHIPPED, adaptation.read("FL", SHIPPED))
+    assert adapter["phase"] == r.IDLE and adapter["generation"] == 4 and not adaptation._resumable
+
+
+@pytest.mark.parametrize(
+    ("outcome", "history", "in_use"),
+    [(r.VEHICLE_MOVED, 0, False), (r.NOT_IN_TIME, 0, False), (r.NOT_CONVERGED, 1, False), (r.ACCEPTED, 1, True)],
+)
+def test_what_was_evaluated_is_kept_and_what_was_accepted_is_in_use(adaptation, tmp_path, outcome, history, in_use):
+    values = adaptkit.accepted(adaptation._stores[0]).current.values
+    adaptation._evaluations[0] = Evaluation(outcome, values=values)
+    adaptation.adapters[0]["outcome"] = outcome
+    adaptation._keep(0, adaptation.adapters[0])
+    store = Memory(tmp_path).read("FL")
+    assert (len(store.history) if store else 0) == history and (adaptation.current("FL") is not None) == in_use
+    assert (adaptation.in_use("FL").friction.offset_Nm != SHIPPED.friction.offset_Nm) == in_use
+
+
+@pytest.mark.parametrize("outcome", [r.ACCEPTED, r.NOT_CONVERGED])
+@pytest.mark.parametrize("clearance, taken", [(7.0, True), (20.0, False)])
+def test_an_accepted_evaluation_alone_puts_values_in_use(adaptation, monkeypatch, outcome, clearance, taken):
+    """The clearance with them, where the motor started released: within the change that it may have."""
+    values = {OFFSET_FRICTION: 2.0 * SHIPPED.friction.offset_Nm}
+    monkeypatch.setattr(
+        module, "fit_training", lambda *_: Evaluation(outcome, values=dict(values), contact_angle=1.5 + clearance)
+    )
+    calibration = moved(SHIPPED, {"contact.walk_rad_per_sqrt_s": 0.02})
+    adaptation._evaluate(0, 5, np.zeros(1, r.TRAINING), SHIPPED, calibration, new_state()[0], 1.5, 0.0)
+    corner, generation, evaluation, learned = adaptation._done.get()
+    expected = moved(SHIPPED, values | ({CLEARANCE: clearance} if taken else {})) if outcome == r.ACCEPTED else calibration
+    assert (corner, generation) == (0, 5) and (CLEARANCE in evaluation.values) == taken
+    assert learned == to_parameters(expected)
+
+
+def test_a_snapshot_belongs_to_the_calibration_with_what_was_learned(adaptation, tmp_path):
+    adaptation._stores[0] = adaptkit.accepted(adaptation._stores[0])
+    state, parameters = new_state()[0], to_parameters(adaptation.in_use("FL"))
+    state["started"] = True
+    adaptation._keep_snapshot(0, state, parameters)
+    text = adaptation._snapshots.path("FL").read_text()
+    assert calibration_hash(adaptation.in_use("FL")) in text and calibration_hash(SHIPPED) not in text
+    assert Adaptation({"FL": SHIPPED}, Memory(tmp_path), int)._resumable == {}, "what was learned was not written"
+
+
+def test_what_is_handed_over_the_loop_no_longer_changes(adaptation):
+    handed, adapter, state = [], adaptation.adapters[0], new_state()[0]
+    adaptation._do = lambda job, *arguments: handed.append(arguments)
+    adapter["evaluation_wanted"], state["force"] = True, 1.0
+    adaptation._attend(0, adapter, state, to_parameters(SHIPPED))
+    state["force"] = 2.0
+    [arguments] = handed
+    assert arguments[5]["force"] == 1.0 and not adapter["evaluation_wanted"]
+
+
+def test_a_job_that_fails_ends_no_other(tmp_path, caplog):
+    adaptation, done = Adaptation({"FL": SHIPPED}, Memory(tmp_path), int, threaded=True), threading.Event()
+    adaptation._thread = threading.Thread(target=adaptation._work, daemon=True)
+    adaptation._thread.start()
+    adaptation._do(lambda: 1 / 0)
+    adaptation._do(done.set)
+    assert done.wait(20.0) and "ZeroDivisionError" in caplog.text
+    adaptation._do(lambda: None)
+    adaptation.close(new_state(4), np.zeros(4, PARAMETERS))
+    assert not adaptation._thread.is_alive()
+
+
+def test_the_end_keeps_a_snapshot_of_what_was_heard(adaptation):
+    states = new_state(4)
+    states["started"][0] = True
+    parameters = np.zeros(4, PARAMETERS)
+    adaptation.restore(parameters)
+    adaptation.close(states, parameters)
+    snapshot, _, warning = adaptation._snapshots.load("FL", SHIPPED)
+    assert snapshot.dtype == restart.SNAPSHOT and warning is None
+    # A daemon that hears nothing before it ends knows nothing better.
+    kept = adaptation._snapshots.path("FL").read_bytes()
+    adaptation.close(new_state(4), parameters)
+    assert adaptation._snapshots.path("FL").read_bytes() == kept
+
+
+def test_where_learning_is_switched_off_nothing_learned_is_used(tmp_path):
+    store = adaptkit.accepted(Adaptation({"FL": SHIPPED}, Memory(tmp_path), int)._stores[0])
+    off = adaptkit.shipped(adaptation=msgspec.structs.replace(SHIPPED.adaptation, enabled=False))
+    adaptation = Adaptation({"FL": off}, Memory(tmp_path), int)
+    adaptation._stores[0] = store
+    assert adaptation.in_use("FL") == off and not adaptation.limits["enabled"][0]
