@@ -11,6 +11,7 @@ from emb_daemon.estimator.unknown import add_growth, add_stiffness_jumps, add_to
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
+    FADE,
     FAST,
     GAIN,
     GROWTH,
@@ -221,6 +222,24 @@ def test_friction_energy_leaves_the_contact_angle_open(parameters):
     assert energy_J[0] == 0.0 and energy_J[1] > 2e5
     assert grown_m[0] < 0.05e-6
     assert 0.3e-6 < grown_m[1] < 3e-6
+
+
+@pytest.mark.parametrize("found, open_yet", [(0.1, 1e-3), (1e-3, 0.1)])
+def test_the_torque_constant_walks_with_the_fade_that_driving_found(parameters, found, open_yet):
+    """What two lags miss of the motor's heat is a share of what heat does: nothing in a motor that was found not to fade
+    though it is hot, per cents in one that fades or may."""
+    p, walked = brake.ideal(parameters), np.zeros(STATES)
+
+    def walk(fade, sigma, heat):
+        x, P = np.zeros(STATES), np.zeros((STATES, STATES))
+        x[FADE], P[FADE, FADE] = fade, sigma**2
+        set_walks(walked, p, x, P, heat, 0.0, 0.0, 0.0, 10.0)
+        return np.sqrt(walked[GAIN])
+
+    cold = walk(found, open_yet, 0.0)
+    assert walk(5e-4, 5e-4, 1.0) < 1.2 * cold
+    assert 0.02 < walk(found, open_yet, 1.0) < 0.04
+    assert walk(found, open_yet, 0.5) == pytest.approx(0.5 * walk(found, open_yet, 1.0), rel=0.02)
 
 
 def test_force_of_an_ideal_brake_is_found_within_its_sigma(parameters):
