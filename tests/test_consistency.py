@@ -9,6 +9,7 @@ from emb_daemon.estimator.consistency import (
     HORIZONS,
     INCONSISTENT,
     UNKNOWN,
+    forget,
     judge,
     model_error,
     remember,
@@ -82,3 +83,12 @@ def test_what_has_passed_is_forgotten():
     watched.pass_by(120.0, bias=0.5)
     verdicts, errors = watched.pass_by(600.0)
     assert np.all(verdicts[-1] == CONSISTENT) and errors[-1] == 0.0
+
+
+def test_what_has_been_explained_is_not_remembered():
+    """A torque that was off until its cause was found: its mean over the last second is no evidence against what follows."""
+    watched = Judged(5)
+    watched.pass_by(20.0, bias=10.0)
+    forget(watched.c[0])
+    verdicts, errors = watched.pass_by(120.0)
+    assert not np.any(verdicts == INCONSISTENT) and not np.any(errors)

@@ -58,7 +58,7 @@ def forget(c):
     """Begin anew: what was left unexplained has been explained."""
     c.seen_s = 0.0
     for i in range(HORIZONS):
-        c.square[i] = c.expected[i] = 0.0
+        c.mean[i] = c.variance[i] = c.square[i] = c.expected[i] = 0.0
 
 
 @njit
