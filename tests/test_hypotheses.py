@@ -15,7 +15,6 @@ from emb_daemon.estimator.hypotheses import (
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     drift_odds,
-    least_odds,
     mix,
     open_again,
     open_all,
@@ -30,7 +29,7 @@ from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import set_priors
 from emb_daemon.models.fusion import COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
 from emb_daemon.offline import estimate
-from emb_daemon.wire.contract import PATHS_DISAGREE
+from emb_daemon.wire.contract import CONTACT_UNCERTAIN, PATHS_DISAGREE
 
 #: Samples of one stop of `brake.stops`, of its standstill at the beginning, and stops before the change.
 _STOP, _STILL, _BEFORE = 750, 350, 4
@@ -137,7 +136,10 @@ def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
         ), what
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
     assert _longest(silent) <= 25
-    assert not estimates["reasons"][-6 * _STOP :].any()
+    told = estimates["reasons"][-6 * _STOP :]
+    assert not np.any(told & ~CONTACT_UNCERTAIN)
+    # What jumped once may again: a sample or two at the beginning of a stop are open by more than a hundredth.
+    assert np.mean(told != 0) < 0.002
 
 
 def _longest(mask):
@@ -293,13 +295,9 @@ def test_what_tells_two_changes_apart_outlasts_certainty(p):
     """However much both explain what nothing does, the one that explained more stays ahead by as much."""
     s = new_state()[0]
     s["alternatives"]["log_odds"] = 150.0, 120.0, -7.0, 149.0
+    s["alternatives"]["least"] = -8.0
     stay_finite(s)
-    assert s["alternatives"]["log_odds"].tolist() == [
-        CERTAIN_ODDS,
-        CERTAIN_ODDS - 30.0,
-        least_odds(DISC_GROWTH),
-        CERTAIN_ODDS - 1.0,
-    ]
+    assert s["alternatives"]["log_odds"].tolist() == [CERTAIN_ODDS, CERTAIN_ODDS - 30.0, -8.0, CERTAIN_ODDS - 1.0]
 
 
 @pytest.fixture
@@ -352,6 +350,50 @@ def test_two_that_are_alike_wait_for_more_strokes(p, opened):
     assert not settle(s, p, True, 0.004)
     s["open_s"] = 20.1
     assert settle(s, p, True, 0.004)
+
+
+def _stop(s, p, jumps):
+    """One stop and the release after it, with a change of contact proven there or not."""
+    s["contact"]["engaged"] = True
+    settle(s, p, False, 4.0)
+    s["contact"]["engaged"] = False
+    if jumps:
+        s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 20.0
+    if settle(s, p, True, 0.004):
+        open_all(s, p)
+
+
+def _share(odds):
+    return 1.0 / (1.0 + np.exp(-odds))
+
+
+def test_pads_that_are_knocked_back_are_expected_to_be_again(p, opened):
+    """One stop in four hundred of a brake that was never seen to; every third of one that did ten times in turn; and after
+    hundreds of stops without it hardly one in fifty."""
+    s = opened[0]
+    odds = s["alternatives"]["log_odds"]
+    _stop(s, p, jumps=False)
+    assert odds[STIFFNESS_JUMP] == odds[TORQUE_JUMP] == PRIOR_ODDS
+    for _ in range(10):
+        _stop(s, p, jumps=True)
+    assert 0.3 < _share(odds[STIFFNESS_JUMP]) <= 0.5 and odds[TORQUE_JUMP] == PRIOR_ODDS
+    assert not suspected(s), "that it may happen is no sign that it has"
+    for _ in range(500):
+        _stop(s, p, jumps=False)
+    assert odds[STIFFNESS_JUMP] > PRIOR_ODDS and _share(odds[STIFFNESS_JUMP]) < 0.02
+
+
+def test_a_change_that_is_certain_is_not_doubted_until_the_release(p, opened):
+    """It is in the force already; what is told is how far apart the force would be with and without what may be."""
+    s = opened[0]
+    s["alternatives"]["shift"][STIFFNESS_JUMP] = 1000.0
+    told = {}
+    for odds in (-6.0, 0.0, 12.0):
+        s["alternatives"]["log_odds"][STIFFNESS_JUMP] = odds
+        mix(s, np.zeros(STATES), 30.0, 0.0)
+        told[odds] = unproven(s)
+    assert told[-6.0] < 5.0 and told[12.0] < 5.0
+    assert told[0.0] == pytest.approx(500.0, rel=0.02)
 
 
 def test_what_is_not_suspected_is_looked_for_anew(p, opened):

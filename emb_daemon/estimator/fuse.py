@@ -13,7 +13,6 @@ from emb_daemon.estimator.hypotheses import (
     drift_odds,
     fold,
     learn,
-    least_odds,
     mix,
     open_again,
     open_all,
@@ -194,7 +193,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         to_torque(h, leverage, slope, s_mean, load + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
-            least, most = drift_odds(s) if kind == DRIFT else (least_odds(kind), np.inf)
+            least, most = drift_odds(s) if kind == DRIFT else (a.least, np.inf)
             weigh(a, least, most, first, variance, second, variance_a)
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage

@@ -109,6 +109,9 @@ STATE = np.dtype(
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
         ("open_s", "f8"),
+        # Whether the pads have touched since the last release; stops so far, and proven jumps of the stiffness path.
+        ("braked", "?"),
+        *fields("f8", "stops jumps"),
         ("sensitivity", "f8", (2, STATES)),
         # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)
         # takes away, rad/K: learned.
