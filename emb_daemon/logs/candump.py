@@ -149,8 +149,8 @@ def parse_candump(text: bytes, octets: np.ndarray = _NOWHERE) -> tuple[np.ndarra
 def format_candump(frames: np.ndarray) -> str:
     """The same format back; classic data frames only, as the daemon sends them, on an interface called can0."""
     lines = []
-    for frame in frames:
-        seconds, fraction = divmod(int(frame["time_ns"]), 1_000_000_000)
-        payload = int(frame["data"]).to_bytes(8, "little")[: frame["length"]].hex().upper()
-        lines.append(f"({seconds}.{fraction // 1000:06d}) can0 {int(frame['can_id']):03X}#{payload}\n")
+    for time_ns, data, can_id, length, _ in frames.tolist():
+        seconds, fraction = divmod(time_ns, 1_000_000_000)
+        payload = data.to_bytes(8, "little")[:length].hex().upper()
+        lines.append(f"({seconds}.{fraction // 1000:06d}) can0 {can_id:03X}#{payload}\n")
     return "".join(lines)

@@ -48,9 +48,8 @@ _SCATTER = {
     "disc_cooling_per_speed": 0.03,
     "friction_coefficient": 0.02,
 }
-_CURVE_SCATTER = 0.003
-_CONTACT_SCATTER_RAD = 0.01
-_EFFECT_SCATTER = 0.03
+#: The same of the whole curve, of the contact angle, rad, and of each parameter of an effect.
+_CURVE_SCATTER, _CONTACT_SCATTER_RAD, _EFFECT_SCATTER = 0.003, 0.01, 0.03
 #: The released position reads anything.
 _RELEASED_RANGE_RAD = (-200.0, 200.0)
 
