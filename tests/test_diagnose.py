@@ -24,7 +24,7 @@ from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.evidence import Averaging, Moments, false_discovery, judge, leave_out
 from emb_daemon.diagnose.forms import harmonic, made_effect
-from emb_daemon.diagnose.held_heat import record_heat, run_held
+from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.prospects import Search
@@ -222,9 +222,12 @@ def test_zero_is_a_start_like_any_other(calibration):
 
 
 def _logs(calibration, seed, effects, reference=True, stops=6):
+    """Two drives of one brake, each simulated when it is asked for."""
     plant = plant_from_calibration(calibration, seed=seed, effects=effects)
     rng = np.random.default_rng(seed)
-    return [simulate_log(plant, campaign(plant, rng, stops), seed=seed + k, reference=reference)[0] for k in (1, 2)]
+    schedules = [campaign(plant, rng, stops) for _ in range(2)]
+    for k, schedule in enumerate(schedules, start=1):
+        yield simulate_log(plant, schedule, seed=seed + k, reference=reference)[0]
 
 
 @pytest.fixture(scope="module")
@@ -326,8 +329,8 @@ def test_on_its_own_data_nothing_is_looked_for_where_nothing_is_left(calibration
 
 
 def test_without_reference_the_paths_judge_each_other(calibration):
-    frames = _logs(calibration, 5, {"viscous_friction": {"viscous_Nms_per_rad": 3e-4}}, reference=False)
-    result = diagnose([log_of(frames[0])], calibration)
+    frames = next(_logs(calibration, 5, {"viscous_friction": {"viscous_Nms_per_rad": 3e-4}}, reference=False))
+    result = diagnose([log_of(frames)], calibration)
     assert report(result)["reference"] == "innovation"
     assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
     assert "no reference" in verdict(result)
@@ -391,7 +394,7 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkey
     """As it happens where something else was still missing when the order was chosen; beyond what its port may bear it is
     refused, and the search goes on."""
     bench = Bench(
-        [log_of(_logs(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})[0])], calibration
+        [log_of(next(_logs(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})))], calibration
     )
     start = Model.of(bench)
     selection = Selection(start.refined({"torque"}), Screening(bench, start))
@@ -457,7 +460,7 @@ def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monke
 
 def test_validation_has_a_veto(calibration, judged):
     """The fit log is of a brake with viscous friction, the validation log of one without: nothing carries over."""
-    result = judged(log_of(_logs(calibration, 54, {}, stops=3)[1]))
+    result = judged(log_of(list(_logs(calibration, 54, {}, stops=3))[1]))
     finding = next(f for f in result.findings if f.effect.name == "viscous_friction")
     assert not finding.accepted and "validation" in finding.reason
     assert "viscous_friction" not in result.calibration.effects
@@ -483,7 +486,7 @@ def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_
 
 
 def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_path(calibration):
-    log = log_of(_logs(calibration, 41, {"disc_thermal_expansion": {"growth_um_per_K": 0.4}})[0])
+    log = log_of(next(_logs(calibration, 41, {"disc_thermal_expansion": {"growth_um_per_K": 0.4}})))
     samples = log.samples.copy()
     samples["has_current"] = False
     result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
@@ -498,7 +501,7 @@ def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_pa
 def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(calibration):
     """Friction that rises for seconds after each stroke, whichever way: a hidden state driven by a power of the speed."""
     hidden = {"size": 1.5, "signal": PLANT_SIGNALS.index("motor_speed"), "exponent": 1.5, "other": -1.0, "lag_s": 2.5}
-    frames, _ = _logs(calibration, 33, {"drawn_gear_friction": hidden}, stops=3)
+    frames = next(_logs(calibration, 33, {"drawn_gear_friction": hidden}, stops=3))
     model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
     best = Search(model, "torque", grammar._signals(model)).prospects()[0]
     assert best.means == ("gear_friction", "motor_speed") and best.form.memory == "response"
@@ -580,7 +583,7 @@ def test_a_term_is_taken_where_its_port_is_sure_though_its_signal_is_not(coupled
 def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):
     selection, fit_log, _ = coupled
     monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
-    nominal = log_of(_logs(calibration, 54, {}, stops=3)[1])
+    nominal = log_of(list(_logs(calibration, 54, {}, stops=3))[1])
     result = diagnose([fit_log], calibration, [nominal])
     [refused] = [f for f in result.findings if f.made]
     assert not refused.accepted and "validation" in refused.reason
@@ -656,7 +659,7 @@ def test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves(cali
 
 def test_bench_runs_the_production_estimator(calibration):
     """With the contact angle held, the residual is reference minus what the daemon would say."""
-    log = log_of(_logs(calibration, 61, {})[0])
+    log = log_of(next(_logs(calibration, 61, {})))
     p = to_parameters(calibration).copy()
     p["clearance_sigma"] = p["contact_walk"] = 0.0
     bench = Bench([log], calibration)
@@ -666,12 +669,12 @@ def test_bench_runs_the_production_estimator(calibration):
 
 def test_with_heat_held_the_paths_are_those_of_the_step(calibration):
     """What a fit's derivatives run is the estimator to the last bit, and moves with a parameter as the whole step does."""
-    samples = log_of(_logs(calibration, 61, {}, stops=2)[0]).samples
+    samples = log_of(next(_logs(calibration, 61, {}, stops=2))).samples
     p = held(to_parameters(calibration))[0]
-    heat = record_heat(samples, p)
     stiffer = p.copy()
     stiffer["curve"] *= 1.01
-    whole, fast = run_step(samples, p), run_held(samples, p, heat)
+    whole, heat = run_with_heat(samples, p)
+    fast = run_held(samples, p, heat)
     for name in ("force", "torque", "leverage", "torque_constant"):
         np.testing.assert_array_equal(fast[name], whole[name])
     change, expected = (
@@ -688,7 +691,7 @@ def test_what_changed_of_a_calibrated_effect_is_named_with_before_and_after(cali
     """The pads relax three times as much as they were calibrated to."""
     share = calibration.effects["second_relaxation"]["share"]
     little = moved(calibration, {"effects.second_relaxation.share": share / 3.0})
-    result = diagnose(*([log_of(frames)] for frames in _logs(calibration, 51, {})[:1]), little)
+    result = diagnose([log_of(next(_logs(calibration, 51, {})))], little)
     [finding] = [f for f in result.accepted if f.in_calibration]
     [entry] = [e for e in report(result)["effects"] if e["accepted"]]
     assert finding.effect.name == entry["name"] == "second_relaxation" and entry["in_calibration"]
@@ -710,13 +713,13 @@ def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
 
 
 def test_a_log_cannot_judge_itself(calibration):
-    log = log_of(_logs(calibration, 55, {}, stops=2)[0])
+    log = log_of(next(_logs(calibration, 55, {}, stops=2)))
     with pytest.raises(InputError, match="expected another log to judge"):
         diagnose([log], calibration, [log])
 
 
 def test_a_log_with_nothing_to_judge_by_is_refused(calibration):
-    log = log_of(_logs(calibration, 57, {}, reference=False, stops=2)[0])
+    log = log_of(next(_logs(calibration, 57, {}, reference=False, stops=2)))
     samples = log.samples.copy()
     samples["has_current"] = False
     with pytest.raises(InputError, match="neither a clamp force reference nor motor current"):

@@ -503,6 +503,7 @@ def test_a_master_calibrates_over_can(daemon, folder, request):
 # --- The A2L file -------------------------------------------------------------------------------------------------------
 
 
+_COMMANDS = xcp.READING | xcp.CALIBRATING
 _AT_UDP = {"XCP_ON_UDP_IP": [256, 5555, {"ADDRESS": "192.168.1.10"}]}
 _AT_CAN = {"XCP_ON_CAN": [256, {"CAN_ID_MASTER": 0x720, "CAN_ID_SLAVE": 0x728, "BAUDRATE": 500000}]}
 
@@ -516,7 +517,6 @@ def test_a_tool_connects_and_calibrates_from_the_file_alone(folder):
     session = pya2l.import_a2l(str(folder / "e.a2l"), in_memory=True, progress_bar=False, loglevel="ERROR")
     [over_udp] = session.parse_ifdata(session.query(model.Module).one().if_data)
     over_can = session._ifdata_parser.parse(ifdata.module_block(ifdata.over_can(0x720, 0x728, 500000), True).strip())
-    codes = ifdata._READING | ifdata._CALIBRATING
     for parsed, layer, transport in ((over_udp, ON_UDP, _AT_UDP), (over_can, ON_CAN, _AT_CAN)):
         content = parsed["XCP"]
         assert {name: content[name] for name in transport} == transport and content["PAG"] == [1]
@@ -525,7 +525,7 @@ def test_a_tool_connects_and_calibrates_from_the_file_alone(folder):
         # What the file says is there, is.
         slave = _Bench(layer).slave
         for name in content["PROTOCOL_LAYER"][-1]["OPTIONAL_CMD"]:
-            assert slave.answer(bytes([codes[name]])) != bytes([0xFE, xcp.UNKNOWN]), name
+            assert slave.answer(bytes([_COMMANDS[name].code])) != bytes([0xFE, xcp.UNKNOWN]), name
     segment = session.query(model.MemorySegment).one()
     assert (segment.address, segment.size) == (SEGMENT_ADDRESS, 8 * len(NUMBERS))
     [[*_, numbered]] = [entry["XCP"]["SEGMENT"] for entry in session.parse_ifdata(segment.if_data)]
@@ -546,8 +546,8 @@ def test_a_tool_connects_and_calibrates_from_the_file_alone(folder):
 
 def test_the_codes_of_commands_are_the_standards():
     types = pytest.importorskip("pyxcp.types", reason="NOT RUN: pyxcp is not installed")
-    for name, code in (ifdata._READING | ifdata._CALIBRATING).items():
-        assert int(types.Command[name]) == code
+    for name, command in _COMMANDS.items():
+        assert int(types.Command[name]) == command.code
 
 
 def test_numbers_that_stand_elsewhere_have_another_version():

@@ -67,9 +67,8 @@ _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
 #: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
 #: off than a calibration leaves it.
 _INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
-_ITERATIONS = 40
-#: The fit has converged when an iteration lowers the cost by less than this share.
-_CONVERGED = 1e-7
+#: Most iterations; the fit has converged when one of them lowers the cost by less than this share.
+_ITERATIONS, _CONVERGED = 40, 1e-7
 #: Residuals beyond this many standard deviations count linearly (Huber): over 99 % as efficient as squares on normal noise.
 _HUBER = 2.5
 #: Samples of which the mean torque is fitted: the acceleration's noise falls with their number, and the motion asked for has
@@ -82,8 +81,8 @@ _FAR, _FEW = 8.0, 0.05
 _UNCHANGED = 16.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12
-_LEAST_SAMPLES = 1000
-_RANGES = 5
+#: Samples of a training that has begun to tell anything, four seconds; equal parts of the force that each direction must pass.
+_LEAST_SAMPLES, _RANGES = 1000, 5
 
 
 @njit
@@ -390,18 +389,15 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     training = _Training(rows, calibration, state, scale)
     fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
-    x, covariance = fit.x, fit.covariance
+    x, sigmas = fit.x, np.sqrt(np.diag(fit.covariance))
     values = training.values(x)
     if unchanged:
         values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
     curve = to_parameters(moved(calibration, values))["curve"]
-    expected, _ = torque_sigma(*_noises(calibration))
-    sigma = _deviation(fit.residual)
-    sigmas = np.sqrt(np.diag(covariance))
     top = highest - x[_CONTACT]
     # The torque constant's error scales the whole curve, whose shape is known better than its size.
-    along = covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
-    constant, relative, force_sigma = _force_sigma(curve, scale, covariance - np.outer(along, along), top)
+    along = fit.covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
+    constant, relative, force_sigma = _force_sigma(curve, scale, fit.covariance - np.outer(along, along), top)
     # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
     scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
     if unchanged:
@@ -424,11 +420,9 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         torque_error_sigma=hypot(sigmas[_GAIN], limits.torque_constant_relative) * exp(-x[_GAIN]),
         inertia_error=expm1(x[_INERTIA]),
         inertia_sigma=hypot(sigmas[_INERTIA], INERTIA_SIGMA),
-        evidence={
+        evidence=_residual_evidence(fit, calibration)
+        | {
             "samples": len(rows),
-            "residual_A": float(sigma / now["torque_constant"]),
-            "residual_ratio": float(sigma / expected),
-            "correlation": float(fit.correlation),
             "curve_changed": float(not unchanged),
             "contact_sigma_rad": float(sigmas[_CONTACT]),
             "force_sigma_N": force_sigma,
@@ -436,11 +430,22 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
             "torque_gain": exp(x[_GAIN]),
             "torque_gain_sigma": float(sigmas[_GAIN]),
             "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
+            "pairs_difference": _pairs_difference(pairs, x, curve, rows, now["gear_gain"]),
         },
     )
-    found.evidence["pairs_difference"] = _pairs_difference(pairs, x, curve, rows, now["gear_gain"])
     found.outcome, found.note = _judge(rows, fit, base, found)
     return found
+
+
+def _residual_evidence(fit, calibration):
+    """How large the unexplained torque is, over the torque constant and over what noise makes, and how correlated."""
+    expected, _ = torque_sigma(*_noises(calibration))
+    sigma = _deviation(fit.residual)
+    return {
+        "residual_A": float(sigma / calibration.motor.torque_constant_Nm_per_A),
+        "residual_ratio": float(sigma / expected),
+        "correlation": float(fit.correlation),
+    }
 
 
 def _pairs_difference(pairs, x, curve, rows, gear_gain):

@@ -22,9 +22,8 @@ _TURNED_OVER = 0.97
 _SAMPLES = 4
 #: Samples so many standard deviations from their bin's mean are left out.
 _FAR = 8.0
-#: Contact is searched below the angle at which this share of the largest force is reached.
-_SEARCHED_SHARE = 0.2
-_CANDIDATES = 60
+#: Contact is searched below the angle at which this share of the largest force is reached, at so many angles.
+_SEARCHED_SHARE, _CANDIDATES = 0.2, 60
 
 #: Columns of a pair: angle, clamp force, friction torque, weight.
 ANGLE, FORCE, FRICTION, WEIGHT = range(4)

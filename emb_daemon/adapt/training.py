@@ -19,6 +19,7 @@ from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
+#: Wheel speed up to which a wheel stands, rad/s: some 3 cm/s at the rim.
 _STANDING_RAD_S = 0.1
 #: Pulses of a wheel that turned: one more or less is an edge of the encoder's wheel that stands before its sensor.
 _ROLLED_PULSES = 2

@@ -36,7 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.adapt.memory import hold, state_directory
     from emb_daemon.calibration.configuration import Setup
     from emb_daemon.jit import compiled_for_the_next_start
-    from emb_daemon.runtime.bus import open_bus
     from emb_daemon.runtime.daemon import Daemon
     from emb_daemon.runtime.journal import log, set_up_logging
     from emb_daemon.runtime.realtime import set_up, settle_memory
@@ -46,24 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
     configuration = setup.configuration
     set_up_logging(configuration.log_level)
     log.info("%s", library.description())
-    ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
-    ids += [can_id for link in setup.links[0] for can_id in (link.authentication_id, link.freshness_id)]
     state = state_directory(configuration.state_directory, arguments.config.parent)
     if state:
         # Two daemons would write what they learned over each other's.
         hold(state)
-    options = bus_options(arguments, configuration.bus)
-    if arguments.mapping:
-        from emb_daemon.logs.live import open_mapped
-
-        bus = open_mapped(options, open_mapping(arguments.mapping), setup.layout)
-    else:
-        bus = open_bus(**options, ids=ids)
-    keyless = ()
-    if setup.keys is not None:
-        from emb_daemon.runtime.secured import secure
-
-        bus, keyless = secure(bus, setup, state)
+    bus, keyless = _open_bus(arguments, setup, state)
     daemon = Daemon(setup, bus, ServiceManager(), state)
     daemon.pipeline.distrust(keyless)
     if arguments.share:
@@ -72,9 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     daemon.warm_up()
     if compiled_for_the_next_start():
         log.info("kernels compiled, starting again with them: the compiler would keep twice the daemon's memory")
-        # A handler does not survive, and without one the signal ends the process; to be ignored does survive.
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+        _start_again()
     if arguments.share and configuration.xcp.calibrate:
         daemon.take_pages(arguments.share)
     # Not before: a signal that comes while kernels are compiled ends the process at once.
@@ -89,3 +73,30 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         bus.close()
     return 0
+
+
+def _open_bus(arguments: argparse.Namespace, setup, state: Path | None):
+    """The bus, and the corners whose keys are missing (`runtime.secured.secure`)."""
+    from emb_daemon.runtime.bus import open_bus
+
+    options = bus_options(arguments, setup.configuration.bus)
+    if arguments.mapping:
+        from emb_daemon.logs.live import open_mapped
+
+        bus = open_mapped(options, open_mapping(arguments.mapping), setup.layout)
+    else:
+        ids = [int(can_id) for can_id in range(2048) if setup.layout["slot"][0, can_id] != -1]
+        ids += [can_id for link in setup.links[0] for can_id in (link.authentication_id, link.freshness_id)]
+        bus = open_bus(**options, ids=ids)
+    if setup.keys is None:
+        return bus, ()
+    from emb_daemon.runtime.secured import secure
+
+    return secure(bus, setup, state)
+
+
+def _start_again() -> None:
+    """Replace this process by the same command."""
+    # A handler does not survive, and without one the signal ends the process; to be ignored does survive.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])

@@ -203,7 +203,7 @@ def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, f
         if order in found:
             found[cosine], found[sine] = _turn(found.get(cosine, 0.0), found.get(sine, 0.0), found[order] * middle)
             limits[cosine] = limits[sine] = low, high
-    return {key: float(np.clip(value, *limits[key])) for key, value in found.items()}
+    return {key: min(max(value, limits[key][0]), limits[key][1]) for key, value in found.items()}
 
 
 def about_middle(values: Values, middle: float) -> dict[Coordinate, float]:

@@ -10,13 +10,12 @@ from itertools import pairwise
 
 import numpy as np
 
-#: Force (N) above which the brake is applied, and shortest pause (s) that ends an application.
-_APPLIED_N = 150.0
+from emb_daemon.effects.terms import CLAMPED_N
+
+#: Shortest pause that ends an application of the brake, s.
 _PAUSE_S = 0.3
-#: Longest episode, and the number of pieces wanted even of a short log.
-_LONGEST_S = 8.0
-_PIECES = 40
-_SHORTEST_S = 0.5
+#: Longest and shortest episode, s, and the number of pieces wanted even of a short log.
+_LONGEST_S, _SHORTEST_S, _PIECES = 8.0, 0.5, 40
 #: The motor holds where it turns less than this over this time: a tenth of the angle over which gears slide.
 _HOLDING_RAD, _HOLDING_S = 0.03, 0.25
 
@@ -52,7 +51,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
 
 def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:
     """First samples of brake applications, each with the pause before it."""
-    applied = force_N > _APPLIED_N
+    applied = force_N > CLAMPED_N
     ends = np.flatnonzero(applied[:-1] & ~applied[1:]) + 1
     starts = np.flatnonzero(~applied[:-1] & applied[1:]) + 1
     cuts = [0]

@@ -17,7 +17,7 @@ _SHAPED = {
 }
 _GATES = {
     "always": "",
-    "load": "_FORCE] / _LARGEST_N",
+    "load": "signals[_FORCE] / _LARGEST_N",
     "closing": "(1.0 if signals[_SPEED] > 0.0 else 0.0)",
     "opening": "(1.0 if signals[_SPEED] < 0.0 else 0.0)",
     "turning": "(1.0 if signals[_WHEEL] > TURNING_RAD_PER_S else 0.0)",
@@ -46,6 +46,15 @@ _RESPONSE = """    y = {shaped}
         s.begun, s.memory = True, y
     s.memory += (1.0 - exp(-dt / p.memory_scale)) * (y - s.memory)
 """
+#: With which the file is a command as well.
+_MAIN = """\
+if __name__ == "__main__":
+    from emb_daemon.effects.own import extend
+
+    extend(EFFECT)
+    from emb_daemon.cli.main import main
+
+    sys.exit(main())""".splitlines()
 _SIZES = {
     "scale": "over which it changes",
     "centre": "where it is centred",
@@ -72,20 +81,10 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         maximum_force_N: of the calibration; a gate of load counts in it.
         equation: the term as an engineer writes it.
     """
-    signal, words = term.signal, term.signal.replace("_", " ")
-    gate = _GATES[term.gate].replace("_FORCE]", "signals[_FORCE]")
-    looked_at = {"_SIGNAL": signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
-    shaped = "p.coefficient * cos(u) + p.sine * sin(u)" if term.shape == "harmonic" else _SHAPED[term.shape]
-    response = _RESPONSE.format(shaped=shaped) if term.memory == "response" else ""
-    body = ("s.memory" if response else f"({shaped})") + (f" * {gate}" if gate else "")
-    if term.shape != "harmonic":
-        body = f"p.coefficient * {body}"
-    if response and np.isfinite(term.limit):
-        body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
-    z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
-    functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in body + response + _MEMORIES.get(term.memory, "")]
-    arguments = "p, signals" if term.memory == "none" else "p, s, signals, dt" if term.memory != "slip" else "p, s, signals"
-    off = "p.coefficient == 0.0" + (" and p.sine == 0.0" if term.shape == "harmonic" else "")
+    gate, kernel, words = _GATES[term.gate], _kernel(term), term.signal.replace("_", " ").capitalize()
+    used = "\n".join(kernel)
+    functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in used]
+    looked_at = {"_SIGNAL": term.signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
     lines = [
         f'"""{equation}."""',
         "",
@@ -99,45 +98,58 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         "from emb_daemon.jit import njit",
         "",
         *(f'{key} = list(SIGNALS).index("{name}")' for key, name in looked_at.items()),
-        f"#: {words.capitalize()} ({SIGNALS[signal]}) between which it was found; outside it stays what it is at the edge.",
+        f"#: {words} ({SIGNALS[term.signal]}) between which it was found; outside it stays what it is at the edge.",
         f"_LOW, _HIGH = {term.low!r}, {term.high!r}",
     ]
     if term.gate == "load":
         lines += ["#: Clamp force at which it acts in full, N.", f"_LARGEST_N = {maximum_force_N!r}"]
     if term.memory != "none":
         lines += ['STATE = np.dtype([("begun", "?"), ("memory", "f8"), ("before", "f8")], align=True)']
-    lines += [
-        "",
-        "",
+    return "\n".join([*lines, "", "", *kernel, "", "", *_declaration(term, equation), "", *_MAIN]) + "\n"
+
+
+def _kernel(term: Term) -> list[str]:
+    """The compiled function that says what the term adds."""
+    harmonic = term.shape == "harmonic"
+    shaped = "p.coefficient * cos(u) + p.sine * sin(u)" if harmonic else _SHAPED[term.shape]
+    response = _RESPONSE.format(shaped=shaped) if term.memory == "response" else ""
+    body = ("s.memory" if response else f"({shaped})") + (f" * {_GATES[term.gate]}" if _GATES[term.gate] else "")
+    if not harmonic:
+        body = f"p.coefficient * {body}"
+    if response and np.isfinite(term.limit):
+        body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
+    z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
+    arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
+    return [
         "@njit",
         f"def term({arguments}):",
         f'    """What it adds, {term.unit}."""',
         "    x = signals[_SIGNAL]",
-        f"    if {off} or not np.isfinite(x):",
+        f"    if p.coefficient == 0.0{' and p.sine == 0.0' if harmonic else ''} or not np.isfinite(x):",
         "        return 0.0",
+        *_MEMORIES.get(term.memory, "").splitlines(),
+        *([] if term.shape == "constant" else [f"    u = ({z} - p.centre) / p.scale"]),
+        *response.splitlines(),
+        f"    return {body}",
     ]
-    lines += _MEMORIES.get(term.memory, "").splitlines()
-    if term.shape != "constant":
-        lines.append(f"    u = ({z} - p.centre) / p.scale")
-    lines += [*response.splitlines(), f"    return {body}", "", "", "EFFECT = Effect("]
-    lines += [f'    name="{effect_name(term)}",', f'    hook="{term.port}",', "    term=term,", "    parameters=("]
-    lines += [f"        {line}" for line in _parameters(term)]
-    lines += ["    ),", f'    equation="{equation}",', f'    source="found by diagnose, {term.provenance or "no log named"}",']
-    if term.memory != "none":
-        lines.append("    state=STATE,")
-    lines += [
-        f'    signal="{signal}",',
+
+
+def _declaration(term: Term, equation: str) -> list[str]:
+    """The `Effect` that the kernel is of."""
+    return [
+        "EFFECT = Effect(",
+        f'    name="{effect_name(term)}",',
+        f'    hook="{term.port}",',
+        "    term=term,",
+        "    parameters=(",
+        *(f"        {line}" for line in _parameters(term)),
+        "    ),",
+        f'    equation="{equation}",',
+        f'    source="found by diagnose, {term.provenance or "no log named"}",',
+        *([] if term.memory == "none" else ["    state=STATE,"]),
+        f'    signal="{term.signal}",',
         ")",
-        "",
-        'if __name__ == "__main__":',
-        "    from emb_daemon.effects.own import extend",
-        "",
-        "    extend(EFFECT)",
-        "    from emb_daemon.cli.main import main",
-        "",
-        "    sys.exit(main())",
     ]
-    return "\n".join(lines) + "\n"
 
 
 def _sizes(term: Term) -> list[str]:

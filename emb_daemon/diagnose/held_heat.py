@@ -10,47 +10,14 @@ import numpy as np
 from emb_daemon.effects import paths as effects
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.estimator.paths import rest, stiffness_path, torque_path
-from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
-from emb_daemon.estimator.step import step
+from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import stiffness_factor
-from emb_daemon.offline.run import TRACE
-
-#: What the force paths take from the rest of the step, at each sample: temperatures (degC) of the pads, ``mean`` and at the
-#: ``surface``, and the ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known,
-#: and the heat of the motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost, which a held run
-#: cannot follow.
-HELD = np.dtype(
-    [
-        ("mean", "f8", (2,)),
-        ("surface", "f8", (2,)),
-        ("history", "f8"),
-        ("power", "f8"),
-        ("disc", "f8"),
-        ("winding", "f8"),
-        ("housing", "f8"),
-        ("contact_angle", "f8"),
-        ("temperature_known", "?"),
-    ],
-    align=True,
-)
+from emb_daemon.offline.run import HEAT, TRACE, run_step
 
 
 @njit
-def _record(samples, parameters, states, estimate, out):
-    p, s, e = parameters[0], states[0], estimate[0]
-    for row in range(len(samples)):
-        o = out[row]
-        o.winding, o.housing = s.winding, s.housing
-        step(s, p, samples[row], e)
-        o.mean[:] = s.mean
-        o.surface[0], o.surface[1] = s.pads[0, 0], s.pads[1, 0]
-        o.history = s.history
-        o.power, o.disc, o.contact_angle, o.temperature_known = s.power, s.disc, s.contact_angle, s.temperature_known
-
-
-@njit
-def _run(samples, parameters, states, held, out, signals):
+def _run(samples, parameters, states, heat, out, signals):
     p, s = parameters[0], states[0]
     s.started = True
     s.angle, s.slid_angle, s.speed = samples[0].angle, samples[0].angle, samples[0].speed
@@ -59,7 +26,7 @@ def _run(samples, parameters, states, held, out, signals):
     s.contact_angle = s.gear_zero + p.clearance
     rest(s, p, -p.clearance, 1.0)
     for row in range(len(samples)):
-        m, h, o = samples[row], held[row], out[row]
+        m, h, o = samples[row], heat[row], out[row]
         s.disc, s.power, s.temperature_known = h.disc, h.power, h.temperature_known
         s.mean[:] = h.mean
         s.pads[0, 0], s.pads[1, 0] = h.surface[0], h.surface[1]
@@ -75,24 +42,25 @@ def _run(samples, parameters, states, held, out, signals):
         s.angle, s.speed = m.angle, m.speed
 
 
-def record_heat(samples: np.ndarray, parameters: np.void) -> np.ndarray | None:
-    """HELD rows of a run of the whole step with `held` parameters; None where the zero of the angle was lost on the way."""
-    rows = np.zeros(len(samples), HELD)
-    _record(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), rows)
-    return rows if np.ptp(rows["contact_angle"]) == 0.0 else None
+def run_with_heat(samples: np.ndarray, parameters: np.void) -> tuple[np.ndarray, np.ndarray | None]:
+    """TRACE rows of the whole step with `held` parameters, and its HEAT rows; None instead of them where the zero of the angle
+    was lost on the way, which a held run cannot follow."""
+    heat = np.zeros(len(samples), HEAT)
+    trace = run_step(samples, parameters, heat)
+    return trace, heat if np.ptp(heat["contact_angle"]) == 0.0 else None
 
 
-def run_held(samples: np.ndarray, parameters: np.void, held: np.ndarray) -> np.ndarray:
+def run_held(samples: np.ndarray, parameters: np.void, heat: np.ndarray) -> np.ndarray:
     """TRACE rows with force, torque, leverage and torque constant; the rest of them is zero."""
     out = np.zeros(len(samples), TRACE)
-    _run(samples, np.atleast_1d(parameters), np.zeros(1, STATE), held, out, np.zeros((0, len(SIGNALS))))
+    _run(samples, np.atleast_1d(parameters), np.zeros(1, STATE), heat, out, np.zeros((0, len(SIGNALS))))
     return out
 
 
-def follow_signals(samples: np.ndarray, parameters: np.void, held: np.ndarray) -> np.ndarray:
+def follow_signals(samples: np.ndarray, parameters: np.void, heat: np.ndarray) -> np.ndarray:
     """What terms see (`effects.terms.SIGNALS`) at each sample of a held run; NaN where it is not known."""
     watching = parameters.copy()
     watching["effects"]["terms"]["count"] = max(watching["effects"]["terms"]["count"], 1)
     signals = np.zeros((len(samples), len(SIGNALS)))
-    _run(samples, np.atleast_1d(watching), np.zeros(1, STATE), held, np.zeros(len(samples), TRACE), signals)
+    _run(samples, np.atleast_1d(watching), np.zeros(1, STATE), heat, np.zeros(len(samples), TRACE), signals)
     return signals

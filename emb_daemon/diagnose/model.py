@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import lru_cache
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class Model:
             which it was chosen.
         chosen: coordinates that stand as chosen and are not fitted: whole numbers.
         residual: by channel.
+        heat: of each log (`held_heat.run_with_heat`); coordinates that stand at nothing do not change it.
         columns: regressors, minus the derivative of the channel's residual, at the last fit.
         fits: by channel.
     """
@@ -37,6 +38,7 @@ class Model:
     bench: Bench
     values: dict[Coordinate, float]
     residual: dict[str, np.ndarray] = field(repr=False)
+    heat: Sequence[np.ndarray | None] = field(repr=False)
     centre: Values = field(default_factory=dict)
     chosen: frozenset[Coordinate] = frozenset()
     columns: Mapping[Coordinate, np.ndarray] = field(default_factory=dict, repr=False)
@@ -55,12 +57,7 @@ class Model:
             if channel and any(on.get(p.name, 0.0) for p in effect.amplitudes):
                 coordinates += effect_coordinates(bench.calibration, effect, channel).values()
         start = about_middle({c: c.start for c in coordinates}, bench.middle)
-        return cls(bench, start, bench.residuals(start), centre=start)
-
-    @cached_property
-    def heat(self) -> list[np.ndarray | None]:
-        """Heat of each log (`held_heat.record_heat`): coordinates that stand at nothing do not change it."""
-        return self.bench.heat(self.values)
+        return cls(bench, start, *bench.run(start), centre=start)
 
     def own(self, channel: str) -> list[Coordinate]:
         """What is fitted in a channel."""
@@ -72,10 +69,12 @@ class Model:
     def entered(self, values: Values, chosen: Iterable[Coordinate] = (), centre: Values | None = None) -> "Model":
         """With more coordinates, or some elsewhere."""
         every = self.values | dict(values)
+        residual, heat = self.bench.run(every)
         return replace(
             self,
             values=every,
-            residual=self.bench.residuals(every),
+            residual=residual,
+            heat=heat,
             centre={**self.centre, **(centre or {})},
             chosen=self.chosen | frozenset(chosen),
         )
@@ -84,7 +83,8 @@ class Model:
         """With some coordinates taken out again, not refitted."""
         gone = set(gone)
         left = {c: value for c, value in self.values.items() if c not in gone}
-        return replace(self, values=left, residual=self.bench.residuals(left), chosen=self.chosen - gone)
+        residual, heat = self.bench.run(left)
+        return replace(self, values=left, residual=residual, heat=heat, chosen=self.chosen - gone)
 
     # -- fitting ------------------------------------------------------------------------------------------------------
 
@@ -112,33 +112,35 @@ class Model:
         own, episode = tuple(self.own(channel)), self.bench.episode[channel]
         # In units of what an episode knows, as priors are.
         scale = float(np.sqrt(self.inflation(channel) * max(self.noise(channel), 1e-12)))
-        known: dict[tuple, np.ndarray] = {}
         slopes: dict[tuple, np.ndarray] = {}
 
+        # Derivatives, and the model in the end, are asked for where the residual was asked for last.
+        @lru_cache(maxsize=2)
+        def run(*tried: float) -> tuple[dict[str, np.ndarray], list[np.ndarray | None]]:
+            return self.bench.run(self.values | dict(zip(own, tried, strict=True)))
+
         def residual(tried: Values) -> np.ndarray:
-            key = tuple(tried[c] for c in own)
-            if key not in known:
-                known[key] = self.bench.residuals(self.values | dict(tried))[channel] / scale
-            return known[key]
+            return run(*(tried[c] for c in own))[0][channel] / scale
 
         def derivative(tried: Values) -> np.ndarray:
             # Heat answers to its parameters so nearly in proportion that one derivative serves all iterations.
             key = tuple(tried[c] for c in own) if channel in FORCE_CHANNELS else ()
             if key not in slopes:
-                at = {channel: scale * residual(tried)}
-                found = self.bench.regressors(self.values | dict(tried), [Probe(c) for c in own], at)
+                at, heat = run(*(tried[c] for c in own))
+                found = self.bench.regressors(self.values | dict(tried), [Probe(c) for c in own], at, heat)
                 slopes[key] = -np.column_stack(found) / scale
             return slopes[key]
 
         prior = {c: (self.centre.get(c, c.start), c.prior) if np.isfinite(c.prior) else None for c in own}
         free = {c: Free(self.values[c], c.step, c.low, c.high, prior[c]) for c in own}
         found = fit([Block(residual, own, episode, derivative)], free, tolerance=TOLERANCE, evaluations=_EVALUATIONS)
-        values = self.values | found.values
         table = -scale * derivative(found.values)
+        left, heat = run(*(found.values[c] for c in own))
         return replace(
             self,
-            values=values,
-            residual=self.bench.residuals(values),
+            values=self.values | found.values,
+            residual=left,
+            heat=heat,
             columns={**self.columns, **dict(zip(own, table.T, strict=True))},
             fits={**self.fits, channel: found},
         )

@@ -7,6 +7,7 @@ from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
+from emb_daemon.effects.terms import CLAMPED_N
 from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, xy_figure
 from emb_daemon.report.page import Page
 
@@ -106,7 +107,7 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
     signal = finding.over if finding.made else diagnosis.signals.get(finding.effect.signal)
     if channel not in FORCE_CHANNELS or signal is None:
         return
-    applied = (diagnosis.signals["clamp_force"] > 150.0) & np.isfinite(signal)
+    applied = (diagnosis.signals["clamp_force"] > CLAMPED_N) & np.isfinite(signal)
     if channel != "stiffness" or not applied.any():
         applied = np.isfinite(signal)
     unit = UNITS[channel]

@@ -16,7 +16,7 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
 from emb_daemon.diagnose.episodes import episodes
-from emb_daemon.diagnose.held_heat import record_heat, run_held
+from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.logs.columns import nearest
@@ -27,9 +27,9 @@ from emb_daemon.offline.run import held, run_step
 UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
 FORCE_CHANNELS = ("stiffness", "torque", "innovation")
 HEAT_CHANNELS = ("temperature", "brake_torque")
-#: Disc speed (rad/s) below which the brake torque sensor shows static friction.
-_SLIDING = 1.0
-_TOUCHING_N = 300.0
+#: Brake torque is compared where pads slide: above this disc speed (rad/s; below, the sensor shows static friction) and this
+#: reference force (N).
+_SLIDING, _TOUCHING_N = 1.0, 300.0
 #: Brake torque (N m) below which a sensor shows nothing but its noise.
 _BRAKING_NM = 20.0
 #: Clearance (rad) from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is
@@ -59,12 +59,13 @@ class Trial:
         return bool(np.isfinite(self.force_N).mean() > _RECORDED)
 
 
-def make_trial(log: Log, index: int, stiffness_N: np.ndarray, mounted: Mapping[str, float]) -> Trial:
-    """Prepare a log. ``stiffness_N``: an estimate of the clamp force, to cut episodes where no reference is."""
+def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, float]) -> Trial:
+    """Prepare a log. ``parameters``: PARAMETERS, whose clamp force cuts the episodes where no reference is."""
     force, torque = _synchronous(log)
     rows, measured = _temperatures(log)
     known = np.isfinite(force).mean() > _RECORDED
-    cut = episodes(log.time_s, np.nan_to_num(force if known else stiffness_N), log.samples["angle"])
+    clamping = force if known else run_step(log.samples, parameters)["force"]
+    cut = episodes(log.time_s, np.nan_to_num(clamping), log.samples["angle"])
     return Trial(log, index, force, cut, rows, measured, torque, mounted)
 
 
@@ -133,8 +134,7 @@ class Bench:
         mounted = mounted or [{}] * len(logs)
 
         def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
-            force = run_step(log.samples, held(to_parameters(moved(calibration, here))))["force"]
-            return make_trial(log, index, force, here)
+            return make_trial(log, index, held(to_parameters(moved(calibration, here)))[0], here)
 
         self.trials = list(self._map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
@@ -203,13 +203,17 @@ class Bench:
 
     def residuals(self, values: Values) -> dict[str, np.ndarray]:
         """Residual by channel over all logs."""
-        return self._joined(list(self._map(lambda trial: self._residual(trial, values), self.trials)))
+        return self.run(values)[0]
 
-    def _joined(self, parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        return {channel: np.concatenate([part[channel] for part in parts]) for channel in self.channels}
+    def run(self, values: Values) -> tuple[dict[str, np.ndarray], list[np.ndarray | None]]:
+        """Residual by channel over all logs, and the heat of each log (`held_heat.run_with_heat`)."""
 
-    def _residual(self, trial: Trial, values: Values) -> dict[str, np.ndarray]:
-        return self.compared(trial, run_step(trial.log.samples, self._parameters(trial, values)))
+        def one(trial: Trial) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+            trace, heat = run_with_heat(trial.log.samples, self._parameters(trial, values))
+            return self.compared(trial, trace), heat
+
+        parts, heat = zip(*self._map(one, self.trials), strict=True)
+        return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
 
     def _parameters(self, trial: Trial, values: Values) -> np.void:
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
@@ -238,43 +242,36 @@ class Bench:
             result["brake_torque"] = np.where(sliding, left, 0.0)
         return result
 
-    def heat(self, values: Values) -> list[np.ndarray | None]:
-        """Heat of each log (`held_heat.record_heat`)."""
-        return list(self._map(lambda t: record_heat(t.log.samples, self._parameters(t, values)), self.trials))
-
     def regressors(
         self,
         values: Values,
         probes: Sequence["Probe"],
         at: Mapping[str, np.ndarray],
-        heat: Sequence[np.ndarray | None] = (),
+        heat: Sequence[np.ndarray | None],
     ) -> list[np.ndarray]:
-        """How the probed coordinates' own channels answer: minus the derivative of the residual.
+        """How the probed coordinates' own channels answer: minus the derivative of the residual, which is ``at`` by channel.
 
-        Pads and disc stay as warm as they are at ``values`` (``heat``, if that is known) while a coordinate of a force path
-        moves: what a hundredth of the force does to its own heat is a hundredth of a hundredth of it."""
-        if not heat and any(probe.coordinate.channel in FORCE_CHANNELS for probe in probes):
-            heat = self.heat(values)
+        Pads and disc stay as warm as they are at ``values`` (``heat``, of each log) while a coordinate of a force path moves:
+        what a hundredth of the force does to its own heat is a hundredth of a hundredth of it."""
 
         def answer(probe: Probe) -> np.ndarray:
             coordinate, tried = probe.coordinate, {**values, **dict(probe.shape)}
             now = tried.get(coordinate, coordinate.start)
             step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
             tried[coordinate] = now + step
-            known = () if coordinate.name == HISTORY_TIME else heat
+            follows = coordinate.channel not in FORCE_CHANNELS or coordinate.name == HISTORY_TIME
+            known = [None] * len(self.trials) if follows else heat
             return (at[coordinate.channel] - self._probed(tried, coordinate.channel, known)) / step
 
         return list(self._map(answer, probes))
 
     def _probed(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
-        """One channel's residual, a force path's with heat held."""
+        """One channel's residual, with the heat of a log held where it is given."""
         parts = []
-        for trial, known in zip(self.trials, heat or [None] * len(self.trials), strict=True):
-            if channel in FORCE_CHANNELS and known is not None:
-                trace = run_held(trial.log.samples, self._parameters(trial, values), known)
-                parts.append(self.compared(trial, trace)[channel])
-            else:
-                parts.append(self._residual(trial, values)[channel])
+        for trial, known in zip(self.trials, heat, strict=True):
+            samples, parameters = trial.log.samples, self._parameters(trial, values)
+            trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
+            parts.append(self.compared(trial, trace)[channel])
         return np.concatenate(parts)
 
 

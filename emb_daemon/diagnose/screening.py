@@ -284,8 +284,8 @@ class Screening:
         return [[np.sum(like, axis=0) * follows] for follows in shuffled]
 
     def _columns(self, model: Model, bench: Bench, candidate: Candidate, shape: tuple) -> list[np.ndarray]:
-        at = model.residual if bench is model.bench else bench.residuals(model.values)
-        return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at)
+        at, heat = (model.residual, model.heat) if bench is model.bench else bench.run(model.values)
+        return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at, heat)
 
 
 def _together(model: Model, candidate: Candidate, signal: str, tested: Sequence[Candidate]) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.effects.terms import CLAMPED_N
 from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline.run import estimate, held
 from emb_daemon.offline.score import rmse
@@ -11,8 +12,6 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
-_APPLIED_N = 150.0
-
 
 #: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not.
 MANOEUVRES = {
@@ -50,7 +49,7 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
         wheel = np.where(samples["has_wheel_speed"], np.nan_to_num(samples["wheel_speed"]), 0.0)
         torque = np.nan_to_num(trial.brake_torque_Nm)
         time = trial.log.time_s
-        applied = force > _APPLIED_N
+        applied = force > CLAMPED_N
         power = np.maximum(torque, 0.0) * wheel
         dt = samples["dt"]
         here = {

@@ -80,23 +80,7 @@ def follow_zero(s, p, m):
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
         moved, sigma = slip, _ZERO_RAD
     elif seen:
-        s.strayed += slip
-        s.turned += turned
-        s.turned_s += m.dt
-        if max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
-            s.drifted = s.stood_s = 0.0
-        else:
-            s.drifted += slip
-            s.stood_s += m.dt
-        if abs(s.drifted) > _unaccounted(p, s.stood_s):
-            moved = s.drifted
-        elif s.stood_s > _AT_REST_S:
-            # Only where a way has just ended: at the beginning of the next, a late speed has not yet seen what the angle has.
-            ended = s.stood_s - m.dt <= _AT_REST_S
-            if ended and abs(s.strayed) > _unaccounted(p, s.turned_s) + _SPEED_SCALE * abs(s.turned):
-                moved = s.strayed
-            if ended or s.turned_s > _STOOD_S:
-                s.strayed = s.turned = s.turned_s = 0.0
+        moved = _drift(s, p, m, slip, turned)
         if moved != 0.0:
             sigma = abs(moved)
             s.drifting_s = _DRIFTING_S
@@ -104,8 +88,39 @@ def follow_zero(s, p, m):
     if moved != 0.0 or not seen:
         # Of a way that was not seen whole nothing can be said at its end.
         s.strayed = np.nan
-    if moved == 0.0:
-        return False
+    if moved != 0.0:
+        _move_zero(s, p, moved, sigma)
+    return moved != 0.0
+
+
+@njit
+def _drift(s, p, m, slip, turned):
+    """How far (rad) the zero has drifted by what shows at standstill or at the end of a way, else 0; ``slip`` and ``turned``
+    rad are what this sample adds to the angle beside the speed, and by it."""
+    s.strayed += slip
+    s.turned += turned
+    s.turned_s += m.dt
+    if max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
+        s.drifted = s.stood_s = 0.0
+    else:
+        s.drifted += slip
+        s.stood_s += m.dt
+    if abs(s.drifted) > _unaccounted(p, s.stood_s):
+        return s.drifted
+    moved = 0.0
+    if s.stood_s > _AT_REST_S:
+        # Only where a way has just ended: at the beginning of the next, a late speed has not yet seen what the angle has.
+        ended = s.stood_s - m.dt <= _AT_REST_S
+        if ended and abs(s.strayed) > _unaccounted(p, s.turned_s) + _SPEED_SCALE * abs(s.turned):
+            moved = s.strayed
+        if ended or s.turned_s > _STOOD_S:
+            s.strayed = s.turned = s.turned_s = 0.0
+    return moved
+
+
+@njit
+def _move_zero(s, p, moved, sigma):
+    """Let every angle that is remembered be read from a zero ``moved`` rad further on, known with ``sigma`` rad."""
     s.drifted = s.stood_s = 0.0
     s.angle += moved
     s.angle_before += moved
@@ -118,7 +133,6 @@ def follow_zero(s, p, m):
     s.covariance[CONTACT, CONTACT] += sigma * sigma
     open_again(s, p)
     s.contact.confirmed = False
-    return True
 
 
 @njit
@@ -227,33 +241,45 @@ def watch_contact(s, p, m, force_before, torque, leverage):
     if explained:
         found = NOTHING
     offset, offset_sigma = clearance_level(c, sigma, offset, offset_sigma)
-    seen = predicted + c.excess
-    if found != NOTHING:
-        # Under a wrong belief the filter took for an offset what it was not.
-        s.error[OFFSET] = offset
-        for i in range(STATES):
-            s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
-        s.covariance[OFFSET, OFFSET] = offset_sigma * offset_sigma
     noticeable = max(leverage * _CLAMPED * p.maximum_force, clearly_above(c, sigma))
-    if found == TOO_EARLY:
-        _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD, leverage)
-    elif found != NOTHING:
-        _start_contact(s, p, m, max(seen, 0.0) / leverage, sigma / leverage, leverage)
+    if found != NOTHING:
+        force = max(predicted + c.excess, 0.0) / leverage
+        _believe_offset(s, offset, offset_sigma)
+        if found == TOO_EARLY:
+            _start_contact(s, p, m, 0.0, p.curve[0] * _UNKNOWN_RAD, leverage)
+        else:
+            _start_contact(s, p, m, force, sigma / leverage, leverage)
     elif not c.confirmed and not explained and c.excess > max(predicted, noticeable):
-        # Power came while the brake was clamped: no angle from which to count the clearance. Or the torque has an offset.
-        s.covariance[OFFSET, OFFSET] += seen * seen
-        force = seen / leverage
-        friction = (p.offset_friction + p.load_friction * force * slope) * sqrt(s.friction_variance)
-        # The gear's slope is as unknown as the released position.
-        least, most = steepest(p.gear)
-        s.covariance[GAIN, GAIN] += (0.5 * (most / least - 1.0)) ** 2
-        forget_level(c)
-        c.engaged = True
-        _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
+        _start_clamped(s, p, m, predicted + c.excess, sigma, leverage)
     contact_sigma = sqrt(s.covariance[CONTACT, CONTACT])
     if contact_sigma < _KNOWN_RAD:
         c.lost = False
     engaged(c, s.past_contact, contact_sigma)
+
+
+@njit
+def _believe_offset(s, offset, sigma):
+    """Forget what the filter took for an offset of the torque under a wrong belief: it is ``offset``, known with ``sigma``
+    (N m)."""
+    s.error[OFFSET] = offset
+    for i in range(STATES):
+        s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
+    s.covariance[OFFSET, OFFSET] = sigma * sigma
+
+
+@njit
+def _start_clamped(s, p, m, torque, sigma, leverage):
+    """Power came while the brake was clamped: no angle from which to count the clearance, but ``torque`` N m of standard
+    deviation ``sigma`` that the clamp force makes. Or the torque has an offset."""
+    s.covariance[OFFSET, OFFSET] += torque * torque
+    force = torque / leverage
+    friction = (p.offset_friction + p.load_friction * force * s.gear_slope) * sqrt(s.friction_variance)
+    # The gear's slope is as unknown as the released position.
+    least, most = steepest(p.gear)
+    s.covariance[GAIN, GAIN] += (0.5 * (most / least - 1.0)) ** 2
+    forget_level(s.contact)
+    s.contact.engaged = True
+    _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
 
 
 @njit

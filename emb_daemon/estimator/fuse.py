@@ -282,35 +282,57 @@ def _beyond_friction(s, p, m, x, force, spread):
 
 
 @njit
-def take_sides(s, p, m, torque_sigma, out):
-    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``torque_sigma`` N m, as
-    `fuse` returns it."""
-    c, x, facts = s.plausibility, s.error, 0
-    motor_torque = _motor_torque(s, p, m, x)
+def _torque_alone(s, p, m):
+    """Clamp force and its standard deviation (N) by the torque alone if nothing has jumped, then the gear gain,
+    load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
-    gain, load, coulomb = _gear(p, x, slope)
-    force, sigma = force_of_torque_alone(c, motor_torque - gain * spring, m.has_current, m.dt, gain, load, coulomb)
+    gain, load, coulomb = _gear(p, s.error, slope)
+    torque = _motor_torque(s, p, m, s.error) - gain * spring
+    force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
     sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / gain)
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
+    return force, sigma, gain, load, coulomb
+
+
+@njit
+def _least_beyond_friction(s, p, m, spread):
+    """`beyond_friction` of the hypothesis that explains the torque best, among those that may explain it."""
+    beyond = _beyond_friction(s, p, m, s.error, s.force, spread)
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        if a.log_odds > _LONG_LIKELY:
+            beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
+    return beyond
+
+
+@njit
+def _facts_of_torque(s, p):
+    """Facts that change neither force nor sigma."""
+    facts = 0
+    if s.torque_age >= _OLD_S:
+        facts |= TORQUE_OLD
+    if unproven(s) > _NOTED * p.maximum_force:
+        facts |= JUMP_SUSPECTED
+    if abs(s.error[OFFSET]) > 2.0 * torque_offset(p):
+        facts |= OFFSET_LARGE
+    return facts
+
+
+@njit
+def take_sides(s, p, m, torque_sigma, out):
+    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``torque_sigma`` N m, as
+    `fuse` returns it."""
+    c = s.plausibility
+    force, sigma, gain, load, coulomb = _torque_alone(s, p, m)
     if np.isfinite(out.innovation):
-        spread = hypot(gain * out.stiffness_sigma, torque_sigma)
-        beyond = _beyond_friction(s, p, m, x, s.force, spread)
-        for kind in range(DRIFT):
-            a = s.alternatives[kind]
-            if a.log_odds > _LONG_LIKELY:
-                beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
+        beyond = _least_beyond_friction(s, p, m, hypot(gain * out.stiffness_sigma, torque_sigma))
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     swings = hold(c, m.angle != s.angle, s.force, torque_sigma, gain, load, coulomb) if m.has_current else 0
     if swings > 1:
         disbelieve_resolver(c)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
-    if s.torque_age >= _OLD_S:
-        facts |= TORQUE_OLD
-    if unproven(s) > _NOTED * p.maximum_force:
-        facts |= JUMP_SUSPECTED
-    if abs(x[OFFSET]) > 2.0 * torque_offset(p):
-        facts |= OFFSET_LARGE
+    facts = _facts_of_torque(s, p)
     # A latched brake needs no current: the torque alone then says that nothing is known.
     latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
     if s.unknown:

@@ -126,8 +126,8 @@ class Questions:
         bench = Bench([replace(log, force_N=np.full(len(log.samples), np.nan))], self.calibration, workers=1)
         values = {self._contact: self._contact.start}
         for _ in range(_STEPS):
-            residual = bench.residuals(values)
-            column, *others = bench.regressors(values, [Probe(self._contact), *self._probes], residual)
+            residual, heat = bench.run(values)
+            column, *others = bench.regressors(values, [Probe(self._contact), *self._probes], residual, heat)
             if not (size := float(column @ column)):
                 raise InputError("the pads never touch")
             move = float(column @ residual[_CHANNEL]) / size

@@ -20,6 +20,9 @@ from emb_daemon.wire.layout import load_database
 SLOW, RANDOM = (0.0, 1.0), (1.0, 100.0)
 NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
 NEED_INTEGRATED = "training and braking heat at full frame rate"
+#: Full frame rate: samples, two seconds of them, and their distance in time, s, a fortieth above the cycle; and share of the
+#: rated force that motion must reach to tell a curve.
+_LEAST_SAMPLES, _LONGEST_CYCLE_S, _LEAST_FORCE = 500, 0.0041, 0.1
 #: Correlation of force and angle from which a log is the wrong way round; a curve of either direction has 0.9 and more.
 _AGAINST = 0.5
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.
@@ -161,9 +164,9 @@ class Campaign:
         force_N, noise_N, reversals_per_s = _excitation(log, actuator.pad_clearance_rad)
         cycle = float(np.median(log.samples["dt"][1:])) if len(log.samples) > 1 else np.inf
         lacking = None
-        if len(log.samples) < 500 or cycle > 0.0041:
+        if len(log.samples) < _LEAST_SAMPLES or cycle > _LONGEST_CYCLE_S:
             lacking = f"{len(log.samples)} samples, one every {1e3 * cycle:.0f} ms"
-        elif not force_N > 0.1 * actuator.rated_clamp_force_N:
+        elif not force_N > _LEAST_FORCE * actuator.rated_clamp_force_N:
             lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
         elif not np.isfinite(noise_N):
             lacking = "does not begin with the brake released"

@@ -11,6 +11,10 @@ from emb_daemon.jit import njit
 from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, friction_power, heat_step, mean_temperature
 from emb_daemon.offline import Log
 
+#: Step of the grid by what a log is shorter than, both s: fine enough for what a log of that length does.
+_STEPS_S = ((930.0, 0.2), (3600.0, 0.5), (float("inf"), 1.0))
+#: Share of the steps at which the reference force comes that often, from which its friction is looked at.
+_DENSE = 0.9
 #: Grid on which flags and torque are put together before they are averaged over a step.
 _FINE_S = 0.1
 #: A reference force at least this often tells when the pads touch; a rarer one leaves it to the brake request.
@@ -88,8 +92,7 @@ def recording(log: Log) -> Recording:
         return 1e-9 * (time_ns - log.time_ns[0])
 
     duration = min(log.time_s[-1], seconds(reference.pads["inner"][0][-1]))
-    # Fine enough for what a log of that length does.
-    step = 0.2 if duration < 930.0 else 0.5 if duration < 3600.0 else 1.0
+    step = next(step_s for longest_s, step_s in _STEPS_S if duration < longest_s)
     count = int(duration / step)
     if count < 10:
         raise InputError(f"{log.path}: {duration:.0f} s long; at least {10 * step:.0f} s are needed to identify heat")
@@ -116,7 +119,7 @@ def recording(log: Log) -> Recording:
         speed=speed,
         force=force,
         measured=measured,
-        dense=bool(np.mean(often) > 0.9),
+        dense=bool(np.mean(often) > _DENSE),
     )
 
 

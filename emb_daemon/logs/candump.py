@@ -5,11 +5,14 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
-_SPACE, _NEWLINE, _HASH = ord(" "), ord("\n"), ord("#")
+_OPEN, _CLOSE, _POINT, _ZERO, _NINE, _REMOTE, _REMOTE_SMALL, _SPACE, _HASH = b"().09Rr #"
+_RETURN, _NEWLINE = b"\r\n"
+#: In `_HEX`, of what is no hexadecimal digit.
+_NO_HEX = 255
 
 
 def _hex_values() -> np.ndarray:
-    values = np.full(256, 255, np.uint8)
+    values = np.full(256, _NO_HEX, np.uint8)
     for digit, characters in enumerate(zip("0123456789abcdef", "0123456789ABCDEF", strict=True)):
         for character in characters:
             values[ord(character)] = digit
@@ -21,25 +24,43 @@ _NOWHERE = np.zeros(0, np.uint8)
 
 
 @njit
+def _parse_payload(text, at, stop, octets):
+    """Position behind the payload, its first eight bytes and its length; position -1 if a byte has one digit only."""
+    data, length = np.uint64(0), 0
+    while at + 1 < stop and _HEX[text[at]] != _NO_HEX:
+        low = _HEX[text[at + 1]]
+        if low == _NO_HEX:
+            return -1, data, length
+        octet = _HEX[text[at]] * 16 + low
+        if length < 8:
+            data |= np.uint64(octet) << np.uint64(8 * length)
+        if length < len(octets):
+            octets[length] = octet
+        length += 1
+        at += 2
+    return at, data, length
+
+
+@njit
 def _parse_line(text, start, stop, frame, octets):
     """Fill ``frame`` from ``text[start:stop]``, and ``octets`` with its payload if there is room; False if the line is
     malformed."""
     at = start
-    if text[at] != 40:  # (
+    if text[at] != _OPEN:
         return False
     at += 1
     whole, fraction, digits = np.int64(0), np.int64(0), 0
-    while at < stop and 48 <= text[at] <= 57:
-        whole = whole * 10 + (text[at] - 48)
+    while at < stop and _ZERO <= text[at] <= _NINE:
+        whole = whole * 10 + (text[at] - _ZERO)
         at += 1
-    if at < stop and text[at] == 46:  # .
+    if at < stop and text[at] == _POINT:
         at += 1
-        while at < stop and 48 <= text[at] <= 57:
+        while at < stop and _ZERO <= text[at] <= _NINE:
             if digits < 9:
-                fraction = fraction * 10 + (text[at] - 48)
+                fraction = fraction * 10 + (text[at] - _ZERO)
                 digits += 1
             at += 1
-    if at >= stop or text[at] != 41 or digits == 0:  # )
+    if at >= stop or text[at] != _CLOSE or digits == 0:
         return False
     while digits < 9:
         fraction *= 10
@@ -49,14 +70,14 @@ def _parse_line(text, start, stop, frame, octets):
     if at >= stop or text[at] != _SPACE:
         return False
     at += 1
-    name = at
+    interface = at
     while at < stop and text[at] != _SPACE:
         at += 1
-    if at == name or at >= stop:
+    if at == interface or at >= stop:
         return False
     at += 1
     can_id, width = np.int64(0), 0
-    while at < stop and _HEX[text[at]] != 255:
+    while at < stop and _HEX[text[at]] != _NO_HEX:
         can_id = can_id * 16 + _HEX[text[at]]
         width += 1
         at += 1
@@ -69,25 +90,19 @@ def _parse_line(text, start, stop, frame, octets):
     at += 1
     data, length = np.uint64(0), 0
     if at < stop and text[at] == _HASH:
+        # A digit of flags follows that no reader needs.
         flags |= FD
         at += 2
-    if at < stop and (text[at] == 82 or text[at] == 114):  # R, remote request with an optional length
+    if at < stop and (text[at] == _REMOTE or text[at] == _REMOTE_SMALL):
+        # A remote request; its length, which may follow, is of no use.
         flags |= REMOTE
         at += 1
         while at < stop and text[at] != _SPACE:
             at += 1
     else:
-        while at + 1 < stop and _HEX[text[at]] != 255:
-            low = _HEX[text[at + 1]]
-            if low == 255:
-                return False
-            octet = _HEX[text[at]] * 16 + low
-            if length < 8:
-                data |= np.uint64(octet) << np.uint64(8 * length)
-            if length < len(octets):
-                octets[length] = octet
-            length += 1
-            at += 2
+        at, data, length = _parse_payload(text, at, stop, octets)
+        if at < 0:
+            return False
     if at < stop and text[at] == _SPACE:
         at += 1
         while at < stop and text[at] != _SPACE:
@@ -110,7 +125,7 @@ def _parse(text, frames, octets):
         while stop < size and text[stop] != _NEWLINE:
             stop += 1
         line += 1
-        end = stop - 1 if stop > start and text[stop - 1] == 13 else stop
+        end = stop - 1 if stop > start and text[stop - 1] == _RETURN else stop
         if end > start:
             if not _parse_line(text, start, end, frames[count], octets[filled:]):
                 return count, line, stop == size
@@ -134,8 +149,8 @@ def parse_candump(text: bytes, octets: np.ndarray = _NOWHERE) -> tuple[np.ndarra
 def format_candump(frames: np.ndarray) -> str:
     """The same format back; classic data frames only, as the daemon sends them, on an interface called can0."""
     lines = []
-    for frame in frames:
-        seconds, fraction = divmod(int(frame["time_ns"]), 1_000_000_000)
-        payload = int(frame["data"]).to_bytes(8, "little")[: frame["length"]].hex().upper()
-        lines.append(f"({seconds}.{fraction // 1000:06d}) can0 {int(frame['can_id']):03X}#{payload}\n")
+    for time_ns, data, can_id, length, _ in frames.tolist():
+        seconds, fraction = divmod(time_ns, 1_000_000_000)
+        payload = data.to_bytes(8, "little")[:length].hex().upper()
+        lines.append(f"({seconds}.{fraction // 1000:06d}) can0 {can_id:03X}#{payload}\n")
     return "".join(lines)

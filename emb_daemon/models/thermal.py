@@ -81,54 +81,43 @@ def disc_loss(p, disc, ambient, wheel_speed):
 
 
 @njit
-def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
-    """One implicit step of ``dt`` seconds; changes ``pads`` (2, NODES) and returns the new disc temperature."""
+def _pad_rows(p, pad, side, backplate, to_disc, to_air, heating, ambient, dt, work):
+    """Heat balance of each node of one pad, over a unit of area: three diagonals, W/(m^2 K), and right-hand side, W/m^2.
+
+    ``to_disc`` and ``to_air`` W/(m^2 K) leave the friction surface, into which ``heating`` W/m^2 goes."""
     lower, diagonal, upper, right = work[0], work[1], work[2], work[3]
     positions = p.node_position
-    contact = p.contact_conductance if braking else p.gap_conductance
-    to_air = 0.0 if braking else p.surface_cooling_per_speed * wheel_speed
-    heat_share = p.heat_share
-    for side in range(2):
-        pad = pads[side]
-        backplate = inner_backplate if side == 0 else outer_backplate
-        for node in range(NODES):
-            below = positions[node] - positions[node - 1] if node > 0 else 0.0
-            above = positions[node + 1] - positions[node] if node < NODES - 1 else 0.0
-            capacity = (
-                p.density
-                * p.specific_heat
-                * (1.0 + p.specific_heat_rise * (pad[node] - REFERENCE_C))
-                * 0.5
-                * (below + above)
-                / dt
-            )
-            diag, rhs = capacity, capacity * pad[node]
-            if node > 0:
-                to_disc = conductance(p, pad[node - 1], pad[node], below)
-            else:
-                to_disc = contact
-                diag += to_air
-                rhs += heat_share[side] * power / p.area + to_air * ambient
-            diag += to_disc
-            to_plate = 0.0
-            if node < NODES - 1:
-                to_plate = conductance(p, pad[node], pad[node + 1], above)
-                diag += to_plate
-            else:
-                diag += p.backplate_conductance
-                rhs += p.backplate_conductance * backplate
-            # The chain runs from the inner backing plate over the disc (row NODES) to the outer one.
-            row = NODES - 1 - node if side == 0 else NODES + 1 + node
-            diagonal[row] = diag
-            right[row] = rhs
-            lower[row] = -to_plate if side == 0 else -to_disc
-            upper[row] = -to_disc if side == 0 else -to_plate
-    loss = disc_loss(p, disc, ambient, wheel_speed) / p.area
-    storage = p.disc_heat_capacity / (p.area * dt)
-    diagonal[NODES] = storage + 2.0 * contact + loss
-    right[NODES] = storage * disc + loss * ambient + (1.0 - heat_share[0] - heat_share[1]) * power / p.area
-    lower[NODES] = upper[NODES] = -contact
+    for node in range(NODES):
+        below = positions[node] - positions[node - 1] if node > 0 else 0.0
+        above = positions[node + 1] - positions[node] if node < NODES - 1 else 0.0
+        per_volume = p.density * p.specific_heat * (1.0 + p.specific_heat_rise * (pad[node] - REFERENCE_C))
+        capacity = per_volume * 0.5 * (below + above) / dt
+        balance, source = capacity, capacity * pad[node]
+        if node > 0:
+            inwards = conductance(p, pad[node - 1], pad[node], below)
+        else:
+            inwards = to_disc
+            balance += to_air
+            source += heating + to_air * ambient
+        balance += inwards
+        outwards = 0.0
+        if node < NODES - 1:
+            outwards = conductance(p, pad[node], pad[node + 1], above)
+            balance += outwards
+        else:
+            balance += p.backplate_conductance
+            source += p.backplate_conductance * backplate
+        # The chain runs from the inner backing plate over the disc (row NODES) to the outer one.
+        row = NODES - 1 - node if side == 0 else NODES + 1 + node
+        diagonal[row] = balance
+        right[row] = source
+        lower[row] = -outwards if side == 0 else -inwards
+        upper[row] = -inwards if side == 0 else -outwards
 
+
+@njit
+def _solve(lower, diagonal, upper, right):
+    """Solve a tridiagonal system by elimination (Thomas); the solution replaces ``right``."""
     for row in range(1, CHAIN):
         factor = lower[row] / diagonal[row - 1]
         diagonal[row] -= factor * upper[row - 1]
@@ -136,6 +125,23 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
     right[CHAIN - 1] /= diagonal[CHAIN - 1]
     for row in range(CHAIN - 2, -1, -1):
         right[row] = (right[row] - upper[row] * right[row + 1]) / diagonal[row]
+
+
+@njit
+def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
+    """One implicit step of ``dt`` seconds; changes ``pads`` (2, NODES) and returns the new disc temperature."""
+    lower, diagonal, upper, right = work[0], work[1], work[2], work[3]
+    contact = p.contact_conductance if braking else p.gap_conductance
+    to_air = 0.0 if braking else p.surface_cooling_per_speed * wheel_speed
+    for side in range(2):
+        backplate = inner_backplate if side == 0 else outer_backplate
+        _pad_rows(p, pads[side], side, backplate, contact, to_air, p.heat_share[side] * power / p.area, ambient, dt, work)
+    loss = disc_loss(p, disc, ambient, wheel_speed) / p.area
+    storage = p.disc_heat_capacity / (p.area * dt)
+    diagonal[NODES] = storage + 2.0 * contact + loss
+    right[NODES] = storage * disc + loss * ambient + (1.0 - p.heat_share[0] - p.heat_share[1]) * power / p.area
+    lower[NODES] = upper[NODES] = -contact
+    _solve(lower, diagonal, upper, right)
     for node in range(NODES):
         pads[0, node] = right[NODES - 1 - node]
         pads[1, node] = right[NODES + 1 + node]

@@ -4,6 +4,9 @@ import numpy as np
 
 from emb_daemon.wire.contract import CYCLE_S
 
+#: Cycles up to which an error is followed, ten seconds, and correlation below which nothing of it is left.
+_LAGS, _GONE = 2500, 0.05
+
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
     """Covariance at lags 0 to ``lags``, shape (lags + 1,), over gap-free series of zero mean."""
@@ -21,9 +24,9 @@ def integral_time(series: list[np.ndarray]) -> float:
     A first-order process with this time constant has the error's own density at the slow end of the spectrum, where the
     filter works; white parts shorten it as they should.
     """
-    covariance = autocorrelation(series, min(2500, min(len(s) for s in series) // 4))
+    covariance = autocorrelation(series, min(_LAGS, min(len(s) for s in series) // 4))
     correlation = covariance / covariance[0]
-    gone = np.flatnonzero(correlation < 0.05)
+    gone = np.flatnonzero(correlation < _GONE)
     end = gone[0] if len(gone) else len(correlation)
     return float(max(CYCLE_S * (np.sum(correlation[:end]) - 0.5), 0.5 * CYCLE_S))
 

@@ -33,7 +33,21 @@ TRACE = np.dtype(
     align=True,
 )
 
+#: What the force paths take from the rest of the step, at each sample: temperatures (degC) of the pads, ``mean`` and at the
+#: ``surface``, and the ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known,
+#: and the heat of the motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost.
+HEAT = np.dtype(
+    [
+        ("mean", "f8", (2,)),
+        ("surface", "f8", (2,)),
+        *fields("f8", "history power disc winding housing contact_angle"),
+        ("temperature_known", "?"),
+    ],
+    align=True,
+)
+
 _COLD = np.ones(1)
+_UNASKED = np.zeros(0, HEAT)
 
 
 @njit
@@ -77,11 +91,19 @@ def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, facto
 
 
 @njit
-def _run_step(samples, parameters, states, estimate, out):
+def _run_step(samples, parameters, states, estimate, out, heat):
     p, s, e = parameters[0], states[0], estimate[0]
     for row in range(len(samples)):
         m, o = samples[row], out[row]
+        winding, housing = s.winding, s.housing
         step(s, p, m, e)
+        if len(heat) > 0:
+            h = heat[row]
+            h.winding, h.housing = winding, housing
+            h.mean[:] = s.mean
+            h.surface[0], h.surface[1] = s.pads[0, 0], s.pads[1, 0]
+            h.history, h.contact_angle = s.history, s.contact_angle
+            h.power, h.disc, h.temperature_known = s.power, s.disc, s.temperature_known
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
         o.torque_constant = p.torque_constant * factor
         o.force, o.torque, o.leverage, o.power = e.stiffness_force, s.balance, s.leverage, s.power
@@ -103,10 +125,13 @@ def held(parameters: np.ndarray | np.void) -> np.ndarray:
     return fixed
 
 
-def run_step(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
-    """The whole step from power-on; returns TRACE rows, what `estimate` does not tell. Residuals want `held` parameters."""
+def run_step(samples: np.ndarray, parameters: np.ndarray | np.void, heat: np.ndarray = _UNASKED) -> np.ndarray:
+    """The whole step from power-on; returns TRACE rows, what `estimate` does not tell. Residuals want `held` parameters.
+
+    Fills ``heat``, as many HEAT rows as samples, if it is given.
+    """
     out = np.zeros(len(samples), TRACE)
-    _run_step(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), out)
+    _run_step(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), out, heat)
     return out
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
-_COLD_C = 22.0
+#: Temperature (degC) at which effects of heat are nothing, and at which magnets have their full strength.
+_COLD_C, _MAGNETS_C = 22.0, 25.0
 #: Signals that drawn effects may follow, and their usual sizes.
 SIGNALS = (
     "brake_torque", "disc_temperature", "surface_temperature", "clamp_force", "motor_speed", "current", "force_rate",
@@ -17,7 +18,6 @@ _BRAKE_NM, _RISE_K, _FORCE_N, _SPEED, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 
 _DISC_SPEED, _POWER_W = 40.0, 30000.0
 #: Shapes of drawn effects: a power, what saturates, what begins at the signal's usual size.
 POWER, SATURATION, ONSET = range(3)
-_MAGNETS_C = 25.0
 
 
 @njit

@@ -1,12 +1,30 @@
 """Plants from calibrations: the same kind of brake, but not the same unit."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from emb_daemon.calibration.curves import curve_at
-from emb_daemon.calibration.types import Calibration
+from emb_daemon.calibration.types import Calibration, FrictionTable, Noise, Thermal
 from emb_daemon.models.gear import all_through_gear, steepest
 from emb_daemon.plant.records import EFFECTS, PLANT, TRAVEL_POINTS
 
+#: What no calibration says, the same for every plant, in the units of `records.PLANT_FIELDS`.
+_UNSTATED = {
+    "current_time": 0.001,
+    "magnet_heating": 0.02,
+    "magnet_time": 60.0,
+    "presliding_damping": 0.004,
+    "curve_temperature": 22.0,
+    "touching_force": 50.0,
+    "plate_heat_capacity": 17500.0,
+    "plate_loss": (93.0, 69.0),
+    "caliper_heat_capacity": 3600.0,
+    "caliper_loss": 4.0,
+    "temperature_noise": 0.25,
+    "force_noise": 25.0,
+    "brake_torque_noise": 0.6,
+}
 #: Standard deviations between what a calibration says and what a unit is, relative where nothing else is said: a well
 #: calibrated unit, some time later.
 _SCATTER = {
@@ -30,16 +48,14 @@ _SCATTER = {
     "disc_cooling_per_speed": 0.03,
     "friction_coefficient": 0.02,
 }
-_CURVE_SCATTER = 0.003
-_CONTACT_SCATTER_RAD = 0.01
-_EFFECT_SCATTER = 0.03
+#: The same of the whole curve, of the contact angle, rad, and of each parameter of an effect.
+_CURVE_SCATTER, _CONTACT_SCATTER_RAD, _EFFECT_SCATTER = 0.003, 0.01, 0.03
 #: The released position reads anything.
 _RELEASED_RANGE_RAD = (-200.0, 200.0)
 
 
-def _friction_plane(calibration: Calibration) -> np.ndarray:
-    """Least squares of the calibration's friction table: value at 20 degC, slopes over temperature, speed and force."""
-    table = calibration.thermal.friction
+def _friction_plane(table: FrictionTable) -> np.ndarray:
+    """Least squares of a friction table: value at 20 degC, slopes over temperature, speed and force."""
     force, speed, temperature = np.meshgrid(
         table.force_N, table.disc_speed_rad_per_s, table.surface_temperature_C, indexing="ij"
     )
@@ -66,33 +82,51 @@ def plant_from_calibration(
         InputError: the thickness is too far outside of what was measured.
         KeyError: no such effect or parameter.
     """
-    c = calibration
-    thickness = c.pad_thickness_mm if pad_thickness_mm is None else pad_thickness_mm
-    pad, disc, soft = c.thermal.pad, c.thermal.disc, c.thermal.softening
     p = np.zeros(1, PLANT)[0]
-    p["torque_constant"] = c.motor.torque_constant_Nm_per_A
-    p["inertia"] = c.motor.inertia_kg_m2
-    p["gear_gain"] = c.motor.gear_gain_m_per_rad
-    if c.motor.travel.angle_rad:
-        p["travel_angle"] = np.linspace(0.0, c.motor.travel.angle_rad[-1], TRAVEL_POINTS)
-        p["travel"] = p["gear_gain"] * all_through_gear(c.motor.gear(), p["travel_angle"])[0]
-    p["release_spring"] = c.motor.release_spring_N_per_m
-    p["maximum_speed"] = c.motor.maximum_speed_rad_per_s
+    for name, value in _UNSTATED.items():
+        p[name] = value
+    thickness = calibration.pad_thickness_mm if pad_thickness_mm is None else pad_thickness_mm
+    _set_motor(p, calibration)
+    _set_stiffness(p, calibration, thickness)
+    _set_pads(p, calibration.thermal, thickness)
+    _set_disc(p, calibration.thermal)
+    _set_sensors(p, calibration.noise)
+    own = {name: values for name, values in calibration.effects.items() if name in EFFECTS}
+    _set_effects(p, own | (effects or {}))
+    if seed is not None:
+        _scatter(p, np.random.default_rng(seed), set(calibration.effects) - set(effects or {}))
+    return p
+
+
+def _set_motor(p: np.void, calibration: Calibration) -> None:
+    motor, friction, gear = calibration.motor, calibration.friction, calibration.motor.gear()
+    p["torque_constant"] = motor.torque_constant_Nm_per_A
+    p["inertia"] = motor.inertia_kg_m2
+    p["gear_gain"] = motor.gear_gain_m_per_rad
+    if motor.travel.angle_rad:
+        p["travel_angle"] = np.linspace(0.0, motor.travel.angle_rad[-1], TRAVEL_POINTS)
+        p["travel"] = p["gear_gain"] * all_through_gear(gear, p["travel_angle"])[0]
+    p["release_spring"] = motor.release_spring_N_per_m
+    p["maximum_speed"] = motor.maximum_speed_rad_per_s
     # Enough to hold the largest force against friction, and to accelerate.
-    steep = steepest(c.motor.gear())[1] * c.motor.gear_gain_m_per_rad
-    p["maximum_current"] = 1.5 * steep * c.stiffness.maximum_force_N / c.motor.torque_constant_Nm_per_A
-    p["current_time"] = 0.001
-    p["magnet_heating"], p["magnet_time"] = 0.02, 60.0
-    p["load_friction"] = c.friction.load_m_per_rad
-    p["offset_friction"] = c.friction.offset_Nm
-    p["presliding_angle"] = c.friction.presliding_angle_rad
-    p["presliding_damping"] = 0.004
-    p["curve"] = curve_at(c.stiffness.curves, thickness)
-    p["relaxation_time"] = c.stiffness.relaxation_time_s
-    p["contact_angle"] = c.contact.clearance_rad
-    p["curve_temperature"] = 22.0
+    steep = steepest(gear)[1] * motor.gear_gain_m_per_rad
+    p["maximum_current"] = 1.5 * steep * calibration.stiffness.maximum_force_N / motor.torque_constant_Nm_per_A
+    p["load_friction"] = friction.load_m_per_rad
+    p["offset_friction"] = friction.offset_Nm
+    p["presliding_angle"] = friction.presliding_angle_rad
+
+
+def _set_stiffness(p: np.void, calibration: Calibration, thickness_mm: float) -> None:
+    soft = calibration.thermal.softening
+    p["curve"] = curve_at(calibration.stiffness.curves, thickness_mm)
+    p["relaxation_time"] = calibration.stiffness.relaxation_time_s
+    p["contact_angle"] = calibration.contact.clearance_rad
     p["softening"], p["softening_history"], p["history_time"] = soft.per_K, soft.history_per_K, soft.history_time_s
-    p["pad_thickness"] = 1e-3 * thickness
+
+
+def _set_pads(p: np.void, thermal: Thermal, thickness_mm: float) -> None:
+    pad = thermal.pad
+    p["pad_thickness"] = 1e-3 * thickness_mm
     p["pad_area"] = pad.area_m2
     p["density"] = pad.density_kg_per_m3
     p["specific_heat"], p["specific_heat_rise"] = pad.specific_heat_J_per_kgK, pad.specific_heat_rise_per_K
@@ -100,34 +134,35 @@ def plant_from_calibration(
     p["heat_share"] = pad.inner_heat_share, pad.outer_heat_share
     p["contact_conductance"] = pad.contact_conductance_W_per_m2K
     p["gap_conductance"] = pad.gap_conductance_W_per_m2K
-    p["touching_force"] = 50.0
     p["plate_conductance"] = pad.backplate_conductance_W_per_m2K
-    p["plate_heat_capacity"], p["plate_loss"] = 17500.0, (93.0, 69.0)
-    p["caliper_heat_capacity"], p["caliper_loss"] = 3600.0, 4.0
+
+
+def _set_disc(p: np.void, thermal: Thermal) -> None:
+    disc = thermal.disc
     p["disc_heat_capacity"] = disc.heat_capacity_J_per_K
     p["disc_cooling"] = disc.cooling_W_per_K
     p["disc_cooling_per_speed"] = disc.cooling_per_speed_J_per_rad_K
     p["disc_radiating_area"] = disc.radiating_area_m2
     p["effective_radius"] = disc.effective_radius_m
     names = ("friction_coefficient", "friction_per_K", "friction_per_speed", "friction_per_force")
-    for name, value in zip(names, _friction_plane(c), strict=True):
+    for name, value in zip(names, _friction_plane(thermal.friction), strict=True):
         p[name] = value
-    p["current_noise"], p["current_noise_time"] = c.noise.current_A, c.noise.current_correlation_s
-    p["speed_noise"] = c.noise.speed_rad_per_s
+
+
+def _set_sensors(p: np.void, noise: Noise) -> None:
+    p["current_noise"], p["current_noise_time"] = noise.current_A, noise.current_correlation_s
+    p["speed_noise"] = noise.speed_rad_per_s
     count = 2.0 * np.pi / 4096
     p["angle_noise"], p["angle_count"], p["angle_hysteresis"] = 0.1 * count, count, 0.5 * count
-    p["temperature_noise"], p["force_noise"], p["brake_torque_noise"] = 0.25, 25.0, 0.6
-    p["force_lead"] = 0.0
-    chosen = {name: dict(values) for name, values in c.effects.items() if name in EFFECTS} | (effects or {})
-    for name, values in chosen.items():
+
+
+def _set_effects(p: np.void, effects: Mapping[str, Mapping[str, float]]) -> None:
+    for name, values in effects.items():
         known = [field.name for field in EFFECTS[name]]
         for key, value in values.items():
             if key not in known:
                 raise KeyError(f"effect {name} has no parameter {key}; expected {', '.join(known)}")
             p["effects"][name][key] = value
-    if seed is not None:
-        _scatter(p, np.random.default_rng(seed), set(c.effects) - set(effects or {}))
-    return p
 
 
 def _scatter(p: np.void, rng: np.random.Generator, scattered_effects: set[str]) -> None:

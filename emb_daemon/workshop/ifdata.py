@@ -5,23 +5,15 @@ from typing import NamedTuple
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
 from emb_daemon.workshop.pages import FILES, WORKING
-from emb_daemon.workshop.xcp import LISTS, MILLISECONDS, ON_CAN, ON_UDP, Transport
+from emb_daemon.workshop.xcp import CALIBRATING, LISTS, MILLISECONDS, ON_CAN, ON_UDP, READING, Transport
 
 #: ms that a tool waits for an answer: longer than the daemon may take to check a page (`runtime.pages`).
 _T1_MS = 5000
 #: Versions of the protocol layer, 1.1, and of the transport layers, 1.0.
 _PROTOCOL, _LAYER = 0x0101, 0x0100
-#: Optional commands that the server knows, with their codes: always, and where numbers may be written.
-_READING = {
-    "GET_COMM_MODE_INFO": 0xFB, "GET_ID": 0xFA, "SET_MTA": 0xF6, "UPLOAD": 0xF5, "SHORT_UPLOAD": 0xF4, "SET_DAQ_PTR":
-    0xE2, "WRITE_DAQ": 0xE1, "SET_DAQ_LIST_MODE": 0xE0, "GET_DAQ_LIST_MODE": 0xDF, "START_STOP_DAQ_LIST": 0xDE,
-    "START_STOP_SYNCH": 0xDD, "GET_DAQ_CLOCK": 0xDC, "GET_DAQ_PROCESSOR_INFO": 0xDA, "GET_DAQ_RESOLUTION_INFO": 0xD9,
-    "GET_DAQ_EVENT_INFO": 0xD7, "FREE_DAQ": 0xD6, "ALLOC_DAQ": 0xD5, "ALLOC_ODT": 0xD4, "ALLOC_ODT_ENTRY": 0xD3
-}  # fmt: skip
-_CALIBRATING = {
-    "DOWNLOAD": 0xF0, "SHORT_DOWNLOAD": 0xED, "SET_CAL_PAGE": 0xEB, "GET_CAL_PAGE": 0xEA, "GET_PAG_PROCESSOR_INFO": 0xE9,
-    "GET_SEGMENT_INFO": 0xE8, "GET_PAGE_INFO": 0xE7, "COPY_CAL_PAGE": 0xE4
-}  # fmt: skip
+#: Commands that every slave has; of the others a file says which are there.
+_MANDATORY = {"CONNECT", "DISCONNECT", "GET_STATUS", "SYNCH"}
+_OPTIONAL = {name: command.code for name, command in (READING | CALIBRATING).items() if name not in _MANDATORY}
 _UNITS = {3: "UNIT_1US", 5: "UNIT_100US"}
 _SIZES = {2: "SIZE_WORD", 4: "SIZE_DWORD"}
 
@@ -50,8 +42,10 @@ def module_block(connection: Connection, calibrate: bool) -> str:
     """IF_DATA of the module."""
     layer = connection.layer
     # The command is not there where a packet has no room behind its header.
-    written = [name for name in _CALIBRATING if calibrate and not (layer.max_cto <= 8 and name == "SHORT_DOWNLOAD")]
-    commands = " ".join(f"OPTIONAL_CMD {name}" for name in [*_READING, *written])
+    missing = set() if calibrate else set(CALIBRATING)
+    if layer.max_cto <= 8:
+        missing.add("SHORT_DOWNLOAD")
+    commands = " ".join(f"OPTIONAL_CMD {name}" for name in _OPTIONAL if name not in missing)
     cycle_ms = CYCLE_NS // 1_000_000
     events = " ".join(
         f'/begin EVENT "{name}" "{name}" {number} DAQ {LISTS} {cycle_ms} {MILLISECONDS} 0 CONSISTENCY EVENT /end EVENT'
@@ -100,7 +94,7 @@ def _access(who: str, other: str) -> str:
 
 
 _PAGE_ACCESS = "; ".join([_access("ECU", "XCP"), _access("XCP_READ", "ECU"), _access("XCP_WRITE", "ECU")])
-_COMMANDS = ", ".join(f'"{name}" = 0x{code:02X}' for name, code in (_READING | _CALIBRATING).items())
+_COMMANDS = ", ".join(f'"{name}" = 0x{code:02X}' for name, code in _OPTIONAL.items())
 
 #: What the blocks above are made of, and no more of XCP.
 A2ML = f"""\

@@ -6,8 +6,9 @@ Whatever a packet holds, it gets one response; without a session none but CONNEC
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from emb_daemon.runtime.pages import Answer
 from emb_daemon.wire.contract import CYCLE_NS
@@ -105,44 +106,8 @@ class Slave:
         self._texts = {0: name, 1: name, 4: file}
         self.connected = False
         self._reset()
-        self._commands: dict[int, tuple[struct.Struct, Callable[..., bytes]]] = {
-            code: (struct.Struct("<" + layout), action)
-            for code, layout, action in (
-                (CONNECT, "B", self._connect),
-                (0xFE, "", self._disconnect),
-                (0xFD, "", self._status),
-                (0xFC, "", self._synch),
-                (0xFB, "", lambda: bytes(7)),
-                (0xFA, "B", self._identify),
-                (0xF6, "2xBI", self._set_address),
-                (0xF5, "B", self._upload),
-                (0xF4, "BxBI", self._short_upload),
-                (0xE2, "xHBB", self._set_pointer),
-                (0xE1, "BBBI", self._write_entry),
-                (0xE0, "BHHBB", self._set_mode),
-                (0xDF, "xH", self._mode),
-                (0xDE, "BH", self._start_stop_list),
-                (0xDD, "B", self._start_stop),
-                (0xDC, "", lambda: struct.pack("<xHI", 0, self._ticks(self._clock()) & 0xFFFFFFFF)),
-                (0xDA, "", lambda: struct.pack("<BHHBB", _DAQ_PROPERTIES, LISTS, len(CORNERS), 0, 0)),
-                (0xD9, "", self._resolution),
-                (0xD7, "xH", self._event_information),
-                (0xD6, "", self._free),
-                (0xD5, "xH", self._allocate_lists),
-                (0xD4, "xHB", self._allocate_odts),
-                (0xD3, "xHBB", self._allocate_entries),
-                *(() if segment is None else (
-                    (0xF0, "B", self._download),
-                    (0xED, "BxBI", self._short_download),
-                    (0xEB, "BBB", self._set_page),
-                    (0xEA, "BB", self._page),
-                    (0xE9, "", lambda: bytes([1, 0])),
-                    (0xE8, "BBBB", self._segment_information),
-                    (0xE7, "xBB", self._page_information),
-                    (0xE4, "BBBB", self._copy_page),
-                )),
-            )
-        }  # fmt: skip
+        commands = READING if segment is None else READING | CALIBRATING
+        self._commands = {command.code: command for command in commands.values()}
         self._packet = b""
 
     def _reset(self) -> None:
@@ -161,15 +126,14 @@ class Slave:
         """The response to a packet; empty where there is none."""
         if not packet or not (self.connected or packet[0] == CONNECT):
             return b""
-        layout, action = self._commands.get(packet[0], (None, None))
         try:
-            if layout is None or action is None:
+            if (command := self._commands.get(packet[0])) is None:
                 raise Refusal(UNKNOWN)
             # Longer ones are filled up to the frame's size.
-            if len(packet) <= layout.size:
+            if len(packet) <= command.layout.size:
                 raise Refusal(SYNTAX)
             self._packet = packet
-            return bytes([_RESPONSE]) + action(*layout.unpack_from(packet, 1))
+            return bytes([_RESPONSE]) + command.action(self, *command.layout.unpack_from(packet, 1))
         except Refusal as refusal:
             return bytes([_ERROR, *refusal.args])
 
@@ -193,6 +157,10 @@ class Slave:
 
     def _synch(self) -> bytes:
         raise Refusal(SYNCH)
+
+    def _communication_mode(self) -> bytes:
+        """No block mode, no interleaving."""
+        return bytes(7)
 
     def _identify(self, kind: int) -> bytes:
         """0 and 1: name; 4: the file itself. Of any other kind there is a text of length 0."""
@@ -293,9 +261,19 @@ class Slave:
             self._segment.fill()
         return b""
 
+    def _page_processor(self) -> bytes:
+        """One segment, none of whose pages can be frozen."""
+        return bytes([1, 0])
+
     def _short_upload(self, count: int, extension: int, address: int) -> bytes:
         self._address = extension, address
         return self._upload(count)
+
+    def _now(self) -> bytes:
+        return struct.pack("<xHI", 0, self._ticks(self._clock()) & 0xFFFFFFFF)
+
+    def _processor(self) -> bytes:
+        return struct.pack("<BHHBB", _DAQ_PROPERTIES, LISTS, len(CORNERS), 0, 0)
 
     def _resolution(self) -> bytes:
         largest = min(self._transport.max_dto - 1, 0xFF)
@@ -450,3 +428,53 @@ class Slave:
     def overload(self) -> bytes:
         """Tell the master that data were lost."""
         return bytes([_EVENT, _OVERLOAD])
+
+
+class Command(NamedTuple):
+    """A command's code, what follows it in a packet, and what answers it: bytes behind the response's first."""
+
+    code: int
+    layout: struct.Struct
+    action: Callable[..., bytes]
+
+
+def _table(rows: Iterable[tuple[str, int, str, Callable[..., bytes]]]) -> dict[str, Command]:
+    return {name: Command(code, struct.Struct("<" + layout), action) for name, code, layout, action in rows}
+
+
+#: What the slave answers, by the standard's names: always, and where numbers may be written.
+READING = _table([
+    ("CONNECT", CONNECT, "B", Slave._connect),
+    ("DISCONNECT", 0xFE, "", Slave._disconnect),
+    ("GET_STATUS", 0xFD, "", Slave._status),
+    ("SYNCH", 0xFC, "", Slave._synch),
+    ("GET_COMM_MODE_INFO", 0xFB, "", Slave._communication_mode),
+    ("GET_ID", 0xFA, "B", Slave._identify),
+    ("SET_MTA", 0xF6, "2xBI", Slave._set_address),
+    ("UPLOAD", 0xF5, "B", Slave._upload),
+    ("SHORT_UPLOAD", 0xF4, "BxBI", Slave._short_upload),
+    ("SET_DAQ_PTR", 0xE2, "xHBB", Slave._set_pointer),
+    ("WRITE_DAQ", 0xE1, "BBBI", Slave._write_entry),
+    ("SET_DAQ_LIST_MODE", 0xE0, "BHHBB", Slave._set_mode),
+    ("GET_DAQ_LIST_MODE", 0xDF, "xH", Slave._mode),
+    ("START_STOP_DAQ_LIST", 0xDE, "BH", Slave._start_stop_list),
+    ("START_STOP_SYNCH", 0xDD, "B", Slave._start_stop),
+    ("GET_DAQ_CLOCK", 0xDC, "", Slave._now),
+    ("GET_DAQ_PROCESSOR_INFO", 0xDA, "", Slave._processor),
+    ("GET_DAQ_RESOLUTION_INFO", 0xD9, "", Slave._resolution),
+    ("GET_DAQ_EVENT_INFO", 0xD7, "xH", Slave._event_information),
+    ("FREE_DAQ", 0xD6, "", Slave._free),
+    ("ALLOC_DAQ", 0xD5, "xH", Slave._allocate_lists),
+    ("ALLOC_ODT", 0xD4, "xHB", Slave._allocate_odts),
+    ("ALLOC_ODT_ENTRY", 0xD3, "xHBB", Slave._allocate_entries),
+])  # fmt: skip
+CALIBRATING = _table([
+    ("DOWNLOAD", 0xF0, "B", Slave._download),
+    ("SHORT_DOWNLOAD", 0xED, "BxBI", Slave._short_download),
+    ("SET_CAL_PAGE", 0xEB, "BBB", Slave._set_page),
+    ("GET_CAL_PAGE", 0xEA, "BB", Slave._page),
+    ("GET_PAG_PROCESSOR_INFO", 0xE9, "", Slave._page_processor),
+    ("GET_SEGMENT_INFO", 0xE8, "BBBB", Slave._segment_information),
+    ("GET_PAGE_INFO", 0xE7, "xBB", Slave._page_information),
+    ("COPY_CAL_PAGE", 0xE4, "BBBB", Slave._copy_page),
+])  # fmt: skip

@@ -34,6 +34,8 @@ from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 NOTHING: Mapping[str, float] = MappingProxyType({})
+#: One minus the squared friction state below which a gear slides.
+_SLID = 0.1
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -203,7 +205,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
-        excess.append(torque**2 - np.mean(torque[sliding < 0.1] ** 2))
+        excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))
         load = (gear_gain + values[LOAD] * mean) * force
         # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
         gains.append(float(load @ torque / (load @ load)))

@@ -22,8 +22,8 @@ from emb_daemon.report.page import Section
 _SLOWEST_SAMPLE_S = 0.02
 _LEAST_BURST_S = 2.0
 _LEAST_RANGE_N = 1000.0
-_LEAST_BURSTS = 6
-_LEAST_RISE_K = 30.0
+#: Bursts of a log from which its softening is known, and kelvins that the pads must differ by between them.
+_LEAST_BURSTS, _LEAST_RISE_K = 6, 30.0
 #: The history term must lower the residual on bursts left out by this much.
 _WORTH_IT = 0.95
 #: Step of the derivative by the contact angle, rad.
