@@ -178,12 +178,13 @@ def one_round(selection: Selection) -> Selection:
 
 
 def find_known(selection: Selection, channel: str) -> Candidate | None:
-    """The effect that gains most in a channel, of all that are not in the model and that nothing speaks against; also of those
-    that were dropped."""
+    """The effect that gains most in a channel, of all that are not in the model and that nothing but chance speaks against;
+    also of those that were dropped."""
     model, screening = selection.model, selection.screening
     off = [e for e in REGISTRY if not model.of_effect(e.name) and not _why_not_asked(e, model)]
-    found = [c for c in screening.test(model, off) if c.channel == channel]
-    passed = [c for c in (screening.judge(model, c, {}, found) for c in found) if not c.reason]
+    found = [c for c in screening.test(model, off) if c.channel == channel and c.columns]
+    rivals: dict = {}
+    passed = [c for c in (screening.plausible(model, c, rivals, found) for c in found) if not c.reason]
     return max(passed, key=lambda c: c.evidence.gain, default=None)
 
 
@@ -268,9 +269,9 @@ def revise(selection: Selection) -> Selection:
         amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
         gone = []
         for group in groups(candidate.effect, amplitudes):
-            samples = LASTING[candidate.channel] if candidate.made else 1
-            evidence = model.evidence_against(dict.fromkeys(group, 0.0), samples)
-            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not candidate.made):
+            over_grammar = candidate.made or candidate.names
+            evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
+            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not over_grammar):
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
