@@ -632,7 +632,8 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
 
     monkeypatch.setattr(blind, "run_trial", pretend)
     output = tmp_path / "blind.jsonl"
-    few = ["--single", "0", "--pairs", "1", "--foreign", "0", "--drawn", "0", "--output", str(output)]
+    none = [part for kind in ("single", "triples", "changed", "foreign", "drawn") for part in (f"--{kind}", "0")]
+    few = [*none, "--pairs", "1", "--output", str(output)]
     assert blind.main(["--null", "2", *few]) == 0
     output.write_bytes(output.read_bytes()[:-20])
     assert blind.main(["--null", "3", *few]) == 0
