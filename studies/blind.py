@@ -361,7 +361,7 @@ def plan(
     for k in range(triples):
         three = tuple(names[which] for which in rng.choice(len(names), 3, replace=False))
         trials.append((45000 + 10 * k, "triple", three, float(rng.uniform(150.0, 500.0))))
-    order = rng.permutation(len(names))
+    order = np.random.default_rng(2011).permutation(len(names))
     for k in range(changed):
         trials.append((70000 + 10 * k, "changed", (names[order[k % len(names)]],), SIZES_N[1 + k % 3]))
     trials += [(60000 + 10 * k, "drawn", (), SIZES_N[1 + k % 3]) for k in range(drawn)]

@@ -623,6 +623,15 @@ def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monke
     assert "disc_thickness_variation" not in result.calibration.effects
 
 
+@pytest.mark.parametrize(
+    ("found", "changed", "named"),
+    [({}, ("backlash",), True), ({}, (), False), ({"backlash": {}}, (), False), ({}, ("backlash", "cogging_torque"), False)],
+)
+def test_a_change_is_named_as_a_change_of_that_effect_and_no_other(found, changed, named):
+    trial = blind.Trial(1, "changed", {"backlash": {}}, 150.0, found, 90.0, 27.0, None, changed=changed)
+    assert trial.named is named
+
+
 def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, capsys):
     ran = []
 
