@@ -600,6 +600,16 @@ def test_blind(calibration):
     assert trial.contribution_error < 0.15
 
 
+def test_a_ripple_of_a_sixth_of_the_current_s_noise_is_named_once_its_order_is_fitted(calibration, monkeypatch):
+    """As its order was scanned a dozen effective episodes leave it unsure; it is most of what lasts of the torque residual."""
+    monkeypatch.setattr(blind, "what_is_left", lambda result, alone: {})
+    trial = run_trial(calibration, 20280, "single", ("gear_mesh_ripple",), 75.0)
+    assert trial.named, trial
+    assert trial.found["gear_mesh_ripple"]["order_per_turn"] == pytest.approx(
+        trial.hidden["gear_mesh_ripple"]["order_per_turn"], rel=0.01
+    )
+
+
 def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monkeypatch):
     """Something periodic in the motor angle is wrong, and the wheel stands: no fit may so much as try to vary the disc."""
     plant = plant_from_calibration(

@@ -23,8 +23,9 @@ from emb_daemon.effects.base import Effect
 _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
-#: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
-#: before it is judged.
+#: A candidate whose chance is below this but not sure, and that explains this share of the mean square of what lasts of the
+#: residual, is fitted before it is judged. Not of all of it: what differs from sample to sample no effect explains, and in the
+#: current that is most.
 _UNSURE, _LARGE = 0.05, 0.25
 
 #: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
@@ -241,7 +242,7 @@ def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> 
         if c.channel in FORCE_CHANNELS
         and c.p_value < _UNSURE
         and c.q_value > Q_VALUE
-        and c.gain**2 > _LARGE * model.noise(c.channel)
+        and c.gain**2 > _LARGE * model.lasting(c.channel, LASTING[c.channel])
     ]
     plausible = [(c, selection.screening.plausible(model, c, rivals)) for c in large]
     plausible = [pair for pair in plausible if not pair[1].reason]
