@@ -5,10 +5,10 @@
 Trials are appended to the file one by one; started again with the same file, the command goes on where it was stopped, and
 prints the table of all.
 
-Each trial draws a unit that scatters about the calibration as units do, gives it no effect, one, two, or one that the
-catalogue does not know, drives a campaign with it, and hands log and calibration to `diagnose`, which is not told. Sizes are
-drawn as the RMS error (N) that the effect makes on its own path, so that power can be stated per size. The plant shares no
-code with the estimator (see emb_daemon/plant).
+Each trial draws a unit that scatters about the calibration as units do, gives it no effect, one, two, three, one that the
+calibration has with another size, or one that the catalogue does not know, drives a campaign with it, and hands log and
+calibration to `diagnose`, which is not told. Sizes are drawn as the RMS error (N) that the effect makes on its own path, so
+that power can be stated per size. The plant shares no code with the estimator (see emb_daemon/plant).
 """
 
 import argparse
@@ -67,6 +67,8 @@ _EXPONENTS, _LAGS_S = (0.4, 2.6), (1.0, 20.0)
 _STOPS = {"foreign": 25, "drawn": 25}
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
+#: Effects of the brake over those of a calibration that has them with another size.
+_CHANGES = (1.0 / 3.0, 3.0)
 
 
 #: Residual that lasts over that of the same unit with nothing hidden: from here something is clearly left (half as much again,
@@ -105,7 +107,8 @@ class Trial:
     Attributes:
         hidden: effects of the plant with their parameters, beside those of the calibration.
         size: RMS that each makes on its own path, N.
-        found: effects accepted, with their parameters; what changed of those in the calibration is recalibration.
+        found: effects accepted, with their parameters.
+        changed: effects of the calibration that are not as calibrated.
         before, after: RMSE of the fused force on the validation log, N.
         unexplained: signal that a rest depends on, or None.
         contribution_error: of what the found effects do on their paths against what the hidden ones do, RMS over RMS; None
@@ -125,6 +128,7 @@ class Trial:
     contribution_error: float | None = None
     seconds: float = 0.0
     left: dict[str, Rest] = field(default_factory=dict)
+    changed: tuple[str, ...] = ()
 
     @property
     def false_findings(self) -> set[str]:
@@ -145,6 +149,8 @@ class Trial:
     @property
     def named(self) -> bool:
         """Whether exactly what was hidden was found; for a foreign effect, a term of the right signal at the right port."""
+        if self.kind == "changed":
+            return not self.found and set(self.changed) == set(self.hidden)
         if self.kind == "drawn":
             return bool(self.found) and {_without_number(name) for name in self.found} <= self._drawn_terms
         if self.kind == "foreign":
@@ -230,7 +236,8 @@ def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarra
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
-    """One blind trial; ``kind`` is null, single, pair, foreign or drawn, ``names`` the effects to hide at ``size`` N each."""
+    """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign or drawn, ``names`` the effects to hide at
+    ``size`` N each; for a change that of what the calibration says is off."""
     rng = np.random.default_rng(seed)
     start = calibration
     removed = [name for name in names if name in calibration.effects]
@@ -256,6 +263,14 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
             for _ in range(2):
                 values = scaled(name, values, size / max(rmse(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
+    if kind == "changed":
+        [(name, off)] = hidden.items()
+        factor = rng.choice(_CHANGES)
+        was = scaled(name, off, 1.0 / abs(factor - 1.0))
+        hidden[name] = scaled(name, was, factor)
+        start = moved(start, {f"effects.{name}.{key}": value for key, value in was.items()})
+        for key, value in was.items():
+            base["effects"][name][key] = value
     plant = base.copy()
     for name, values in hidden.items():
         for key, value in values.items():
@@ -271,7 +286,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     new = [f for f in result.accepted if not f.in_calibration]
     found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in new}
     error = None
-    if kind in ("single", "pair") and set(found) == set(hidden):
+    if kind in ("single", "pair", "triple") and set(found) == set(hidden):
         bench = Bench([val_log], start)
         true = {name: contribution(bench, name, values) for name, values in hidden.items()}
         error = max(rmse(contribution(bench, name, found[name]) - true[name]) / rmse(true[name]) for name in hidden)
@@ -287,6 +302,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         error,
         seconds,
         what_is_left(result, log_of(simulate_log(base, judging, seed=seed + 2)[0])),
+        tuple(f.effect.name for f in result.accepted if f.in_calibration),
     )
 
 
@@ -329,7 +345,9 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
     return result | {key: float(np.hypot(values[key], values[sine])) for key, sine in pairs.items()}
 
 
-def plan(null: int, single: int, pairs: int, foreign: int, drawn: int = 0) -> list[tuple[int, str, tuple[str, ...], float]]:
+def plan(
+    null: int, single: int, pairs: int, foreign: int, drawn: int = 0, triples: int = 0, changed: int = 0
+) -> list[tuple[int, str, tuple[str, ...], float]]:
     """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
     names = list(DRAWN)
@@ -339,6 +357,13 @@ def plan(null: int, single: int, pairs: int, foreign: int, drawn: int = 0) -> li
     for k in range(pairs):
         first, second = rng.choice(len(names), 2, replace=False)
         trials.append((40000 + 10 * k, "pair", (names[first], names[second]), float(rng.uniform(150.0, 500.0))))
+    rng = np.random.default_rng(2010)
+    for k in range(triples):
+        three = tuple(names[which] for which in rng.choice(len(names), 3, replace=False))
+        trials.append((45000 + 10 * k, "triple", three, float(rng.uniform(150.0, 500.0))))
+    order = np.random.default_rng(2011).permutation(len(names))
+    for k in range(changed):
+        trials.append((70000 + 10 * k, "changed", (names[order[k % len(names)]],), SIZES_N[1 + k % 3]))
     trials += [(60000 + 10 * k, "drawn", (), SIZES_N[1 + k % 3]) for k in range(drawn)]
     strangers = [name for _ in range(foreign) for name in _FOREIGN]
     return trials + [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
@@ -377,7 +402,10 @@ def summary(trials: list[Trial]) -> str:
     return "\n".join(lines)
 
 
-_KINDS = {"null": "no effect", "single": "one effect", "pair": "two effects", "drawn": "drawn by a seed"}
+_KINDS = {
+    "null": "no effect", "single": "one effect", "pair": "two effects", "triple": "three effects",
+    "changed": "calibrated with another size", "drawn": "drawn by a seed",
+}  # fmt: skip
 #: From here a validation error counts as worse; below it is the noise of the reference.
 _WORSE = 1.05
 
@@ -417,6 +445,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--null", type=int, default=200, help="plants without an effect")
     parser.add_argument("--single", type=int, default=5, help="plants per effect and size")
     parser.add_argument("--pairs", type=int, default=40, help="plants with two effects")
+    parser.add_argument("--triples", type=int, default=20, help="plants with three effects")
+    parser.add_argument("--changed", type=int, default=13, help="plants with an effect calibrated with another size")
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
     parser.add_argument("--drawn", type=int, default=16, help="plants with an effect that a seed draws from a wider family")
     parser.add_argument("--bare", action="store_true", help="make no terms: does the report say that something is left?")
@@ -426,7 +456,8 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.bare:
         search.make_terms = lambda selection, progress: selection
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
-    planned = plan(arguments.null, arguments.single, arguments.pairs, arguments.foreign, arguments.drawn)
+    counts = arguments.null, arguments.single, arguments.pairs, arguments.foreign
+    planned = plan(*counts, arguments.drawn, arguments.triples, arguments.changed)
     done = {_key(t.seed, t.kind, () if t.kind == "drawn" else t.hidden, t.size): t for t in recorded(arguments.output)}
     trials = []
     for seed, kind, names, size in planned:

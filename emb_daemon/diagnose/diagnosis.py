@@ -229,7 +229,8 @@ def _describe(selection: Selection, candidate: Candidate) -> Candidate:
 
 
 def _why(candidate: Candidate) -> str:
-    text = f"q = {candidate.q_value:.1g} over episodes, gains {candidate.gain:.3g} {UNITS[candidate.channel]} on left-out ones"
+    over = "the whole grammar" if candidate.names else "episodes"
+    text = f"q = {candidate.q_value:.1g} over {over}, gains {candidate.gain:.3g} {UNITS[candidate.channel]} on left-out ones"
     if candidate.in_calibration:
         text = f"not as calibrated: {text}"
     for disturbed, share in candidate.placebos.items():

@@ -86,12 +86,17 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
     """The same with an effect of the catalogue in the place of each term that it describes as shortly: what has a name is
-    called by it."""
+    called by it.
+
+    That something is there the term has proven, over more forms than the catalogue has; few effective episodes, which leave
+    the catalogue's own test no freedom, are no reason against the name."""
     for term in _made(selection, channel):
         bare = selection.without(term, "an effect of the catalogue says the same")
         known = find_known(bare, channel)
         if known is None:
             continue
+        proven = selection.candidates[term]
+        known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
         named, name = bare.entered([known]), known.effect.name
         if name in named.accepted and _description(named, channel) <= _description(selection, channel):
             selection = named

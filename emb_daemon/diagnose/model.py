@@ -93,6 +93,11 @@ class Model:
         counted = self.residual[channel][self.residual[channel] != 0.0]
         return rmse(counted) ** 2 if len(counted) else 0.0
 
+    def lasting(self, channel: str, samples: int) -> float:
+        """Mean square of what lasts over so many samples of the residual."""
+        means = Averaging(self.bench.episode[channel], samples)
+        return float(np.square(means.of(self.residual[channel][:, None])).sum()) / self.counted(channel)
+
     def inflation(self, channel: str) -> float:
         """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""
         residual, episode = self.residual[channel], self.bench.episode[channel]

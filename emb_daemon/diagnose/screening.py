@@ -59,6 +59,7 @@ class Candidate:
         values, sigmas: by parameter; before: as calibrated, for an effect that was.
         contribution: what it takes from the channel's residual, at every sample.
         over: its signal at every sample, for a term.
+        names: the term in whose place it stands, by which its chance was judged.
         undecided_N: RMS by which rivals that these logs cannot tell from it do otherwise.
     """
 
@@ -81,6 +82,7 @@ class Candidate:
     before: Mapping[str, float] = field(default_factory=dict)
     confounded_with: str | None = None
     manoeuvre: str | None = None
+    names: str = ""
     undecided_N: float = 0.0
     contribution: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     over: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)

@@ -23,8 +23,9 @@ from emb_daemon.effects.base import Effect
 _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
-#: A candidate whose chance is below this but not sure, and that explains this share of the residual's mean square, is fitted
-#: before it is judged.
+#: A candidate whose chance is below this but not sure, and that explains this share of the mean square of what lasts of the
+#: residual, is fitted before it is judged. Not of all of it: what differs from sample to sample no effect explains, and in the
+#: current that is most.
 _UNSURE, _LARGE = 0.05, 0.25
 
 #: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
@@ -178,12 +179,13 @@ def one_round(selection: Selection) -> Selection:
 
 
 def find_known(selection: Selection, channel: str) -> Candidate | None:
-    """The effect that gains most in a channel, of all that are not in the model and that nothing speaks against; also of those
-    that were dropped."""
+    """The effect that gains most in a channel, of all that are not in the model and that nothing but chance speaks against;
+    also of those that were dropped."""
     model, screening = selection.model, selection.screening
     off = [e for e in REGISTRY if not model.of_effect(e.name) and not _why_not_asked(e, model)]
-    found = [c for c in screening.test(model, off) if c.channel == channel]
-    passed = [c for c in (screening.judge(model, c, {}, found) for c in found) if not c.reason]
+    found = [c for c in screening.test(model, off) if c.channel == channel and c.columns]
+    rivals: dict = {}
+    passed = [c for c in (screening.plausible(model, c, rivals, found) for c in found) if not c.reason]
     return max(passed, key=lambda c: c.evidence.gain, default=None)
 
 
@@ -240,7 +242,7 @@ def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> 
         if c.channel in FORCE_CHANNELS
         and c.p_value < _UNSURE
         and c.q_value > Q_VALUE
-        and c.gain**2 > _LARGE * model.noise(c.channel)
+        and c.gain**2 > _LARGE * model.lasting(c.channel, LASTING[c.channel])
     ]
     plausible = [(c, selection.screening.plausible(model, c, rivals)) for c in large]
     plausible = [pair for pair in plausible if not pair[1].reason]
@@ -268,9 +270,9 @@ def revise(selection: Selection) -> Selection:
         amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
         gone = []
         for group in groups(candidate.effect, amplitudes):
-            samples = LASTING[candidate.channel] if candidate.made else 1
-            evidence = model.evidence_against(dict.fromkeys(group, 0.0), samples)
-            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not candidate.made):
+            over_grammar = candidate.made or candidate.names
+            evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
+            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not over_grammar):
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
