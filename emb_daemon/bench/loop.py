@@ -17,12 +17,16 @@ from emb_daemon.ahead import library
 from emb_daemon.bench import empty
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import connected_sockets
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
 
 #: The daemon's own; the car comes before it, as the senders on a bus do.
 _PRIORITY = 60
 _CAR_PRIORITY = 65
 _PATIENCE_S = 300.0
+#: Of the time by which the loop overslept, the share that the process may have worked and still count as held up: a helper
+#: thread that keeps the loop from waking works throughout.
+_IDLE = 0.1
 
 
 class _Child:
@@ -123,6 +127,11 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
         "answers": answers,
         "cyclictest": latency,
     }
+
+
+def held_up(late_ns: int, worked_ns: int) -> bool:
+    """Whether the machine kept asleep a loop that woke ``late_ns`` too late, by what its whole process worked meanwhile."""
+    return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
 
 
 def measure_start(cold: bool = False) -> dict:
