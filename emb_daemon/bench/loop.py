@@ -79,12 +79,12 @@ def _configured(corners: int) -> Iterator[list]:
         yield [config, Path(folder) / "state"]
 
 
-def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> dict:
+def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict:
     """Run the real daemon for the brakes of a simulated car, each in a process of its own, and beside them an empty loop and,
     where it is installed, cyclictest.
 
     More than four ``corners`` are several daemons of four in one process, each on its own bus. ``kernels`` is the library that
-    the daemon uses; empty: it uses numba; None: what it would use by itself.
+    the daemon uses; empty: it uses numba; None: what it would use by itself. ``share`` is where it tells its estimates.
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
@@ -102,6 +102,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
             served = _Child(
                 "served",
                 *arguments,
+                share or "",
                 *(ours.fileno() for ours, _ in pairs),
                 inherited=[a for a, _ in pairs],
                 environment=None if kernels is None else {library.VARIABLE: kernels},
@@ -139,7 +140,7 @@ def measure_start(cold: bool = False) -> dict:
     ours, theirs = connected_sockets()
     with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
-        served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
+        served = _Child("served", *arguments, "", ours.fileno(), inherited=[ours], environment=environment)
         try:
             served.stop()
         finally:

@@ -1,8 +1,9 @@
 """The daemon in a process of its own, on inherited sockets, set up as ``emb-daemon run`` sets it up, with a stopwatch.
 
-Run as ``python -m emb_daemon.bench.served CONFIG STATE FD...``. Prints a line when it is ready, with the CPU time that took,
-and, after SIGTERM, a JSON line with what its ticks cost. Several descriptors make as many daemons, one after the other in each
-tick of one loop: that is no service of this package, whose process has four corners at most, and says what more corners cost.
+Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD...``. Prints a line when it is ready, with the CPU time that
+took, and, after SIGTERM, a JSON line with what its ticks cost. SHARE is as in ``emb-daemon run --share``, empty for none.
+Several descriptors make as many daemons, one after the other in each tick of one loop: that is no service of this package,
+whose process has four corners at most, and says what more corners cost.
 """
 
 # Before anything is imported that has kernels.
@@ -153,12 +154,14 @@ def resident_KiB() -> int:
 def main() -> None:
     # As in emb-daemon run: cantools and python-can import it where it is installed, and with it pandas.
     sys.modules.setdefault("asammdf", None)
-    config, state, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]
+    config, state, share, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], sys.argv[4:]
     setup = Setup(config)
     set_up_logging(setup.configuration.log_level)
     buses = [RawCanSocket(socket.socket(fileno=int(descriptor)), stamped=True) for descriptor in descriptors]
     loop.Pacer = Pacer
     daemons = [loop.Daemon(setup, bus, state=state / str(number)) for number, bus in enumerate(buses)]
+    if share:
+        daemons[0].share(Path(share))
     for daemon in daemons:
         daemon.warm_up()
     if jit.compiled_for_the_next_start():
