@@ -41,6 +41,8 @@ _CORNER = "FL"
 _ABOUT, _KEPT, _TELLS = b"A", b"K", 33
 #: A parked car is asked and gives its training within this time, s.
 _PARKED_S = 60.0
+#: How much longer than in a car an evaluation may take.
+_BUSY = 25.0
 #: Time from the beginning of a write to the kill, s: a write takes a millisecond or two, and more where the disk is busy.
 _WRITING_S = 0.005
 
@@ -81,8 +83,8 @@ def live(memory: Memory, calibration: Calibration, pads_mm: float, threaded: boo
         if pipeline.estimates["adapt_result"][:count].any():
             break
         if threaded and adaptation.adapters[0]["phase"] == r.EVALUATING:
-            # The helper thread has as long as it has in a car.
-            time.sleep(CYCLE_S)
+            # On a busy machine the helper thread, which gives way to all others, has no less than it has in a car.
+            time.sleep(_BUSY * CYCLE_S)
     adaptation.close(pipeline.states, pipeline.parameters)
 
 
