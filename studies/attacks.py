@@ -20,6 +20,7 @@ import numpy as np
 
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.jit import njit
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
@@ -254,25 +255,34 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
 
 
 def _cost(seed: int) -> None:
-    """Median time of a tick of four corners, µs: on the CPU, whatever else runs."""
-    plants = np.array(
-        [plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed + k) for k in range(4)]
-    )
+    """Median time of a tick of four corners, µs: of what the daemon hears and of what it sends; on the CPU, whatever else
+    runs."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    plants = np.array([plant_from_calibration(calibration, seed + k) for k in range(4)])
     schedule = city_drive().first(20.0)
     drive = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]
-    received, _ = load_links()
-    macs = {link.name: cmac(link.name.encode().ljust(16)) for link in received}
-    signer, spent = Signer(received, macs, 1), {"sign": [], "verify": []}
-    verifier = Verifier(received, macs, {})
+    received, sent = load_links()
+    macs = {link.name: cmac(link.name.encode().ljust(16)[:16]) for link in (*received, *sent)}
+    car, verifier, signer = Signer(received, macs, 1), Verifier(received, macs, {}), Signer(sent, macs, 1)
+    pipeline = Pipeline(np.repeat(to_parameters(calibration), 4), CORNERS)
+    pipeline.begin(_START_NS)
+    spent, answers = {"verify": [], "sign": []}, 0
     for cycle in np.split(drive, np.flatnonzero(np.diff((drive["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
+        authentic = car.sign(cycle)
         began = thread_time_ns()
-        authentic = signer.sign(cycle)
-        signed_at = thread_time_ns()
-        verifier.verify(authentic)
-        spent["verify"].append(thread_time_ns() - signed_at)
-        spent["sign"].append(signed_at - began)
-    figures = ", ".join(f"{name} {1e-3 * np.median(times):.0f} µs" for name, times in spent.items())
-    print(f"\nA tick of four corners, {len(drive) / len(spent['sign']):.1f} frames and their authentication: {figures}")
+        heard = verifier.verify(authentic)
+        spent["verify"].append(thread_time_ns() - began)
+        answer = pipeline.broadcast(pipeline.consume(heard)[1])
+        began = thread_time_ns()
+        signer.sign(answer)
+        spent["sign"].append(thread_time_ns() - began)
+        answers += len(answer)
+    figures = [f"{name} {1e-3 * np.median(times):.0f} µs" for name, times in spent.items()]
+    ticks = len(spent["sign"])
+    print(
+        f"\nA tick of four corners: {figures[0]} of {len(drive) / ticks:.1f} frames and their authentication that are heard,"
+    )
+    print(f"{figures[1]} of {answers / ticks:.1f} that are sent")
 
 
 def main() -> None:

@@ -101,6 +101,12 @@ def test_a_name_of_somebody_else_that_leads_here_gets_nothing(web):
     assert _get(web.port, "/state.json", host="localhost").status == 200
 
 
+def test_it_is_served_on_one_address_alone(web):
+    """Who reaches the machine under another address, of the same network card even, reaches no page."""
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", web.port), timeout=5.0)
+
+
 def test_a_taken_port_is_told(web, capsys):
     assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--web", str(web.port)]) == 1
     assert capsys.readouterr().err == f"--web {web.port}: Address already in use\n"

@@ -490,6 +490,16 @@ class TestKeys:
         with pytest.raises(InputError, match=f"mode {mode:o}: others may read"):
             load_keys(self.written(tmp_path, self.GOOD, mode), {})
 
+    def test_what_somebody_else_wrote_is_refused(self, tmp_path, monkeypatch):
+        """He may write to it again whenever he likes."""
+        path = self.written(tmp_path, self.GOOD)
+        if os.geteuid() == 0:
+            os.chown(path, 4242, -1)
+        else:
+            monkeypatch.setattr(os, "geteuid", lambda: 4242)
+        with pytest.raises(InputError, match="belongs to somebody else"):
+            load_keys(path, {})
+
     def test_a_credential_shows_its_access_list_as_the_groups_right(self, tmp_path):
         path, environment = self.written(tmp_path, self.GOOD, 0o440), {"CREDENTIALS_DIRECTORY": str(tmp_path)}
         assert len(load_keys(path, environment)) == 2

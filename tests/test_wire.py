@@ -268,6 +268,18 @@ def test_a_counter_that_runs_ahead_of_time_is_refused(heard, counter):
     _refused(heard, _resolver(counter if counter != 4 else 5, 8 * MS), BAD_COUNTER)
 
 
+@pytest.mark.parametrize("stray", [None, *(counter for counter in range(15) if counter not in (5, 6, 7, 8))])
+def test_after_a_turn_of_silence_alone_the_counter_may_stand(stray):
+    """Somebody who was heard meanwhile, out of sequence, makes a frame with the last counter a repetition."""
+    receptions = new_reception()
+    for counter in range(6):
+        assert _receive(_resolver(counter, 4 * MS * counter), receptions)[1] == ACCEPTED
+    if stray is not None:
+        _refused(receptions, _resolver(stray, 24 * MS), BAD_COUNTER)
+    stands = _receive(_resolver(5, 80 * MS), receptions)[1]
+    assert stands == (ACCEPTED if stray in (None, 3, 4) else BAD_COUNTER)
+
+
 def test_a_restarted_sender_is_believed_at_its_second_frame(heard):
     for cycle in range(2, 10):
         assert _receive(_resolver(cycle % 15, 4 * MS * cycle), heard)[1] == ACCEPTED

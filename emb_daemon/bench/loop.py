@@ -17,12 +17,16 @@ from emb_daemon.ahead import library
 from emb_daemon.bench import empty
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import connected_sockets
+from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
 
 #: The daemon's own; the car comes before it, as the senders on a bus do.
 _PRIORITY = 60
 _CAR_PRIORITY = 65
 _PATIENCE_S = 300.0
+#: Of the time by which the loop overslept, the share that the process may have worked and still count as held up: a helper
+#: thread that keeps the loop from waking works throughout.
+_IDLE = 0.1
 
 
 class _Child:
@@ -75,12 +79,12 @@ def _configured(corners: int) -> Iterator[list]:
         yield [config, Path(folder) / "state"]
 
 
-def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> dict:
+def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict:
     """Run the real daemon for the brakes of a simulated car, each in a process of its own, and beside them an empty loop and,
     where it is installed, cyclictest.
 
     More than four ``corners`` are several daemons of four in one process, each on its own bus. ``kernels`` is the library that
-    the daemon uses; empty: it uses numba; None: what it would use by itself.
+    the daemon uses; empty: it uses numba; None: what it would use by itself. ``share`` is where it tells its estimates.
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
@@ -98,6 +102,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
             served = _Child(
                 "served",
                 *arguments,
+                share or "",
                 *(ours.fileno() for ours, _ in pairs),
                 inherited=[a for a, _ in pairs],
                 environment=None if kernels is None else {library.VARIABLE: kernels},
@@ -125,12 +130,17 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None) -> di
     }
 
 
+def held_up(late_ns: int, worked_ns: int) -> bool:
+    """Whether the machine kept asleep a loop that woke ``late_ns`` too late, by what its whole process worked meanwhile."""
+    return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
+
+
 def measure_start(cold: bool = False) -> dict:
     """``wall_s`` and ``cpu_s`` from start to ready by numba, with the kernels that are in the cache or ``cold`` with none."""
     ours, theirs = connected_sockets()
     with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
-        served = _Child("served", *arguments, ours.fileno(), inherited=[ours], environment=environment)
+        served = _Child("served", *arguments, "", ours.fileno(), inherited=[ours], environment=environment)
         try:
             served.stop()
         finally:

@@ -1,8 +1,9 @@
 """The daemon in a process of its own, on inherited sockets, set up as ``emb-daemon run`` sets it up, with a stopwatch.
 
-Run as ``python -m emb_daemon.bench.served CONFIG STATE FD...``. Prints a line when it is ready, with the CPU time that took,
-and, after SIGTERM, a JSON line with what its ticks cost. Several descriptors make as many daemons, one after the other in each
-tick of one loop: that is no service of this package, whose process has four corners at most, and says what more corners cost.
+Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD...``. Prints a line when it is ready, with the CPU time that
+took, and, after SIGTERM, a JSON line with what its ticks cost. SHARE is as in ``emb-daemon run --share``, empty for none.
+Several descriptors make as many daemons, one after the other in each tick of one loop: that is no service of this package,
+whose process has four corners at most, and says what more corners cost.
 """
 
 # Before anything is imported that has kernels.
@@ -24,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import jit
+from emb_daemon.bench.loop import held_up
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.runtime import daemon as loop
 from emb_daemon.runtime.journal import set_up_logging
@@ -40,18 +42,20 @@ _ROOM = 1_000_000
 
 
 class Pacer(loop.Pacer):
-    """Remembers which deadline the loop sleeps for; 0 while a sample is overdue."""
+    """Remembers which deadline the loop sleeps for, 0 while a sample is overdue, and the process's CPU time before."""
 
     deadline_ns = 0
+    worked_ns = 0
 
     def next_wake(self, now_ns: int) -> int:
         wake = super().next_wake(now_ns)
         self.deadline_ns = wake if wake > now_ns else 0
+        self.worked_ns = time.process_time_ns()
         return wake
 
 
 class Ledger:
-    """What ticks that answered a sample cost, in parts, and how late those that slept woke."""
+    """What ticks that answered a sample cost, in parts, how late those that slept woke, and whose fault a missed one is."""
 
     def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
         self._daemons = daemons
@@ -60,7 +64,9 @@ class Ledger:
         self._late = np.zeros(_ROOM, np.int32)
         self._used = self._woken = 0
         self._spent = [0] * len(_PARTS)
-        self._begun = self._stand()
+        self._missed = self._held_up = 0
+        self._settled_KiB = resident_KiB()
+        self._begun = self._ended = self._stand()
         for daemon, bus in zip(daemons, buses, strict=True):
             for column, (_, owner, name) in enumerate(_PARTS):
                 self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
@@ -82,6 +88,7 @@ class Ledger:
         setattr(holder, name, timed)
 
     def _tick(self, now_ns: int, pacer: Pacer) -> None:
+        self._attribute(now_ns, pacer)
         corners = self._daemons[0].pipeline.corners
         cycles = corners["cycle"].sum()
         begin = time.perf_counter_ns()
@@ -97,22 +104,32 @@ class Ledger:
         if corners["cycle"].sum() > cycles and self._used < _ROOM:
             self._rows[self._used] = [*self._spent, taken]
             self._used += 1
+            # The car that ends, at a priority above the daemon's, is no load that a daemon has.
+            self._ended = self._stand()
             if self._used == _SETTLED:
-                self._begun = self._stand()
+                self._begun, self._settled_KiB = self._ended, resident_KiB()
+
+    def _attribute(self, now_ns: int, pacer: Pacer) -> None:
+        """Count missed periods in which the machine is known not to have woken the loop: nothing of the process ran."""
+        missed, self._missed = self._daemons[0].missed - self._missed, self._daemons[0].missed
+        if missed and pacer.deadline_ns and held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
+            self._held_up += missed
 
     def _stand(self) -> tuple:
         daemon = self._daemons[0]
-        return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, resident_KiB()
+        return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, self._held_up
 
     def figures(self) -> dict:
-        """Since memory settled: share of a core, ticks and missed ones, memory at both ends; since the start: costs, us."""
-        (begin, used, ticks, missed, resident), end = self._begun, self._stand()
+        """From when memory settled to the last sample: share of a core, ticks, those missed, those of them that the machine
+        held up, memory at both ends; since the start: costs, us."""
+        (begin, used, ticks, missed, held), end = self._begun, self._ended
         *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
             "core_share": (end[1] - used) / (end[0] - begin),
             "ticks": end[2] - ticks,
             "missed": end[3] - missed,
-            "resident_KiB": [resident, end[4]],
+            "held_up": end[4] - held,
+            "resident_KiB": [self._settled_KiB, resident_KiB()],
             "tick": _quantiles(whole),
             "parts": {name: _quantiles(part) for (name, *_), part in zip(_PARTS, parts, strict=True)}
             | {"rest": _quantiles(whole - sum(parts))},
@@ -137,12 +154,14 @@ def resident_KiB() -> int:
 def main() -> None:
     # As in emb-daemon run: cantools and python-can import it where it is installed, and with it pandas.
     sys.modules.setdefault("asammdf", None)
-    config, state, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]
+    config, state, share, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], sys.argv[4:]
     setup = Setup(config)
     set_up_logging(setup.configuration.log_level)
     buses = [RawCanSocket(socket.socket(fileno=int(descriptor)), stamped=True) for descriptor in descriptors]
     loop.Pacer = Pacer
     daemons = [loop.Daemon(setup, bus, state=state / str(number)) for number, bus in enumerate(buses)]
+    if share:
+        daemons[0].share(Path(share))
     for daemon in daemons:
         daemon.warm_up()
     if jit.compiled_for_the_next_start():
