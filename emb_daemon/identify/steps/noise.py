@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import EPISODE
@@ -27,6 +28,7 @@ from emb_daemon.identify.steps.torque import (
 )
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import Log
 from emb_daemon.offline.levels import force_error_levels, integral_time
 from emb_daemon.offline.score import rmse
@@ -90,6 +92,15 @@ def identify(
         notes.append(
             "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
         )
+    rated = campaign.datasheet.actuator.rated_clamp_force_N
+    beyond = _extrapolation(stiffness, rated)
+    if beyond * rated > np.hypot(floor, levels["stiffness_relative"] * rated):
+        campaign.fault(
+            f"curves: no log clamps harder than {1e-3 * stiffness.reached_N:.3g} of {1e-3 * rated:.3g} kN, and a cubic that "
+            f"goes on leaves {100.0 * beyond:.2g} % of the largest force unsure; sigma holds that share of any force; "
+            "needed: a slow clamp to the largest force"
+        )
+    levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
     # The daemon is not told how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
     values = {f"noise.{name}": value for name, value in levels.items()}
@@ -103,6 +114,18 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s
     travel = max(curve.travel_rad for curve in stiffness.fit.curves)
     unseen = max(campaign.datasheet.actuator.max_motor_speed_rad_per_s - fastest_rad_per_s, 0.0)
     return USUAL_RELAXATION_S * unseen / travel
+
+
+def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
+    """Relative error, at the brake's largest force, of curves that were not measured as far as that."""
+    worst = 0.0
+    for curve in stiffness.fit.curves:
+        if rising_force(curve.coefficients) < rated_N:
+            return 1.0
+        travel = travel_at(rated_N, curve.coefficients)
+        if travel > curve.travel_rad:
+            worst = max(worst, float(curve.force_sigma(np.array([travel]))[0]) / rated_N)
+    return min(worst, 1.0)
 
 
 def speed_noise(logs: list[Log]) -> float | None:
