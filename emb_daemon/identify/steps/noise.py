@@ -36,6 +36,8 @@ from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 NOTHING: Mapping[str, float] = MappingProxyType({})
+#: Samples of a stretch of which noise is asked where there are any so long.
+_LONG = 50
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -223,7 +225,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         values = left.found.values
         rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
         torque = values[TORQUE_CONSTANT] * current
-        series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
+        series += np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1)
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < 0.1] ** 2))
@@ -232,6 +234,8 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
+    # Short stretches tell little, and are all there is of a friction that takes most of a log to turn over.
+    series = [s for s in series if len(s) > _LONG] or series
     sigma, time = _with_what_lasts(series, *current_noise(series, difference))
     return {
         "current_A": sigma,
