@@ -1,11 +1,12 @@
 """Brakes of other physics, identified from campaign and datasheet alone, and judged on a drive that fitted nothing.
 
-    python -m studies.strangers --seeds 0 1 2 3 [--kept DIR]
+    python -m studies.strangers --seeds 0 1 2 3 [--without random ...] [--kept DIR]
 
 Each seed draws a simulated brake: force from 10 to 45 kN, another screw, motor and friction, three effects of the catalogue
 at their usual sizes and one that no catalogue lists. A campaign is recorded as a rig does it (curves and random angles at
 three pad thicknesses, a training, heat, drives with stops) and given to `emb-daemon identify`. What comes out estimates
-another drive; printed are its errors, what the calibration says of itself, and what it named.
+another drive, or the campaign's own judge where the brake jams in that; printed are its errors, what the calibration says of
+itself, and what it named. With parts of the campaign, or single logs, left out it shows what a thin campaign is worth.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import io
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -156,8 +158,8 @@ def _heat(calibration: Calibration, rng: np.random.Generator) -> sc.Schedule:
     return schedule + sc.rest(60.0)
 
 
-def record(stranger: Stranger, seed: int, folder: Path) -> Path:
-    """Logs, datasheet and campaign in ``folder``; the campaign's path."""
+def record(stranger: Stranger, seed: int, folder: Path, without: Sequence[str] = ()) -> Path:
+    """Logs, datasheet and campaign in ``folder``, which lacks what it goes ``without``; the campaign's path."""
     rng, c = np.random.default_rng((seed, 1)), stranger.calibration
     for row, (name, (schedule, thickness)) in enumerate(stranger.logs.items()):
         write_frames(folder / f"{name}.log", sc.simulate_log(_plant(stranger, seed, thickness), schedule, seed=seed + row)[0])
@@ -183,8 +185,32 @@ def record(stranger: Stranger, seed: int, folder: Path) -> Path:
         "thermal": {"tune": "tune.log", "validate": "validate.log"},
         "integrated": [{"fit": "fit.log", "judge": "judge.log"}],
     }
-    (folder / "campaign.yaml").write_text(yaml.safe_dump(campaign, sort_keys=False))
+    (folder / "campaign.yaml").write_text(yaml.safe_dump(_thin(campaign, without), sort_keys=False))
     return folder / "campaign.yaml"
+
+
+def _thin(campaign: dict, without: Sequence[str]) -> dict:
+    """A campaign without some of its parts, and without entries of some of its logs, by the log's name.
+
+    Raises:
+        ValueError: it has none of a name.
+    """
+
+    def kept(entry):
+        return not any(f"{name}.log" in entry.values() for name in without)
+
+    entries = [entry for value in campaign.values() if isinstance(value, list) for entry in value]
+    known = [
+        *campaign,
+        *(value.removesuffix(".log") for entry in entries for value in entry.values() if isinstance(value, str)),
+    ]
+    if unknown := [name for name in without if name not in known]:
+        raise ValueError(f"--without: {', '.join(unknown)}: expected of {', '.join(known)}")
+
+    parts = {part: value for part, value in campaign.items() if part not in without}
+    return {
+        part: [entry for entry in value if kept(entry)] if isinstance(value, list) else value for part, value in parts.items()
+    }
 
 
 def judge(calibration: Calibration, path: Path) -> dict[str, float]:
@@ -206,12 +232,18 @@ def judge(calibration: Calibration, path: Path) -> dict[str, float]:
     }
 
 
-def run(stranger: Stranger, seed: int, folder: Path) -> str:
+def _opens(path: Path) -> bool:
+    """Whether the brake is released at the end of a drive: a drawn loss of the gear may grow until it holds itself."""
+    force = load_log(path).force_N
+    return float(np.nanmedian(force[-50:])) < 0.1 * float(np.nanmax(force))
+
+
+def run(stranger: Stranger, seed: int, folder: Path, without: Sequence[str] = ()) -> str:
     """One line: the brake, what it hides, what was named, and the errors."""
     hidden = {name: {key: round(value, 6) for key, value in values.items()} for name, values in stranger.effects.items()}
     head = f"seed {seed}: {stranger.calibration.stiffness.maximum_force_N:.0f} N, hides {hidden}"
     print(f"{head}\n  recording", file=sys.stderr, flush=True)
-    campaign = record(stranger, seed, folder)
+    campaign = record(stranger, seed, folder, without)
     print("  identifying", file=sys.stderr, flush=True)
     begin, said = time.monotonic(), io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -223,13 +255,20 @@ def run(stranger: Stranger, seed: int, folder: Path) -> str:
         return f"{head}\n  identify ended with {status}: {said.getvalue().strip().splitlines()[-1]}"
     calibration = load_calibration(folder / "c.yaml")
     found = ", ".join([*calibration.effects, *(f"{term.port} over {term.signal}" for term in calibration.terms)])
-    errors = "  ".join(f"{name} {value:.3g}" for name, value in judge(calibration, folder / "val.log").items())
-    return f"{head}\n  named: {found}\n  {errors}  says {calibration.provenance.achieved}  {seconds:.0f} s, status {status}"
+    drive = next((name for name in ("val", "judge") if _opens(folder / f"{name}.log")), None)
+    if drive is None:
+        return f"{head}\n  named: {found}\n  jams in every drive that judges"
+    errors = "  ".join(f"{name} {value:.3g}" for name, value in judge(calibration, folder / f"{drive}.log").items())
+    says = f"says {calibration.provenance.achieved}  {seconds:.0f} s, status {status}"
+    return f"{head}\n  named: {found}\n  on {drive}: {errors}  {says}"
 
 
 def main(draw=draw_stranger, text=__doc__) -> None:
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument(
+        "--without", nargs="+", default=(), metavar="NAME", help="part of the campaign (random, thermal), or log (curve_3.5)"
+    )
     parser.add_argument("--kept", type=Path, metavar="DIR", help="logs, calibrations and reports stay there")
     arguments = parser.parse_args()
     for seed in arguments.seeds:
@@ -238,7 +277,7 @@ def main(draw=draw_stranger, text=__doc__) -> None:
             if arguments.kept:
                 folder = arguments.kept / str(seed)
                 folder.mkdir(parents=True, exist_ok=True)
-            print(run(draw(seed), seed, folder), flush=True)
+            print(run(draw(seed), seed, folder, arguments.without), flush=True)
 
 
 if __name__ == "__main__":

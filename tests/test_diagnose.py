@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -830,3 +831,35 @@ def test_a_path_that_is_no_number_any_more_has_got_worse():
     assert "no number" in confirmation.harm(before, EpisodeErrors.of(lost, {}, episode), "fused")
     better = errors | {"torque": np.full(400, 1.0)}
     assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused")
+
+
+def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch):
+    """A log that is off by far outweighs the others: a little gained there would pay for anything lost elsewhere."""
+    episode = np.repeat(np.arange(4), 100)
+    trials = [SimpleNamespace(episode=episode, log=SimpleNamespace(path=Path(name))) for name in ("far.log", "near.log")]
+    bench = SimpleNamespace(trials=trials, calibration=None, residuals=lambda _: {})
+
+    def of(far_N, near_N):
+        return EpisodeErrors.joined([EpisodeErrors.of({"fused": np.full(400, size)}, {}, episode) for size in (far_N, near_N)])
+
+    @dataclasses.dataclass
+    class Chosen:
+        suspects: list[str]
+        reasons: dict[str, str]
+        model = SimpleNamespace(bench=bench)
+
+        def without(self, suspect, reason):
+            return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
+
+    def left_out(chosen, without=""):
+        there = {*chosen.suspects} - {without}
+        return of(1000.0 - 50.0 * len(there), 60.0 if "wrong" in there else 32.0)
+
+    monkeypatch.setattr(confirmation, "errors", lambda *_: of(1000.0, 30.0))
+    monkeypatch.setattr(confirmation, "whole", lambda _: "fused")
+    monkeypatch.setattr(confirmation, "_beyond_bounds", lambda _: [])
+    monkeypatch.setattr(confirmation, "_own_harm", lambda *_: None)
+    monkeypatch.setattr(confirmation, "left_out_errors", left_out)
+    found, after = confirmation.confirm(Chosen(["right", "wrong"], {}), None)
+    assert found.suspects == ["right"] and after.rmse("fused") < 1000.0
+    assert found.reasons == {"wrong": "the estimator's fused error on near.log goes from 30 to 60 N on left-out episodes"}

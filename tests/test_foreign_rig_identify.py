@@ -34,6 +34,16 @@ def _in_contact() -> np.ndarray:
     return motion[round(4.0 / foreignkit.FINE_S) : round(20.0 / foreignkit.FINE_S)]
 
 
+def _low() -> np.ndarray:
+    """Two clamps in five seconds to a ninth of the brake's force."""
+    return foreignkit.slow(5.4, 5.0)
+
+
+def _long() -> np.ndarray:
+    """So slow that the reversals show where friction turns over, and little else does."""
+    return foreignkit.slow(seconds=80.0)
+
+
 @pytest.mark.parametrize(
     ("motions", "said", "most_N", "status"),
     [
@@ -41,9 +51,11 @@ def _in_contact() -> np.ndarray:
         ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
         ({"curve": foreignkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0, 3),
         ({"curve": _clamp_only}, "random: no usable log", 500.0, 3),
+        ({"curve": _long}, "random: no usable log", 400.0, 3),
+        ({"curve": _low}, "curves: no log clamps harder than 2.15 of 20 kN", 400.0, 3),
         ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0, 3),
     ],
-    ids=["both", "random alone", "one slow curve", "apply alone", "no clearance"],
+    ids=["both", "random alone", "one slow curve", "apply alone", "long", "little force", "no clearance"],
 )
 def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N, status):
     campaign = foreignkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})

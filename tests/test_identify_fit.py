@@ -15,8 +15,8 @@ from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
 from emb_daemon.identify.steps import attribution, noise, stiffness
-from emb_daemon.identify.steps.thickness import left_out_errors
-from emb_daemon.identify.steps.torque import fit_torque
+from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque
 from emb_daemon.resources import resource
 
 
@@ -156,6 +156,15 @@ def test_what_stays_for_a_manoeuvre_is_in_the_noise_of_the_current():
     assert noise._with_what_lasts([plain[:100]], 0.3, 0.02) == (0.3, 0.02)
 
 
+def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
+    """Friction that turns over for most of a slow clamp leaves tens of samples at a time in which it is known."""
+    found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
+    rows = np.concatenate([np.arange(20) + 100 * piece for piece in range(100)])
+    current = np.random.default_rng(7).normal(0.0, 0.2, len(rows))
+    left = Unexplained(found, rows, current, np.ones(len(rows)), np.linspace(1e3, 2e3, len(rows)))
+    assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
+
+
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
     found = SimpleNamespace(fit=SimpleNamespace(curves=[SimpleNamespace(travel_rad=20.0)]))
     campaign = SimpleNamespace(datasheet=SimpleNamespace(actuator=SimpleNamespace(max_motor_speed_rad_per_s=200.0)))
@@ -197,3 +206,13 @@ def test_curves_whose_compliance_grows_straight_are_predicted_exactly():
     ]
     errors = left_out_errors(curves)
     assert errors.shape == (2,) and np.all(errors < 1e-9)
+
+
+def test_one_curve_is_as_unsure_of_other_pads_as_compliance_may_grow_with_them():
+    """Half as thick again is up to half as soft again: from nothing to that, as likely as not; its own pads it knows."""
+    curve = CurveFit(8.0, np.array([300.0, 40.0, 0.8]), np.eye(3), np.zeros(1), np.ones(1), 18.0)
+    only = ThicknessStep(curves=[curve], left_out=np.array([]))
+    assert only.interpolation_error(8.0) == 0.0
+    parts = np.linspace(0.0, 0.5, 1001)
+    assert only.interpolation_error(12.0) == pytest.approx(np.sqrt(np.mean(parts**2)), rel=1e-3)
+    assert only.interpolation_error(4.0) == pytest.approx(only.interpolation_error(12.0))

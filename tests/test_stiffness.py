@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_daemon.effects import REGISTRY
-from emb_daemon.models.stiffness import first_order_lag
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, travel_at
 from emb_daemon.offline import estimate
 
 _force = st.floats(-3e4, 3e4)
@@ -111,3 +111,13 @@ def test_an_effect_is_described(effect):
     for parameter in effect.parameters:
         assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
         assert parameter.unit and parameter.meaning
+
+
+def test_travel_is_found_on_either_side_of_a_curves_turn():
+    """Which doubled travels pass over: the curve turns over at 33.9 rad and is below zero at 64."""
+    turning = np.array([207.0, 38.0, -0.75])
+    travel = travel_at(20e3, turning)
+    assert characteristic_curve(travel, turning)[0] == pytest.approx(20e3)
+    top = travel_at(1e6, turning)
+    assert characteristic_curve(top, turning)[1] == pytest.approx(0.0, abs=1e-6) and top > travel
+    assert travel_at(1e6, np.array([1.0])) == np.inf

@@ -2,8 +2,9 @@
 
 Whatever was accepted has to lower what is left of its own path on episodes left out of the fit, the contact angle held: it
 learns from the other path, whose error would speak against a term that is true. What an engineer gets is the estimator with
-everything at work, so the error of the fused force must not rise. Where validation logs are given, they have a veto. What
-fails is taken out, one by one, and the rest refitted.
+everything at work, so the error of the fused force must not rise, nor clearly that of any log: where one log is off by far,
+a fit that gains a little there may ruin all others, and their mean would not show it. Where validation logs are given, they
+have a veto. What fails is taken out, one by one, and the rest refitted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,7 @@ from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection
+from emb_daemon.diagnose.unexplained import CLEARLY
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
@@ -23,6 +25,8 @@ _FOLDS = 4
 #: Rise of the fused error that is harm. Below it is what the contact angle's learning and the reference's noise do by chance,
 #: where an effect is real but the other path carries the fused force.
 _HARM = 1.05
+#: ... and of one log alone, whose few episodes scatter more: what a rest must rise by to count as unexplained.
+_LOG_HARM = CLEARLY
 #: Share of the samples with a force before that must have one after: a delay takes some at the edges.
 _KEPT = 0.99
 
@@ -43,10 +47,29 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
         elif (worse := harm(before, after, main)) and selection.suspects:
             rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
             selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
+        elif (ruined := _ruined(bench, before, after, main)) and selection.suspects:
+            own, told = ruined
+            rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in selection.suspects}
+            selection = selection.without(min(rest, key=rest.__getitem__), told)
         elif veto := judges and _veto(selection, judges):
             selection = selection.without(*veto)
         else:
             return selection, after
+
+
+def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[np.ndarray, str] | None:
+    """The log whose ``main`` error rose most, where that is clear: which episodes are its own, and what became of it."""
+    lengths = [int(trial.episode[-1]) + 1 for trial in bench.trials]
+    of = np.repeat(np.arange(len(lengths)), lengths)
+    own = [(of == index).astype(float) for index in range(len(lengths))]
+    pairs = [(before.rmse(main, weights=there), after.rmse(main, weights=there)) for there in own]
+    ratios = [last / first if first > 0.0 else 0.0 for first, last in pairs]
+    worst = int(np.nanargmax(ratios)) if np.isfinite(ratios).any() else 0
+    if not ratios[worst] > _LOG_HARM:
+        return None
+    first, last = pairs[worst]
+    name = bench.trials[worst].log.path.name
+    return own[worst], f"the estimator's {main} error on {name} goes from {first:.4g} to {last:.4g} N on left-out episodes"
 
 
 def _beyond_bounds(selection: Selection) -> list[str]:

@@ -14,7 +14,7 @@ _SURE = 2.5
 _LEAST_SHARE = 0.05
 #: Residual over what the calibration achieved on its own data from which something is left: its figures scatter by a quarter
 #: from log to log and pad to pad, units by less.
-_CLEARLY = 1.5
+CLEARLY = 1.5
 #: Heat without a brake torque sensor is as uncertain as pads' friction, which no table knows better from one day to the next.
 _FRICTION_SHARE = 0.08
 
@@ -92,7 +92,7 @@ class Left:
 
 def is_beyond(rms: float, known: float) -> bool:
     """Whether a residual is clearly above what the calibration achieved; not where it does not say."""
-    return rms > _CLEARLY * known
+    return rms > CLEARLY * known
 
 
 def sample_noise(residual: np.ndarray) -> float:

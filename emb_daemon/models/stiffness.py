@@ -37,16 +37,24 @@ def mean_slope(x, spread, coefficients):
 
 
 @njit
+def _short_of(x, force, coefficients):
+    """Whether a curve that rises from contact is still rising at ``x`` rad, towards ``force`` (N)."""
+    there, slope = characteristic_curve(x, coefficients)
+    return there < force and slope > 0.0
+
+
+@njit
 def travel_at(force, coefficients):
-    """Travel past contact (rad) at which a rising curve reaches ``force`` (N); infinite beyond 1000 rad."""
+    """Travel past contact (rad) at which a rising curve reaches ``force`` (N), or where it stops rising below; infinite beyond
+    1000 rad."""
     low, high = 0.0, 1.0
-    while characteristic_curve(high, coefficients)[0] < force:
+    while _short_of(high, force, coefficients):
         high *= 2.0
         if high > 1000.0:
             return np.inf
     for _ in range(50):
         middle = 0.5 * (low + high)
-        if characteristic_curve(middle, coefficients)[0] < force:
+        if _short_of(middle, force, coefficients):
             low = middle
         else:
             high = middle

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import EPISODE
@@ -27,6 +28,7 @@ from emb_daemon.identify.steps.torque import (
 )
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import Log
 from emb_daemon.offline.levels import force_error_levels, integral_time
 from emb_daemon.offline.score import rmse
@@ -36,6 +38,10 @@ from emb_daemon.wire.contract import CYCLE_S
 NOTHING: Mapping[str, float] = MappingProxyType({})
 #: One minus the squared friction state below which a gear slides.
 _SLID = 0.1
+#: Relative error of a curve beyond what was measured from which that is told: the usual relative noise of the path.
+_TOLD = 0.01
+#: Samples of a stretch of which noise is asked where there are any so long.
+_LONG = 50
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -92,6 +98,15 @@ def identify(
         notes.append(
             "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
         )
+    rated = campaign.datasheet.actuator.rated_clamp_force_N
+    beyond = _extrapolation(stiffness, rated)
+    if beyond > _TOLD:
+        campaign.fault(
+            f"curves: no log clamps harder than {1e-3 * stiffness.reached_N:.3g} of {1e-3 * rated:.3g} kN, and a cubic that "
+            f"goes on leaves {100.0 * beyond:.2g} % of the largest force unsure; sigma holds that share of any force; "
+            "needed: a slow clamp to the largest force"
+        )
+    levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
     # The daemon is not told how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
     values = {f"noise.{name}": value for name, value in levels.items()}
@@ -105,6 +120,18 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s
     travel = max(curve.travel_rad for curve in stiffness.fit.curves)
     unseen = max(campaign.datasheet.actuator.max_motor_speed_rad_per_s - fastest_rad_per_s, 0.0)
     return USUAL_RELAXATION_S * unseen / travel
+
+
+def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
+    """Relative error, at the brake's largest force, of curves that were not measured as far as that."""
+    worst = 0.0
+    for curve in stiffness.fit.curves:
+        if rising_force(curve.coefficients) < rated_N:
+            return 1.0
+        travel = travel_at(rated_N, curve.coefficients)
+        if travel > curve.travel_rad:
+            worst = max(worst, float(curve.force_sigma(np.array([travel]))[0]) / rated_N)
+    return min(worst, 1.0)
 
 
 def speed_noise(logs: list[Log]) -> float | None:
@@ -202,7 +229,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         values = left.found.values
         rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
         torque = values[TORQUE_CONSTANT] * current
-        series += [s for s in np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1) if len(s) > 50]
+        series += np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1)
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))
@@ -211,6 +238,8 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
+    # Short stretches tell little, and are all there is of a friction that takes most of a log to turn over.
+    series = [s for s in series if len(s) > _LONG] or series
     sigma, time = _with_what_lasts(series, *current_noise(series, difference))
     return {
         "current_A": sigma,

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
+from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects.base import Effect
@@ -30,6 +31,8 @@ from emb_daemon.report.page import Page, Section
 #: Relaxation of an ordinary brake, s, and as much its standard deviation where no log shows it: between pads whose force
 #: follows at once and those that need the time of a hard application.
 USUAL_RELAXATION_S = 0.03
+#: A curve that turns over below the brake's largest force is taken up to this share of where it does.
+_RISING = 0.999
 #: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
 _WORTH = 1.02
 #: Standard deviations by which an effect's amplitude must stand clear of zero.
@@ -69,6 +72,7 @@ class StiffnessStep(Step):
         candidates: structures that were compared.
         chosen: the one that was taken.
         separate: fits of each pair of pads alone, where it has random logs.
+        reached_N: largest force of the logs.
     """
 
     pads: list[Pads]
@@ -76,6 +80,7 @@ class StiffnessStep(Step):
     candidates: list[Candidate]
     chosen: Candidate
     separate: list[DynamicsFit]
+    reached_N: float
 
 
 def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
@@ -109,18 +114,21 @@ def _step(
     separate: list[DynamicsFit],
 ) -> StiffnessStep:
     reached = max(float(np.nanmax(log.force_N)) for own in pads for log in own.logs)
+    rises = min(rising_force(curve.coefficients) for curve in fit.curves)
     sigmas = {key: sigma for key, sigma in fit.sigmas.items() if key != DELAY} or {RELAXATION: USUAL_RELAXATION_S}
     for curve in fit.curves:
         keys = curve_keys(fit.calibration, curve.thickness_mm)
         sigmas |= dict(zip(keys, np.sqrt(np.diag(curve.covariance)).tolist(), strict=True))
     return StiffnessStep(
-        values=fit.values() | {"stiffness.maximum_force_N": max(reached, nominal.stiffness.maximum_force_N)},
+        values=fit.values()
+        | {"stiffness.maximum_force_N": min(max(reached, nominal.stiffness.maximum_force_N), _RISING * rises)},
         sigmas=sigmas,
         pads=pads,
         fit=fit,
         candidates=candidates,
         chosen=chosen,
         separate=separate,
+        reached_N=reached,
     )
 
 

@@ -13,6 +13,8 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import Panel, Style, Trace, shades, xy_figure
 from emb_daemon.report.page import Page
 
+#: Part of a brake's compliance that is its pads', RMS where any from none to all is as likely.
+_PADS_PART = 1.0 / np.sqrt(3.0)
 _NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
 
 
@@ -32,9 +34,12 @@ class ThicknessStep(Step):
         """Relative force error that interpolation adds at a thickness.
 
         A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which leaving out each inner
-        thickness shows.
+        thickness shows. A single curve is taken for any pads, and errs by as much as the pads' part of the compliance grows
+        with them.
         """
         thicknesses = np.array([curve.thickness_mm for curve in self.curves])
+        if len(thicknesses) == 1:
+            return _PADS_PART * abs(float(thickness_mm / thicknesses[0]) - 1.0)
         if len(thicknesses) < 3 or np.any(np.abs(thicknesses - thickness_mm) < 1e-6):
             return 0.0
         spans = (thicknesses[1:-1] - thicknesses[:-2]) * (thicknesses[2:] - thicknesses[1:-1])
@@ -65,6 +70,11 @@ def load_pads(campaign: Campaign) -> list[Pads]:
         _check_thickness(pads, campaign.pad_thickness_mm)
     except InputError as error:
         raise InputError("\n".join([*campaign.faults, f"{campaign.path}: {error}"])) from None
+    if len(pads) == 1 and pads[0].thickness_mm != campaign.pad_thickness_mm:
+        campaign.fault(
+            f"curves: pads of {campaign.pad_thickness_mm:g} mm are taken to be as stiff as the only ones measured, of "
+            f"{pads[0].thickness_mm:g} mm, and sigma holds what thickness may change; needed: a slow clamp with the former"
+        )
     if not any(own.random for own in pads):
         campaign.fault(
             "random: no usable log, so that relaxation keeps what is usual of brakes, and sigma holds what that may do in a "

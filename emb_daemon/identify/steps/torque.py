@@ -148,17 +148,15 @@ class _Regression:
         self.of_angle = (angle[r + 1] - angle[r] - angle[r - 1] + angle[r - 2]) / (2.0 * CYCLE_S**2)
 
     def matrices(self, presliding_angle: float):
-        """Regressors (n, 4), instruments (n, 4), rows where the friction state is known, by the estimator's own model, and
-        what not knowing it leaves in the other rows: regressors times the state's standard deviation."""
+        """Regressors (n, 4) and instruments (n, 4) by the estimator's own model, and rows where the friction state is known;
+        in others it is the state's mean, none where nothing is known."""
         parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.load, self.acceleration, s, s * self.load])
         instruments = regressors.copy()
         instruments[:, 1] = self.of_angle
-        known = paths["friction_variance"] < _KNOWN
-        spread = np.sqrt(paths["friction_variance"][~known, None]) * np.column_stack([np.ones(len(s)), self.load])[~known]
-        return regressors, instruments, known, spread
+        return regressors, instruments, paths["friction_variance"] < _KNOWN
 
 
 def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> TorqueFit:
@@ -172,22 +170,23 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
 
     def solve(presliding):
         matrices = [part.matrices(presliding) for part in parts]
-        left = precision[:4, :4] + sum(z[use].T @ x[use] for x, z, use, _ in matrices)
+        left = precision[:4, :4] + sum(z[use].T @ x[use] for x, z, use in matrices)
         right = precision[:4, :4] @ nominal
-        right += sum(z[use].T @ part.current[use] for part, (_, z, use, _) in zip(parts, matrices, strict=True))
+        right += sum(z[use].T @ part.current[use] for part, (_, z, use) in zip(parts, matrices, strict=True))
         solution = np.linalg.solve(left, right)
-        residuals = [p.current[use] - x[use] @ solution for p, (x, _, use, _) in zip(parts, matrices, strict=True)]
+        residuals = [part.current - x @ solution for part, (x, _, _) in zip(parts, matrices, strict=True)]
         return solution, matrices, residuals
 
     def cost(logarithm):
-        # A state that is unknown explains nothing: otherwise large angles would be rewarded for the rows that they leave out.
-        solution, matrices, residuals = solve(np.exp(logarithm))
-        left_over = np.concatenate([*residuals, *(spread @ solution[2:] for *_, spread in matrices)])
+        # Over all rows: a state that is unknown explains nothing, and large angles, which leave most of them unknown, would
+        # else be rewarded for the rows that they leave out.
+        left_over = np.concatenate(solve(np.exp(logarithm))[2])
         return float(left_over @ left_over + precision[4, 4] * (logarithm - np.log(_USUAL_PRESLIDING)) ** 2)
 
     # Below a resolver count the angle says nothing.
     presliding = float(np.exp(valley(cost, np.log(np.geomspace(1e-3, 1.0, 13)), xatol=1e-3)))
     solution, matrices, residuals = solve(presliding)
+    residuals = [residual[use] for residual, (_, _, use) in zip(residuals, matrices, strict=True)]
     covariance = _covariance(parts, matrices, residuals, solution, presliding, precision)
     physical, covariance = _physical(solution, presliding, covariance, sheet)
     physical, covariance = _with_priors(physical, covariance, sheet)
@@ -195,7 +194,7 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
     physical[4] = np.clip(physical[4], 0.5 * presliding, 2.0 * presliding)
     left_over = {
         str(part.log.path): (part.rows[use], residual)
-        for part, (_, _, use, _), residual in zip(parts, matrices, residuals, strict=True)
+        for part, (_, _, use), residual in zip(parts, matrices, residuals, strict=True)
     }
     return TorqueFit(dict(zip(KEYS, physical.tolist(), strict=True)), covariance, left_over)
 
@@ -216,7 +215,7 @@ def _wide_prior(sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
 def _covariance(parts, matrices, residuals, solution, presliding, precision) -> np.ndarray:
     """Of the four coefficients and the logarithm of the presliding angle, jackknife over seconds."""
     normals, scores = [], []
-    for part, (regressors, instruments, use, _), residual in zip(parts, matrices, residuals, strict=True):
+    for part, (regressors, instruments, use), residual in zip(parts, matrices, residuals, strict=True):
         moved = part.matrices(presliding * np.exp(_STEP))[0]
         sensitivity = (((moved - regressors) @ solution) / _STEP)[use, None]
         x, z = np.hstack([regressors[use], sensitivity]), np.hstack([instruments[use], sensitivity])
