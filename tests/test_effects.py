@@ -131,6 +131,8 @@ def _of_a_widening_caliper():
     samples["caliper"] += warmth
     samples["angle"] += wider
     samples["speed"] += np.gradient(wider, log.time_s)
+    # The current is that of a motor that did not turn so.
+    samples["has_current"] = False
     return dataclasses.replace(log, samples=samples)
 
 

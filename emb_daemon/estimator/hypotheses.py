@@ -314,7 +314,9 @@ def settle(s, p, released, dt):
     for kind in range(DRIFT if released else 0):
         a = s.alternatives[kind]
         margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
-        if a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
+        # What is expected needs as much evidence as what is not: else one jump that was none would bring the next.
+        evidence = a.log_odds - max(a.least, PRIOR_ODDS) > _PROVEN - PRIOR_ODDS
+        if evidence and a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
             copy_errors(s.error, s.covariance, a.error, a.covariance)
             s.force += a.shift
             s.drive += a.shift
