@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.bench.logs import difference
-from emb_daemon.bench.loop import held_up, measure_loop
+from emb_daemon.bench.loop import held_up, measure_loop, measure_start
 from emb_daemon.bench.report import text, verdict
 from emb_daemon.estimator.records import ESTIMATE
 
@@ -145,3 +145,8 @@ def test_the_daemon_is_measured_in_a_process_of_its_own():
     assert 0 <= result["held_up"] <= result["missed"]
     assert list(parts) == ["drain", "decode", "step", "encode", "send", "rest"]
     assert all(0.0 < part["p50_us"] < cost for part in parts.values())
+
+
+def test_a_start_is_measured_without_a_car():
+    ready = measure_start()
+    assert ready["cpu_s"] > 0.0 and 0.0 < ready["wall_s"] < 300.0

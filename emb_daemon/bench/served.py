@@ -122,7 +122,7 @@ class Ledger:
     def figures(self) -> dict:
         """From when memory settled to the last sample: share of a core, ticks, those missed, those of them that the machine
         held up, memory at both ends; since the start: costs, us."""
-        (begin, used, ticks, missed, held), end = self._begun, self._ended
+        (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._stand()
         *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
             "core_share": (end[1] - used) / (end[0] - begin),
