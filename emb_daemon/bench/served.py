@@ -15,6 +15,7 @@ if refusal := library.load():
 import gc
 import json
 import math
+import mmap
 import os
 import signal
 import socket
@@ -37,7 +38,7 @@ _PARTS = (("drain", "bus", "drain"), ("decode", "pipeline", "collect"), ("step",
           ("encode", "pipeline", "broadcast"), ("send", "bus", "send"))  # fmt: skip
 #: Ticks after which memory counts as settled: a second.
 _SETTLED = 250
-#: Ticks that are kept, enough for an hour; memory that no tick has written to costs nothing.
+#: Ticks that are kept, enough for an hour.
 _ROOM = 1_000_000
 
 
@@ -60,8 +61,8 @@ class Ledger:
     def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
         self._daemons = daemons
         self._ticks = [daemon.tick for daemon in daemons]
-        self._rows = np.zeros((_ROOM, len(_PARTS) + 1), np.int32)
-        self._late = np.zeros(_ROOM, np.int32)
+        self._rows = _shared(_ROOM, len(_PARTS) + 1)
+        self._late = _shared(_ROOM)
         self._used = self._woken = 0
         self._spent = [0] * len(_PARTS)
         self._missed = self._held_up = 0
@@ -143,12 +144,16 @@ def _quantiles(us: np.ndarray) -> dict[str, float]:
     return {"p50_us": float(np.median(us)), "p99_us": float(np.percentile(us, 99))}
 
 
+def _shared(*shape: int) -> np.ndarray:
+    """Zeros in shared memory, ns: it counts as none of the daemon's, and what nothing was written to costs nothing."""
+    return np.frombuffer(mmap.mmap(-1, 8 * math.prod(shape)), np.int64).reshape(shape)
+
+
 def resident_KiB() -> int:
-    """Of this process."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1])
-    return 0
+    """Of this process, without the memory that it shares."""
+    held = ("RssAnon:", "RssFile:")
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith(held))
 
 
 def main() -> None:
