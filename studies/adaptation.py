@@ -1,19 +1,15 @@
-"""What can be said of contact and adaptation only by many repetitions: false alarms, wear over a life, kills while writing.
+"""What can be said of contact and adaptation only by many repetitions: false alarms and wear over a life.
 
     python -m studies.adaptation alarms
     python -m studies.adaptation wear --output DIR
-    python -m studies.adaptation kills
 
 Everything here is simulated.
 """
 
 import argparse
 import json
-import os
-import signal
 import sys
 import tempfile
-import time
 from math import exp, sqrt
 from pathlib import Path
 
@@ -143,59 +139,15 @@ def specimen(number: int) -> Store:
     return Store(format=2, corner="FL", actuator="specimen", calibration=str(number), current=entry, history=(entry,) * 50)
 
 
-def _write_for_ever(memory: Memory, number: int, begun: int) -> None:
-    memory.save(specimen(number))
-    os.write(begun, b".")
-    while True:
-        number += 1
-        memory.save(specimen(number))
-
-
-def kills(count: int = 500, seed: int = 1) -> dict:
-    """Kill a process that writes without pause, ``count`` times at random moments from its second file on, and read what it
-    left."""
-    rng = np.random.default_rng(seed)
-    whole = changed = 0
-    newest = 1
-    waiting, begun = os.pipe()
-    with tempfile.TemporaryDirectory() as folder:
-        memory = Memory(Path(folder))
-        memory.save(specimen(newest))
-        for _ in range(count):
-            writer = os.fork()
-            if writer == 0:
-                try:
-                    _write_for_ever(memory, newest + 1, begun)
-                finally:
-                    os._exit(1)
-            os.read(waiting, 1)
-            time.sleep(rng.uniform(0.0, 0.02))
-            os.kill(writer, signal.SIGKILL)
-            os.waitpid(writer, 0)
-            try:
-                store = memory.read("FL")
-            except ValueError:
-                continue
-            found = int(store.calibration)
-            whole += store == specimen(found)
-            changed += found != newest
-            newest = found
-    for end in (waiting, begun):
-        os.close(end)
-    return {"kills": count, "whole": whole, "newer_set_found": changed}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("alarms", "wear", "kills"))
-    parser.add_argument("--count", type=int, help="releases, trainings or kills")
+    parser.add_argument("what", choices=("alarms", "wear"))
+    parser.add_argument("--count", type=int, help="releases or trainings")
     parser.add_argument("--output", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
     arguments = parser.parse_args()
     calibration = load_calibration(resource("config/calibration.yaml"))
     if arguments.what == "alarms":
         result = false_alarms(calibration, arguments.count or 100_000)
-    elif arguments.what == "kills":
-        result = kills(arguments.count or 500)
     else:
         result = wear(msgspec.structs.replace(calibration, pad_thickness_mm=10.0), trainings=arguments.count or 20)
         plot_wear(result, arguments.output / "wear.svg")

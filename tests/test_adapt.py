@@ -34,7 +34,7 @@ from emb_daemon.replay import Replay
 from emb_daemon.wire import contract
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, INVALID
 from emb_daemon.wire.layout import load_database
-from studies.adaptation import kills, specimen, wear
+from studies.adaptation import specimen, wear
 
 RIG_CONTACT = 7.497
 
@@ -769,13 +769,6 @@ def test_history_is_bounded_and_a_rejection_changes_nothing_in_use():
     assert store.current == specimen(1).current
     assert len(store.history) == 50
     assert decode(encode(store), Store, FORMAT) == store
-
-
-def test_a_kill_leaves_a_whole_set():
-    """`python -m studies.adaptation kills` kills 500 times."""
-    result = kills(40)
-    assert result["whole"] == result["kills"] == 40
-    assert result["newer_set_found"] > 5
 
 
 def test_where_the_state_is_kept(tmp_path):

@@ -171,12 +171,13 @@ class Adaptation:
 
     def _attend(self, corner: int, adapter: np.void, state: np.void, parameters: np.void) -> None:
         """Have done what the tick asks for."""
-        if adapter["snapshot_wanted"]:
-            adapter["snapshot_wanted"] = False
-            self._keep_snapshot(corner, state, parameters)
         if adapter["ended"]:
             adapter["ended"] = False
             self._keep(corner, adapter)
+        # After what was learned, to which it belongs.
+        if adapter["snapshot_wanted"]:
+            adapter["snapshot_wanted"] = False
+            self._keep_snapshot(corner, state, parameters)
         if adapter["evaluation_wanted"]:
             adapter["evaluation_wanted"] = False
             rows = self.rows[corner, : int(adapter["training_rows"])]

@@ -135,7 +135,7 @@ class Memory:
 
     def _sweep(self) -> None:
         """Remove what writers left that were killed long ago."""
-        for path in self.folder.glob(".*-*.json.*"):
+        for path in self.folder.glob(".*.json.*"):
             with contextlib.suppress(OSError):
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
                     path.unlink()

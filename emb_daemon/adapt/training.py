@@ -209,6 +209,8 @@ def _conclude(a, s, parameters, learned, scratch, rows):
     elif a.evaluation == r.ACCEPTED:
         apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
         parameters[0] = learned
+        # Those made before belong to the values that were in use until now.
+        a.snapshot_ns, a.snapshot_wanted = a.time_ns, True
         end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
         end_training(a, a.evaluation, e.RESULT_REJECTED)
