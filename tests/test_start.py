@@ -113,6 +113,24 @@ def test_while_somebody_may_brake_standing_still_is_no_release(p, name, value):
     assert np.all(_unknown(estimate(rows, p)))
 
 
+def test_a_way_back_to_where_it_started_clamped_is_no_clearance(p):
+    """Started lightly clamped, opened for a moment between two stops and closed again: that nothing opposes it up to where it
+    started says nothing of the way from there. Silently 9 kN wrong on a drawn drive otherwise."""
+    up = brake.clamp(p, 3.0, 1.0)
+    open_rad, top = p["clearance"] - 5.0, p["clearance"] + 15.0
+    ways = [(up[-1], 350), (open_rad, 100), (up[-1], 200), (top, 40), (top, 100)]
+    path = [up]
+    for target, count in ways:
+        path.append(np.linspace(path[-1][-1], target, count + 1)[1:])
+    rows, force = brake.samples(p, np.concatenate(path))
+    first = len(up) + 100
+    rows, force = rows[first:].copy(), force[first:]
+    rows["dt"][0] = 0.0
+    rows["brake_request"] = 2000.0
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)) and _covered(estimates, force)
+
+
 def test_a_motor_that_moves_or_holds_is_not_released(p):
     """Slow opening without a stop, and a hold under torque with everything released in the status."""
     rows, _, _ = _latched_then(p)

@@ -176,14 +176,15 @@ def seek_release(s, p, m):
 def _passed_clearance(s, p, m):
     """Whether the motor has closed from where it started, or from where it has stood lower since, by a good part of the
     clearance and no force opposed it: then it was released there, whatever was asked of it."""
-    if s.friction_mean > _SLIDING and np.isfinite(s.balance):
-        s.passed += 1.0
-        s.opposing += (s.balance - s.opposing) / s.passed
-    elif m.angle <= s.start_angle:
+    if m.angle <= s.start_angle:
+        # What opposes it on a way back to there says nothing of the way from there.
         s.passed = s.opposing = 0.0
         if s.stood_s > _OFF_S:
             # Where it only turned round, half open, nobody had released it.
             s.start_angle = m.angle
+    elif s.friction_mean > _SLIDING and np.isfinite(s.balance):
+        s.passed += 1.0
+        s.opposing += (s.balance - s.opposing) / s.passed
     passed, _ = through_gear(p.gear, m.angle - s.start_angle)
     closed = s.clearance > 0.0 and passed > _PASSED * s.clearance
     sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
