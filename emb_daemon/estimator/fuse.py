@@ -5,6 +5,7 @@ from math import exp, hypot, sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
+from emb_daemon.estimator import uneven
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
@@ -19,6 +20,7 @@ from emb_daemon.estimator.hypotheses import (
     place,
     settle,
     stay_finite,
+    suspected,
     to_force,
     to_torque,
     unproven,
@@ -47,6 +49,7 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
     torque_offset,
 )
+from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
@@ -181,7 +184,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
     fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
-    unexplained = torque - leverage * mean_force
+    periodic = leverage * uneven.applied(s.uneven)
+    unexplained = torque - leverage * mean_force - periodic
     first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
     slow = max(variance - white - fast, 0.0)
     out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
@@ -198,6 +202,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
+    if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
+        uneven.learn(s.uneven, leverage, first + periodic, variance)
     return sqrt(moving + slow)
 
 
@@ -210,6 +216,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p)
     _predict(s, p, m, spread, warmth, known)
+    uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
@@ -241,6 +248,9 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         # Nothing has jumped: until it was found out, a frozen current spoke for every jump.
         open_again(s, p)
     out.force, out.sigma = mix(s, h, spread, warmth)
+    if not known:
+        out.force += uneven.applied(s.uneven)
+        out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0

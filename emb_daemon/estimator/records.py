@@ -6,6 +6,7 @@ from emb_daemon.effects import REGISTRY, parameter_record, state_record
 from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
 from emb_daemon.models.contact import CONTACT
@@ -125,6 +126,7 @@ STATE = np.dtype(
         ("winding", "f8"),
         ("housing", "f8"),
         ("consistency", CONSISTENCY),
+        ("uneven", UNEVEN),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("monitor", MONITOR),
         ("wheel", WHEEL),

@@ -1,0 +1,157 @@
+"""A disc whose thickness varies over its turn in a way that the calibration does not know.
+
+Its period is the wheel's, so it needs no stop to be told from all else: cosine and sine of the first orders of the wheel angle
+are a Kalman filter of their own over what the hypotheses leave of the torque (a lock-in that knows its noise). The ratio of the
+likelihoods with and without says whether there is such a disc (`estimator.hypotheses`); the fused force follows it by that
+probability, and what that leaves open counts in its standard deviation.
+
+Only while the motor turns: a motor that stands is held by its friction, whatever the disc does to the force.
+"""
+
+from math import cos, exp, log, pi, sin, sqrt
+
+import numpy as np
+
+from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import first_order_lag
+from emb_daemon.models.wheel import WHEEL, track
+from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
+
+#: Orders that discs commonly have, and cosine and sine of each.
+ORDERS = 2
+STATES = 2 * ORDERS
+#: Standard deviation of cosine and sine of order 1, m: 10 to 20 um from crest to trough before drivers complain (Jacobsson,
+#: Aspects of disc brake judder, Proc. IMechE D 217, 2003); amplitudes of a smooth disc fall with the square of the order.
+_AMPLITUDE_M = 7e-6
+#: Wear makes another disc of it within hours of braking, s.
+_WORN_S = 3600.0
+#: Log odds of a disc that its calibration does not know, and below which they do not fall.
+_PRIOR_ODDS, _LEAST_ODDS = -3.0, -8.0
+#: Log odds that are as good as certainty.
+_CERTAIN_ODDS = 20.0
+#: Standard deviations of the innovation beyond which a sample teaches nothing.
+_GATE = 5.0
+#: Share by which a wheel speed may be off where the counter does not correct it; angle, rad, that may be missing of the way
+#: until the phase is lost: half of what the counter counts before it begins anew.
+_SPEED_ERROR, _LOST_RAD = 0.01, pi * PULSE_MODULO / PULSES_PER_TURN
+
+#: ``wheel`` angle and the angle (rad) ``unseen`` since the counter was last heard; ``amplitude`` (m) of cosines and sines and
+#: their ``covariance``; ``drive`` and ``force`` N/m: static force and force (with its lag) per amplitude; ``gain`` scratch;
+#: ``log_odds`` of such a disc and its ``share``; ``shift`` N: what it adds to the force.
+UNEVEN = np.dtype(
+    [
+        ("known", "?"),
+        ("wheel", WHEEL),
+        ("unseen", "f8"),
+        ("amplitude", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        ("drive", "f8", (STATES,)),
+        ("force", "f8", (STATES,)),
+        ("gain", "f8", (STATES,)),
+        ("log_odds", "f8"),
+        ("share", "f8"),
+        ("shift", "f8"),
+    ],
+    align=True,
+)
+
+
+@njit
+def _variance(i):
+    order = i // 2 + 1
+    sigma = _AMPLITUDE_M / (order * order)
+    return sigma * sigma
+
+
+@njit
+def _begin(u):
+    """Nothing is known of the phase; what is known of the odds stays."""
+    u.known = True
+    u.unseen = 0.0
+    for i in range(STATES):
+        # What it was found to be is possible again, at another phase.
+        size = u.amplitude[i - i % 2] ** 2 + u.amplitude[i - i % 2 + 1] ** 2
+        u.gain[i] = _variance(i) + 0.5 * size
+    for i in range(STATES):
+        u.amplitude[i] = 0.0
+        for j in range(STATES):
+            u.covariance[i, j] = 0.0
+        u.covariance[i, i] = u.gain[i]
+
+
+@njit
+def _wheel_angle(u, m):
+    """Angle of the wheel (rad); begins anew where its phase was lost."""
+    speed = m.wheel_speed if m.has_wheel_speed else 0.0
+    if m.has_wheel_pulse:
+        if u.unseen * _SPEED_ERROR > 1.0:
+            _begin(u)
+        u.unseen = 0.0
+        return track(u.wheel, m.wheel_pulse, speed, m.dt)
+    u.wheel.turned += speed * m.dt
+    u.unseen += speed * m.dt if m.has_wheel_speed else _LOST_RAD
+    return u.wheel.turned
+
+
+@njit
+def turn(u, m, slope, gear_gain, relaxation_time):
+    """Advance by one sample: what each amplitude does to the force. ``slope`` N/rad of the static force."""
+    if not u.known:
+        u.log_odds = _PRIOR_ODDS
+        u.share = 1.0 / (1.0 + exp(-u.log_odds))
+        _begin(u)
+    angle = _wheel_angle(u, m)
+    u.shift = 0.0
+    for k in range(ORDERS):
+        for part in range(2):
+            i = 2 * k + part
+            shape = cos((k + 1) * angle) if part == 0 else sin((k + 1) * angle)
+            drive = slope / gear_gain * shape
+            u.force[i] = first_order_lag(u.force[i], u.drive[i], drive, m.dt, relaxation_time)
+            u.drive[i] = drive
+            u.shift += u.force[i] * u.amplitude[i]
+            u.covariance[i, i] += _variance(i) * m.dt / _WORN_S
+
+
+@njit
+def applied(u):
+    """What the fused force follows of it, N."""
+    return u.share * u.shift
+
+
+@njit
+def learn(u, leverage, without, variance):
+    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance."""
+    added = 0.0
+    for i in range(STATES):
+        total = 0.0
+        for j in range(STATES):
+            total += u.covariance[i, j] * u.force[j]
+        u.gain[i] = leverage * total
+        added += leverage * u.force[i] * u.gain[i]
+    innovation, s = without - leverage * u.shift, variance + added
+    if innovation * innovation > _GATE * _GATE * s:
+        return
+    u.log_odds += 0.5 * (without * without / variance - innovation * innovation / s + log(variance / s))
+    u.log_odds = min(max(u.log_odds, _LEAST_ODDS), _CERTAIN_ODDS)
+    u.share = 1.0 / (1.0 + exp(-u.log_odds))
+    for i in range(STATES):
+        u.amplitude[i] += u.gain[i] / s * innovation
+        for j in range(STATES):
+            u.covariance[i, j] -= u.gain[i] * u.gain[j] / s
+
+
+@njit
+def force_sigma(u):
+    """Standard deviation (N) that it leaves in the fused force."""
+    variance = (1.0 - u.share) * u.shift * u.shift
+    for i in range(STATES):
+        for j in range(STATES):
+            variance += u.force[i] * u.covariance[i, j] * u.force[j]
+    return sqrt(max(u.share * variance, 0.0))
+
+
+@njit
+def unproven(u):
+    """How far the force with and without such a disc are apart, N, times the probability of the less likely."""
+    return min(u.share, 1.0 - u.share) * abs(u.shift)
