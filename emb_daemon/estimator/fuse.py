@@ -119,11 +119,14 @@ def needed_torque(s, p, m, mean_force, leverage):
 
 
 @njit
-def _spread(s, p):
+def _spread(s, p, m):
     """Standard deviation (N) of what is fast in the stiffness path's error."""
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
     relative = hypot(relative, s.effects.terms.sigma)
     relative = hypot(relative, s.slope * effects.thickness_sigma(s.effects) / p.gear_gain)
+    if s.late > 0.0 and m.dt > 0.0:
+        # A late angle is undone to first order: the second is what the motor gained in speed meanwhile.
+        relative = hypot(relative, 0.5 * s.late * s.late * s.slope * s.gear_slope * (m.speed - s.speed) / m.dt)
     return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
 
 
@@ -203,7 +206,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
-        uneven.learn(s.uneven, leverage, first + periodic, variance)
+        uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     return sqrt(moving + slow)
 
 
@@ -214,7 +217,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
     torque."""
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
-    known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p)
+    known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
     uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     to_force(h, spread, s.slope, s.force, warmth)

@@ -12,6 +12,7 @@ from emb_daemon.jit import fields
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.gear import GEAR
+from emb_daemon.models.lateness import LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
 
@@ -105,6 +106,9 @@ STATE = np.dtype(
         *fields("f8", "friction_state slid_angle friction_mean friction_variance torque_age balance leverage"),
         ("contact", CONTACT),
         ("plausibility", PLAUSIBILITY),
+        # Age of the angle beside the speed, and beyond what the calibration knows, s.
+        ("lateness", LATENESS),
+        ("late", "f8"),
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),

@@ -8,7 +8,7 @@ probability, and what that leaves open counts in its standard deviation.
 Only while the motor turns: a motor that stands is held by its friction, whatever the disc does to the force.
 """
 
-from math import cos, exp, log, pi, sin, sqrt
+from math import cos, exp, pi, sin, sqrt
 
 import numpy as np
 
@@ -26,7 +26,9 @@ _AMPLITUDE_M = 7e-6
 #: Wear makes another disc of it within hours of braking, s.
 _WORN_S = 3600.0
 #: Log odds of a disc that its calibration does not know, and below which they do not fall.
-_PRIOR_ODDS, _LEAST_ODDS = -3.0, -8.0
+_PRIOR_ODDS, _LEAST_ODDS = -3.0, -6.0
+#: Motion, s, after which it is another: what one stroke leaves unexplained is a shape, and any shape is a part of a period.
+_STROKE_S = 1.0
 #: Log odds that are as good as certainty.
 _CERTAIN_ODDS = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing.
@@ -37,7 +39,8 @@ _SPEED_ERROR, _LOST_RAD = 0.01, pi * PULSE_MODULO / PULSES_PER_TURN
 
 #: ``wheel`` angle and the angle (rad) ``unseen`` since the counter was last heard; ``amplitude`` (m) of cosines and sines and
 #: their ``covariance``; ``drive`` and ``force`` N/m: static force and force (with its lag) per amplitude; ``gain`` scratch;
-#: ``log_odds`` of such a disc and its ``share``; ``shift`` N: what it adds to the force.
+#: ``log_odds`` of such a disc and its ``share``; ``shift`` N: what it adds to the force. ``earlier``: amplitude (m) by the strokes
+#: before this one, ``stroke_s`` s of which were looked at.
 UNEVEN = np.dtype(
     [
         ("known", "?"),
@@ -48,6 +51,8 @@ UNEVEN = np.dtype(
         ("drive", "f8", (STATES,)),
         ("force", "f8", (STATES,)),
         ("gain", "f8", (STATES,)),
+        ("earlier", "f8", (STATES,)),
+        ("stroke_s", "f8"),
         ("log_odds", "f8"),
         ("share", "f8"),
         ("shift", "f8"),
@@ -73,7 +78,7 @@ def _begin(u):
         size = u.amplitude[i - i % 2] ** 2 + u.amplitude[i - i % 2 + 1] ** 2
         u.gain[i] = _variance(i) + 0.5 * size
     for i in range(STATES):
-        u.amplitude[i] = 0.0
+        u.amplitude[i] = u.earlier[i] = 0.0
         for j in range(STATES):
             u.covariance[i, j] = 0.0
         u.covariance[i, i] = u.gain[i]
@@ -101,6 +106,8 @@ def turn(u, m, slope, gear_gain, relaxation_time):
         u.share = 1.0 / (1.0 + exp(-u.log_odds))
         _begin(u)
     angle = _wheel_angle(u, m)
+    if slope == 0.0 and u.stroke_s > 0.0:
+        _end_stroke(u)
     u.shift = 0.0
     for k in range(ORDERS):
         for part in range(2):
@@ -120,8 +127,32 @@ def applied(u):
 
 
 @njit
-def learn(u, leverage, without, variance):
-    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance."""
+def _end_stroke(u):
+    """What this stroke taught may be held against the next."""
+    u.stroke_s = 0.0
+    for i in range(STATES):
+        u.earlier[i] = u.amplitude[i]
+
+
+@njit
+def _weigh(u, leverage, without, variance):
+    """Odds after a torque: what earlier strokes foretold of it against nothing. Under noise a wrong foretelling loses."""
+    foretold = 0.0
+    for i in range(STATES):
+        foretold += leverage * u.force[i] * u.earlier[i]
+    edge = _GATE * _GATE * variance
+    better = min(without * without, edge) - min((without - foretold) ** 2, edge)
+    u.log_odds = min(max(u.log_odds + 0.5 * better / variance, _LEAST_ODDS), _CERTAIN_ODDS)
+    u.share = 1.0 / (1.0 + exp(-u.log_odds))
+
+
+@njit
+def learn(u, leverage, without, variance, dt):
+    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt`` s
+    of motion."""
+    u.stroke_s += dt
+    if u.stroke_s > _STROKE_S:
+        _end_stroke(u)
     added = 0.0
     for i in range(STATES):
         total = 0.0
@@ -132,9 +163,7 @@ def learn(u, leverage, without, variance):
     innovation, s = without - leverage * u.shift, variance + added
     if innovation * innovation > _GATE * _GATE * s:
         return
-    u.log_odds += 0.5 * (without * without / variance - innovation * innovation / s + log(variance / s))
-    u.log_odds = min(max(u.log_odds, _LEAST_ODDS), _CERTAIN_ODDS)
-    u.share = 1.0 / (1.0 + exp(-u.log_odds))
+    _weigh(u, leverage, without, variance)
     for i in range(STATES):
         u.amplitude[i] += u.gain[i] / s * innovation
         for j in range(STATES):
