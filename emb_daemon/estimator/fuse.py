@@ -28,10 +28,12 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
 from emb_daemon.estimator.status import (
+    ANGLE_LATE,
     CONTACT_LOST,
     CONTACT_SOUGHT,
     CONTACT_UNKNOWN,
     CURRENT_IMPLAUSIBLE,
+    DISC_UNEVEN,
     JUMP_SUSPECTED,
     MODEL_ERROR,
     NO_SOURCE,
@@ -91,6 +93,8 @@ _LATE = 0.3
 _LONG_LIKELY = 62.5
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
 _TELLING = 0.1
+#: Cycles by which an angle is late from where it is told, as of one whose frame is late.
+_TOLD_CYCLES = 2.0
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
@@ -329,6 +333,10 @@ def _facts_of_torque(s, p):
         facts |= JUMP_SUSPECTED
     if abs(s.error[OFFSET]) > 2.0 * torque_offset(p):
         facts |= OFFSET_LARGE
+    if uneven.unproven(s.uneven) > _NOTED * p.maximum_force:
+        facts |= DISC_UNEVEN
+    if s.late > _TOLD_CYCLES * CYCLE_S:
+        facts |= ANGLE_LATE
     return facts
 
 

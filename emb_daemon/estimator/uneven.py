@@ -1,21 +1,21 @@
 """A disc whose thickness varies over its turn in a way that the calibration does not know.
 
-Its period is the wheel's, so it needs no stop to be told from all else: cosine and sine of the first orders of the wheel angle
-are a Kalman filter of their own over what the hypotheses leave of the torque (a lock-in that knows its noise). The ratio of the
-likelihoods with and without says whether there is such a disc (`estimator.hypotheses`); the fused force follows it by that
-probability, and what that leaves open counts in its standard deviation.
+Its period is the wheel's: cosine and sine of the first orders of the wheel angle are a Kalman filter of their own over what
+the first hypothesis (`estimator.hypotheses`) leaves of the torque, a lock-in that knows its noise. How much better each stroke
+is foretold by what earlier ones taught than by an even disc says whether there is such a disc; the fused force follows it by
+that probability, and what that leaves open counts in its standard deviation.
 
 Only while the motor turns: a motor that stands is held by its friction, whatever the disc does to the force.
 """
 
-from math import cos, exp, pi, sin, sqrt
+from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
+from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.stiffness import first_order_lag
 from emb_daemon.models.wheel import WHEEL, track
-from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
 #: Orders that discs commonly have, and cosine and sine of each.
 ORDERS = 2
@@ -26,24 +26,26 @@ _AMPLITUDE_M = 7e-6
 #: Wear makes another disc of it within hours of braking, s.
 _WORN_S = 3600.0
 #: Log odds of a disc that its calibration does not know, and below which they do not fall.
-_PRIOR_ODDS, _LEAST_ODDS = -3.0, -6.0
+_PRIOR_ODDS, _LEAST_ODDS = -4.0, -6.0
 #: Motion, s, after which it is another: what one stroke leaves unexplained is a shape, and any shape is a part of a period.
 _STROKE_S = 1.0
 #: Log odds that are as good as certainty.
 _CERTAIN_ODDS = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing.
 _GATE = 5.0
-#: Share by which a wheel speed may be off where the counter does not correct it; angle, rad, that may be missing of the way
-#: until the phase is lost: half of what the counter counts before it begins anew.
-_SPEED_ERROR, _LOST_RAD = 0.01, pi * PULSE_MODULO / PULSES_PER_TURN
+#: Way, rad, over which a wheel speed that is off by a hundredth, uncorrected by the counter, loses the phase by a radian: less
+#: than half of what the counter counts before it begins anew.
+_LOST_RAD = 100.0
 
-#: ``wheel`` angle and the angle (rad) ``unseen`` since the counter was last heard; ``amplitude`` (m) of cosines and sines and
-#: their ``covariance``; ``drive`` and ``force`` N/m: static force and force (with its lag) per amplitude; ``gain`` scratch;
-#: ``log_odds`` of such a disc and its ``share``; ``shift`` N: what it adds to the force. ``earlier``: amplitude (m) by the strokes
-#: before this one, ``stroke_s`` s of which were looked at.
+#: Whether it has ``turned`` since the start: until then its thickness is one with the contact angle. ``wheel`` angle and the
+#: way (rad) ``unseen`` since the counter was last heard; ``amplitude`` (m) of cosines and sines, their ``covariance``, and
+#: what they were by the strokes ``earlier`` than this one, of which ``stroke_s`` s were looked at; ``drive`` and ``force``
+#: N/m: static force and force (with its lag) per amplitude; ``gain``: scratch; ``log_odds`` of such a disc and its ``share``;
+#: ``shift`` N: what it adds to the force.
 UNEVEN = np.dtype(
     [
         ("known", "?"),
+        ("turned", "?"),
         ("wheel", WHEEL),
         ("unseen", "f8"),
         ("amplitude", "f8", (STATES,)),
@@ -89,12 +91,12 @@ def _wheel_angle(u, m):
     """Angle of the wheel (rad); begins anew where its phase was lost."""
     speed = m.wheel_speed if m.has_wheel_speed else 0.0
     if m.has_wheel_pulse:
-        if u.unseen * _SPEED_ERROR > 1.0:
+        if u.unseen > _LOST_RAD:
             _begin(u)
         u.unseen = 0.0
         return track(u.wheel, m.wheel_pulse, speed, m.dt)
     u.wheel.turned += speed * m.dt
-    u.unseen += speed * m.dt if m.has_wheel_speed else _LOST_RAD
+    u.unseen += speed * m.dt if m.has_wheel_speed else 2.0 * _LOST_RAD
     return u.wheel.turned
 
 
@@ -106,6 +108,9 @@ def turn(u, m, slope, gear_gain, relaxation_time):
         u.share = 1.0 / (1.0 + exp(-u.log_odds))
         _begin(u)
     angle = _wheel_angle(u, m)
+    u.turned = u.turned or (m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S)
+    if not u.turned:
+        return
     if slope == 0.0 and u.stroke_s > 0.0:
         _end_stroke(u)
     u.shift = 0.0
@@ -148,8 +153,8 @@ def _weigh(u, leverage, without, variance):
 
 @njit
 def learn(u, leverage, without, variance, dt):
-    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt`` s
-    of motion."""
+    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt``
+    s of motion."""
     u.stroke_s += dt
     if u.stroke_s > _STROKE_S:
         _end_stroke(u)
@@ -182,5 +187,8 @@ def force_sigma(u):
 
 @njit
 def unproven(u):
-    """How far the force with and without such a disc are apart, N, times the probability of the less likely."""
-    return min(u.share, 1.0 - u.share) * abs(u.shift)
+    """How far apart the force with and without such a disc are over a turn, N, times the probability of the less likely."""
+    crest = 0.0
+    for k in range(0, STATES, 2):
+        crest += hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+    return min(u.share, 1.0 - u.share) * crest
