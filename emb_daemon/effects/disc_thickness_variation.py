@@ -24,7 +24,7 @@ _GUESSED_RAD, _LOST_RAD = 1.0, pi * PULSE_MODULO / PULSES_PER_TURN
 
 #: ``unseen``: phase (rad) by which the wheel may be off since the counter was last heard; ``sigma``: thickness (m, standard
 #: deviation) that this leaves open.
-_STATE = np.dtype([*((name, WHEEL[name]) for name in WHEEL.names), ("unseen", "f8"), ("sigma", "f8")], align=True)
+_STATE = np.dtype([("wheel", WHEEL), ("unseen", "f8"), ("sigma", "f8")], align=True)
 
 
 @njit
@@ -45,14 +45,14 @@ def term(p, s, m):
     if square == 0.0:
         return 0.0
     if m.has_wheel_pulse and s.unseen < _LOST_RAD:
-        angle = track(s, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
+        angle = track(s.wheel, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
         s.unseen = 0.0
-    elif s.known and m.has_wheel_speed:
+    elif s.wheel.known and m.has_wheel_speed:
         # The counter is silent or was: the speed carries the wheel on.
-        s.turned += m.wheel_speed * m.dt
+        s.wheel.turned += m.wheel_speed * m.dt
         s.unseen += (_SPEED_ERROR * m.wheel_speed + _SPEED_ERROR_RAD_PER_S) * m.dt
-        angle = s.turned
-    elif s.known:
+        angle = s.wheel.turned
+    elif s.wheel.known:
         s.unseen, angle = _LOST_RAD, 0.0
     else:
         return 0.0

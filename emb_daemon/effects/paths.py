@@ -82,3 +82,9 @@ def backplates(e, s, inner, outer, dt):
 def thickness_sigma(s):
     """Standard deviation (m) of the disc's thickness where its phase is not known."""
     return s.disc_thickness_variation.sigma
+
+
+@njit
+def known_delay(e):
+    """Age of the motor angle (s) that the calibration knows."""
+    return e.signal_delay.delay_s

@@ -5,6 +5,7 @@ from math import exp, hypot, sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
+from emb_daemon.estimator import uneven
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
@@ -19,6 +20,7 @@ from emb_daemon.estimator.hypotheses import (
     place,
     settle,
     stay_finite,
+    suspected,
     to_force,
     to_torque,
     unproven,
@@ -26,10 +28,12 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
 from emb_daemon.estimator.status import (
+    ANGLE_LATE,
     CONTACT_LOST,
     CONTACT_SOUGHT,
     CONTACT_UNKNOWN,
     CURRENT_IMPLAUSIBLE,
+    DISC_UNEVEN,
     JUMP_SUSPECTED,
     MODEL_ERROR,
     NO_SOURCE,
@@ -47,6 +51,7 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
     torque_offset,
 )
+from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
@@ -88,6 +93,8 @@ _LATE = 0.3
 _LONG_LIKELY = 62.5
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
 _TELLING = 0.1
+#: Cycles by which an angle is late from where it is told, as of one whose frame is late.
+_TOLD_CYCLES = 2.0
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
@@ -116,11 +123,14 @@ def needed_torque(s, p, m, mean_force, leverage):
 
 
 @njit
-def _spread(s, p):
+def _spread(s, p, m):
     """Standard deviation (N) of what is fast in the stiffness path's error."""
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
     relative = hypot(relative, s.effects.terms.sigma)
     relative = hypot(relative, s.slope * effects.thickness_sigma(s.effects) / p.gear_gain)
+    if s.late > 0.0 and m.dt > 0.0:
+        # A late angle is undone to first order: the second is what the motor gained in speed meanwhile.
+        relative = hypot(relative, 0.5 * s.late * s.late * s.slope * s.gear_slope * (m.speed - s.speed) / m.dt)
     return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
 
 
@@ -181,7 +191,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
     fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
-    unexplained = torque - leverage * mean_force
+    periodic = leverage * uneven.applied(s.uneven)
+    unexplained = torque - leverage * mean_force - periodic
     first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
     slow = max(variance - white - fast, 0.0)
     out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
@@ -198,6 +209,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
+    if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
+        uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     return sqrt(moving + slow)
 
 
@@ -208,8 +221,9 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
     torque."""
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
-    known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p)
+    known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
+    uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
@@ -241,6 +255,9 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         # Nothing has jumped: until it was found out, a frozen current spoke for every jump.
         open_again(s, p)
     out.force, out.sigma = mix(s, h, spread, warmth)
+    if not known:
+        out.force += uneven.applied(s.uneven)
+        out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
@@ -316,6 +333,10 @@ def _facts_of_torque(s, p):
         facts |= JUMP_SUSPECTED
     if abs(s.error[OFFSET]) > 2.0 * torque_offset(p):
         facts |= OFFSET_LARGE
+    if uneven.unproven(s.uneven) > _NOTED * p.maximum_force:
+        facts |= DISC_UNEVEN
+    if s.late > _TOLD_CYCLES * CYCLE_S:
+        facts |= ANGLE_LATE
     return facts
 
 

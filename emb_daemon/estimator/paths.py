@@ -42,7 +42,7 @@ def position(s, p, m):
     effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
-    angle, s.gear_slope = turned(s, p, m.angle + effects.motor_angle(e, state, m, m.dt))
+    angle, s.gear_slope = turned(s, p, m.angle + s.late * m.speed + effects.motor_angle(e, state, m, m.dt))
     return angle + gained / p.gear_gain + grown - s.contact_angle
 
 

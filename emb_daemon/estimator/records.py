@@ -6,11 +6,13 @@ from emb_daemon.effects import REGISTRY, parameter_record, state_record
 from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import STATES
 from emb_daemon.models.gear import GEAR
+from emb_daemon.models.lateness import LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
 
@@ -104,6 +106,9 @@ STATE = np.dtype(
         *fields("f8", "friction_state slid_angle friction_mean friction_variance torque_age balance leverage"),
         ("contact", CONTACT),
         ("plausibility", PLAUSIBILITY),
+        # Age of the angle beside the speed, and beyond what the calibration knows, s.
+        ("lateness", LATENESS),
+        ("late", "f8"),
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
@@ -125,6 +130,7 @@ STATE = np.dtype(
         ("winding", "f8"),
         ("housing", "f8"),
         ("consistency", CONSISTENCY),
+        ("uneven", UNEVEN),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("monitor", MONITOR),
         ("wheel", WHEEL),

@@ -40,6 +40,8 @@ TABLE = {
     "jump_suspected": Fact("contact, stiffness, friction or current may have changed at once", PATHS_DISAGREE, FUSED),
     "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
+    "disc_uneven": Fact("the disc may be uneven in a way that the calibration does not know", PATHS_DISAGREE, FUSED),
+    "angle_late": Fact("the motor angle is over two cycles older than the speed that comes with it", OUT_OF_RANGE, FUSED),
     "resolver_implausible": Fact("the resolver is frozen, or contradicts itself", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
@@ -59,9 +61,9 @@ TABLE = {
 #: Bit of each fact.
 (
     ZERO_MOVED, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
-    RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN,
-    TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK, WHEEL_CONTRADICTED, BOUNDS_CONTRADICT, BOUND_REACHED, BEYOND_RANGE,
-    NO_SOURCE, NOT_A_NUMBER,
+    DISC_UNEVEN, ANGLE_LATE, RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT, FORCE_UNCERTAIN,
+    TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK, WHEEL_CONTRADICTED, BOUNDS_CONTRADICT, BOUND_REACHED,
+    BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
 ) = (1 << bit for bit in range(len(TABLE)))  # fmt: skip
 
 _REASONS = np.array([fact.reasons for fact in TABLE.values()])

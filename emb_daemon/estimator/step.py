@@ -8,6 +8,7 @@ from math import sqrt
 
 import numpy as np
 
+from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
@@ -32,6 +33,7 @@ from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening,
 from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
+from emb_daemon.models.lateness import follow, interrupt
 from emb_daemon.models.plausibility import disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
@@ -83,6 +85,7 @@ def step(s, p, m, out):
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT]), s.contact.confirmed)
+    _follow_age(s, p, m, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
@@ -125,6 +128,16 @@ def step(s, p, m, out):
     out.mode = RUNNING
     tell_status(_look(s, p, m, facts, out) | (ZERO_MOVED if moved_zero else 0), out)
     s.fused, s.fused_sigma = out.force, out.sigma
+
+
+@njit
+def _follow_age(s, p, m, moved_zero):
+    """How old the angle is beyond what the calibration knows."""
+    if moved_zero or not 0.0 < m.dt <= ONE_CYCLE_S or s.drifting_s > 0.0 or frozen(s.plausibility):
+        interrupt(s.lateness)
+        return
+    follow(s.lateness, m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed, m.dt)
+    s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
 
 
 @njit

@@ -1,0 +1,194 @@
+"""A disc whose thickness varies over its turn in a way that the calibration does not know.
+
+Its period is the wheel's: cosine and sine of the first orders of the wheel angle are a Kalman filter of their own over what
+the first hypothesis (`estimator.hypotheses`) leaves of the torque, a lock-in that knows its noise. How much better each stroke
+is foretold by what earlier ones taught than by an even disc says whether there is such a disc; the fused force follows it by
+that probability, and what that leaves open counts in its standard deviation.
+
+Only while the motor turns: a motor that stands is held by its friction, whatever the disc does to the force.
+"""
+
+from math import cos, exp, hypot, sin, sqrt
+
+import numpy as np
+
+from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
+from emb_daemon.jit import njit
+from emb_daemon.models.stiffness import first_order_lag
+from emb_daemon.models.wheel import WHEEL, track
+
+#: Orders that discs commonly have, and cosine and sine of each.
+ORDERS = 2
+STATES = 2 * ORDERS
+#: Standard deviation of cosine and sine of order 1, m: 10 to 20 um from crest to trough before drivers complain (Jacobsson,
+#: Aspects of disc brake judder, Proc. IMechE D 217, 2003); amplitudes of a smooth disc fall with the square of the order.
+_AMPLITUDE_M = 7e-6
+#: Wear makes another disc of it within hours of braking, s.
+_WORN_S = 3600.0
+#: Log odds of a disc that its calibration does not know, and below which they do not fall.
+_PRIOR_ODDS, _LEAST_ODDS = -4.0, -6.0
+#: Motion, s, after which it is another: what one stroke leaves unexplained is a shape, and any shape is a part of a period.
+_STROKE_S = 1.0
+#: Log odds that are as good as certainty.
+_CERTAIN_ODDS = 20.0
+#: Standard deviations of the innovation beyond which a sample teaches nothing.
+_GATE = 5.0
+#: Way, rad, over which a wheel speed that is off by a hundredth, uncorrected by the counter, loses the phase by a radian: less
+#: than half of what the counter counts before it begins anew.
+_LOST_RAD = 100.0
+
+#: Whether it has ``turned`` since the start: until then its thickness is one with the contact angle. ``wheel`` angle and the
+#: way (rad) ``unseen`` since the counter was last heard; ``amplitude`` (m) of cosines and sines, their ``covariance``, and
+#: what they were by the strokes ``earlier`` than this one, of which ``stroke_s`` s were looked at; ``drive`` and ``force``
+#: N/m: static force and force (with its lag) per amplitude; ``gain``: scratch; ``log_odds`` of such a disc and its ``share``;
+#: ``shift`` N: what it adds to the force.
+UNEVEN = np.dtype(
+    [
+        ("known", "?"),
+        ("turned", "?"),
+        ("wheel", WHEEL),
+        ("unseen", "f8"),
+        ("amplitude", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        ("drive", "f8", (STATES,)),
+        ("force", "f8", (STATES,)),
+        ("gain", "f8", (STATES,)),
+        ("earlier", "f8", (STATES,)),
+        ("stroke_s", "f8"),
+        ("log_odds", "f8"),
+        ("share", "f8"),
+        ("shift", "f8"),
+    ],
+    align=True,
+)
+
+
+@njit
+def _variance(i):
+    order = i // 2 + 1
+    sigma = _AMPLITUDE_M / (order * order)
+    return sigma * sigma
+
+
+@njit
+def _begin(u):
+    """Nothing is known of the phase; what is known of the odds stays."""
+    u.known = True
+    u.unseen = 0.0
+    for i in range(STATES):
+        # What it was found to be is possible again, at another phase.
+        size = u.amplitude[i - i % 2] ** 2 + u.amplitude[i - i % 2 + 1] ** 2
+        u.gain[i] = _variance(i) + 0.5 * size
+    for i in range(STATES):
+        u.amplitude[i] = u.earlier[i] = 0.0
+        for j in range(STATES):
+            u.covariance[i, j] = 0.0
+        u.covariance[i, i] = u.gain[i]
+
+
+@njit
+def _wheel_angle(u, m):
+    """Angle of the wheel (rad); begins anew where its phase was lost."""
+    speed = m.wheel_speed if m.has_wheel_speed else 0.0
+    if m.has_wheel_pulse:
+        if u.unseen > _LOST_RAD:
+            _begin(u)
+        u.unseen = 0.0
+        return track(u.wheel, m.wheel_pulse, speed, m.dt)
+    u.wheel.turned += speed * m.dt
+    u.unseen += speed * m.dt if m.has_wheel_speed else 2.0 * _LOST_RAD
+    return u.wheel.turned
+
+
+@njit
+def turn(u, m, slope, gear_gain, relaxation_time):
+    """Advance by one sample: what each amplitude does to the force. ``slope`` N/rad of the static force."""
+    if not u.known:
+        u.log_odds = _PRIOR_ODDS
+        u.share = 1.0 / (1.0 + exp(-u.log_odds))
+        _begin(u)
+    angle = _wheel_angle(u, m)
+    u.turned = u.turned or (m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S)
+    if not u.turned:
+        return
+    if slope == 0.0 and u.stroke_s > 0.0:
+        _end_stroke(u)
+    u.shift = 0.0
+    for k in range(ORDERS):
+        for part in range(2):
+            i = 2 * k + part
+            shape = cos((k + 1) * angle) if part == 0 else sin((k + 1) * angle)
+            drive = slope / gear_gain * shape
+            u.force[i] = first_order_lag(u.force[i], u.drive[i], drive, m.dt, relaxation_time)
+            u.drive[i] = drive
+            u.shift += u.force[i] * u.amplitude[i]
+            u.covariance[i, i] += _variance(i) * m.dt / _WORN_S
+
+
+@njit
+def applied(u):
+    """What the fused force follows of it, N."""
+    return u.share * u.shift
+
+
+@njit
+def _end_stroke(u):
+    """What this stroke taught may be held against the next."""
+    u.stroke_s = 0.0
+    for i in range(STATES):
+        u.earlier[i] = u.amplitude[i]
+
+
+@njit
+def _weigh(u, leverage, without, variance):
+    """Odds after a torque: what earlier strokes foretold of it against nothing. Under noise a wrong foretelling loses."""
+    foretold = 0.0
+    for i in range(STATES):
+        foretold += leverage * u.force[i] * u.earlier[i]
+    edge = _GATE * _GATE * variance
+    better = min(without * without, edge) - min((without - foretold) ** 2, edge)
+    u.log_odds = min(max(u.log_odds + 0.5 * better / variance, _LEAST_ODDS), _CERTAIN_ODDS)
+    u.share = 1.0 / (1.0 + exp(-u.log_odds))
+
+
+@njit
+def learn(u, leverage, without, variance, dt):
+    """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt``
+    s of motion."""
+    u.stroke_s += dt
+    if u.stroke_s > _STROKE_S:
+        _end_stroke(u)
+    added = 0.0
+    for i in range(STATES):
+        total = 0.0
+        for j in range(STATES):
+            total += u.covariance[i, j] * u.force[j]
+        u.gain[i] = leverage * total
+        added += leverage * u.force[i] * u.gain[i]
+    innovation, s = without - leverage * u.shift, variance + added
+    if innovation * innovation > _GATE * _GATE * s:
+        return
+    _weigh(u, leverage, without, variance)
+    for i in range(STATES):
+        u.amplitude[i] += u.gain[i] / s * innovation
+        for j in range(STATES):
+            u.covariance[i, j] -= u.gain[i] * u.gain[j] / s
+
+
+@njit
+def force_sigma(u):
+    """Standard deviation (N) that it leaves in the fused force."""
+    variance = (1.0 - u.share) * u.shift * u.shift
+    for i in range(STATES):
+        for j in range(STATES):
+            variance += u.force[i] * u.covariance[i, j] * u.force[j]
+    return sqrt(max(u.share * variance, 0.0))
+
+
+@njit
+def unproven(u):
+    """How far apart the force with and without such a disc are over a turn, N, times the probability of the less likely."""
+    crest = 0.0
+    for k in range(0, STATES, 2):
+        crest += hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+    return min(u.share, 1.0 - u.share) * crest

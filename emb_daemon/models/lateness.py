@@ -1,0 +1,51 @@
+"""By how much the resolver's angle is older than the speed that comes with it.
+
+What the angle lacks of the integrated speed is then the time times the speed. Both are followed over a tenth of a second; a
+gain of the resolver, in proportion to the way, is fitted beside the time, or it would look like one. Neither signal can be
+ahead of the motor: a speed that is older, as a filtered one is, says nothing of the angle.
+"""
+
+from math import exp
+
+import numpy as np
+
+from emb_daemon.jit import fields, njit
+
+#: Time over which angle and speed are followed, and over which what they said is kept, s.
+_FOLLOWED_S, _KEPT_S = 0.1, 60.0
+#: Noise of the angle less integrated speed, rad: some counts, and the speed's noise over the time above; samples that share
+#: it; ages that an angle has, s, and at most; gains that a resolver has, share.
+_NOISE_RAD, _ALIKE, _AGE_S, _OLDEST_S, _GAIN = 0.01, 25.0, 0.002, 0.015, 0.02
+#: A sample that is further off than the oldest angle makes it, rad, is another fault's.
+_BEYOND_RAD = 0.1
+
+#: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. The others:
+#: normal equations of the two, and ``age`` s as they solve them.
+LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age"), align=True)
+
+
+@njit
+def follow(a, travel, turned, gained, dt):
+    """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s."""
+    keep = exp(-dt / _FOLLOWED_S)
+    a.apart = keep * a.apart + travel - turned
+    a.gained = keep * a.gained + gained
+    a.gone = keep * a.gone + turned
+    if abs(a.apart) > _OLDEST_S * abs(a.gained) + _BEYOND_RAD:
+        return
+    old = exp(-dt / _KEPT_S)
+    a.ss = old * a.ss + a.gained * a.gained
+    a.sw = old * a.sw + a.gained * a.gone
+    a.ww = old * a.ww + a.gone * a.gone
+    a.as_ = old * a.as_ + a.apart * a.gained
+    a.aw = old * a.aw + a.apart * a.gone
+    noise = _ALIKE * _NOISE_RAD * _NOISE_RAD
+    ss, ww = a.ss + noise / (_AGE_S * _AGE_S), a.ww + noise / (_GAIN * _GAIN)
+    age = (a.aw * a.sw - a.as_ * ww) / (ss * ww - a.sw * a.sw)
+    a.age = min(max(age, 0.0), _OLDEST_S)
+
+
+@njit
+def interrupt(a):
+    """A sample was missing or was no motion."""
+    a.apart = a.gained = a.gone = 0.0

@@ -1,0 +1,76 @@
+"""A motor angle that is older than the speed beside it: found, undone, covered; nothing else is taken for it."""
+
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.models.lateness import LATENESS, follow
+from emb_daemon.offline import estimate
+from emb_daemon.wire.contract import OUT_OF_RANGE
+
+_DT = 0.004
+_COUNT = 2.0 * np.pi / 4096
+
+
+def _strokes(seconds=3.0):
+    """Angle (rad) and speed (rad/s) at any time (s): strokes of a tenth of a second and more."""
+    return (lambda t: 10.0 * (1.0 - np.cos(9.0 * t)) * (t > 0.0)), (lambda t: 90.0 * np.sin(9.0 * t) * (t > 0.0))
+
+
+def _age(late_s=0.0, gain=1.0, speed_late_s=0.0, seed=1):
+    angle, speed = _strokes()
+    time, rng = np.arange(0.0, 3.0, _DT), np.random.default_rng(seed)
+    angles = np.round(gain * angle(time - late_s) / _COUNT) * _COUNT
+    speeds = speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
+    a = np.zeros(1, LATENESS)[0]
+    for i in range(1, len(time)):
+        turned = 0.5 * (speeds[i] + speeds[i - 1]) * _DT
+        follow(a, angles[i] - angles[i - 1], turned, speeds[i] - speeds[i - 1], _DT)
+    return float(a["age"])
+
+
+@pytest.mark.parametrize("late_s", [0.001, 0.004, 0.009])
+@pytest.mark.parametrize("gain", [1.0, 0.95, 1.05])
+def test_the_age_is_found_whatever_the_gain(late_s, gain):
+    assert _age(late_s, gain) == pytest.approx(late_s, abs=0.1 * late_s + 2e-4)
+
+
+@pytest.mark.parametrize("gain", [0.93, 1.0, 1.07])
+def test_an_angle_in_time_is_not_old(gain):
+    assert _age(gain=gain) < 2e-4
+
+
+def test_an_older_speed_says_nothing_of_the_angle():
+    assert _age(speed_late_s=0.003) == 0.0
+
+
+@pytest.mark.parametrize("late_s", [0.002, 0.006, 0.0095])
+def test_a_late_angle_is_undone(parameters, late_s):
+    """The force is right where the stiffness path would lag by the way of the motor, and sigma covers the rest. An angle that
+    is over two cycles old is told."""
+    p = brake.ideal(parameters)
+    path = brake.stops(p, 5)
+    rows, force = brake.samples(p, path)
+    time = _DT * np.arange(len(path))
+    rows["angle"] = np.interp(time - late_s, time, path)
+    rows = brake.noisy(rows, p)
+    estimates = estimate(rows, p.reshape(1))
+    second = slice(750, None)
+    error = np.abs(estimates["force"] - force)[second]
+    stroke = (np.abs(rows["speed"]) > 20.0)[second] & (force[second] > 1000.0)
+    lag = late_s * (np.gradient(force) / _DT)[second][stroke]
+    assert np.sqrt(np.mean(error[stroke] ** 2)) < 0.3 * np.sqrt(np.mean(lag**2))
+    assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
+    assert np.any(estimates["reasons"][second] & OUT_OF_RANGE) == (late_s > 2.0 * _DT)
+
+
+def test_a_delay_that_the_calibration_knows_is_undone_once(parameters):
+    p = brake.ideal(parameters)
+    path = brake.stops(p, 5)
+    rows, force = brake.samples(p, path)
+    time = _DT * np.arange(len(path))
+    rows["angle"] = np.interp(time - 0.004, time, path)
+    rows = brake.noisy(rows, p)
+    p["effects"]["signal_delay"]["delay_s"] = 0.004
+    error = (estimate(rows, p.reshape(1))["force"] - force)[750:]
+    assert np.sqrt(np.mean(error**2)) < 60.0
