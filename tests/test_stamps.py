@@ -185,9 +185,10 @@ _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
 
 
 @pytest.mark.parametrize(("factor", "said"), [(-1.0, "ClampForceRef falls while CurrentQ rises"), (1.0, "")])
-def test_a_torque_sensor_the_wrong_way_round_is_told_without_an_angle(tmp_path, capsys, factor, said):
+@pytest.mark.parametrize("motion", [foreignkit.slow, foreignkit.random])
+def test_a_torque_sensor_the_wrong_way_round_is_told_without_an_angle(tmp_path, capsys, motion, factor, said):
     """A motor on a dynamometer: speed, current and torque, no angle."""
-    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow()), 100.0)
+    columns = foreignkit.sampled(foreignkit.truth(motion()), 250.0)
     _read(tmp_path, _wrong(columns, "force_N", factor=factor), _NO_ANGLE)
     told = capsys.readouterr().err
     assert said in told and ("scale: -1" in told) == bool(said)
