@@ -181,6 +181,17 @@ def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, 
     assert len(lines) == (rate_Hz < 100.0) and all("one sample of the motor every 80 ms, too rare" in line for line in lines)
 
 
+def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
+    """Neither are they at 20 Hz where almost all samples stand."""
+    columns = foreignkit.sampled(truth, 20.0)
+    rest = {name: np.full(100 * len(values), values[0]) for name, values in columns.items()}
+    rest["time_s"] = 0.05 * np.arange(len(rest["time_s"]))
+    columns["time_s"] = columns["time_s"] + rest["time_s"][-1]
+    log = _read(tmp_path, {name: np.concatenate([rest[name], columns[name]]) for name in columns})
+    assert "one sample of the motor every 50 ms, too rare" in capsys.readouterr().err
+    assert len(log.samples) <= 101 * len(columns["time_s"])
+
+
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
 
 

@@ -24,8 +24,8 @@ _SAME_PERIOD = 0.05
 #: the estimator bridges what lies between. A brake clamps in some fifty cycles.
 _SPARSE_CYCLES = 5
 #: Sampling period up to which slow motion is filled in between its samples: a stop that comes and goes takes longer, ns. Share
-#: of the samples by which slow motion is told, and angle by which the straight line between two may miss the way: some 20 N
-#: at a kilonewton per radian, the noise of a reference sensor, rad.
+#: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
+#: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
 _LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
@@ -122,7 +122,9 @@ class Series:
         if not self.is_sparse or self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
             return self.is_sparse
         missed = 0.25 * np.abs(self.values[1:-1] - 0.5 * (self.values[2:] + self.values[:-2]))
-        return float(np.quantile(missed, _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD
+        # A brake that stands for an hour says nothing of how its stops are sampled.
+        moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
+        return bool(moving.any()) and float(np.quantile(missed[moving], _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD
 
     @property
     def is_slow(self) -> bool:
