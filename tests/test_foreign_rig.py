@@ -118,6 +118,18 @@ def test_columns_and_channels_are_logs(truth, tmp_path, name):
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
 
 
+@pytest.mark.parametrize(("ending", "mark"), [("txt", " "), ("csv", ","), ("tsv", "\t"), ("dat", ";")])
+def test_a_table_without_header_has_its_columns_by_number(tmp_path, ending, mark):
+    """As microcontrollers print it: numbers alone, in a file called anything."""
+    mapping = foreignkit.COLUMNS
+    for number, name in enumerate(_HEADER.split(",")):
+        mapping = mapping.replace(name, f"column {number + 1}")
+    foreignkit.write_rig(tmp_path, mapping)
+    (tmp_path / f"a.{ending}").write_text(_table(100).replace(",", mark))
+    samples = load_log(tmp_path / f"a.{ending}", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+
+
 def test_a_table_may_have_decimal_commas(tmp_path):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = "".join(f"{0.004 * n:.3f};{0.1 * n:.1f};25.0;1.5;22;0\n".replace(".", ",") for n in range(100))

@@ -154,3 +154,22 @@ def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
     monkeypatch.setattr(attribution, "identify", lambda _, hot, known, progress: attribution._unsearched(hot, known))
     main(["identify", str(tmp_path / "campaign.yaml"), "--output", str(output)])
     assert re.search(r"judge: \d+ % of the errors inside two sigma, .* worse than it says", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("rate_Hz", [50.0, 20.0])
+def test_a_slow_clamp_may_be_sampled_slowly(tmp_path, capsys, rate_Hz):
+    """Of a slow motion the way between two samples is known at 50 Hz and less; of a fast one it is said that it is not."""
+    campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(), random=foreignkit.random())
+    for name, angle in (("curve", foreignkit.slow()), ("random", foreignkit.random())):
+        foreignkit.write_table(tmp_path / f"{name}.parquet", foreignkit.sampled(foreignkit.truth(angle), rate_Hz))
+    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
+    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 3
+    told = capsys.readouterr().err
+    assert f"one every {1e3 / rate_Hz:.0f} ms, and the way between two is unknown; expected 100 Hz or a slower motion" in told
+    assert "curves: no usable log" not in told
+    found = load_calibration(output)
+    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(foreignkit.truth(), 500.0))
+    log = emb_daemon.load_log(table, read=Mapping(mapping).read)
+    estimates = emb_daemon.run(log, found)
+    error = (estimates["force"] - log.force_N)[1:]
+    assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9

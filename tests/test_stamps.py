@@ -1,5 +1,7 @@
 """Recordings as recorders make them: what their stamps and columns get wrong, and what a mapping states wrongly."""
 
+import re
+
 import foreignkit
 import numpy as np
 import pytest
@@ -175,7 +177,42 @@ def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, 
     time_s = foreignkit.FINE_S * np.arange(round(8.0 / foreignkit.FINE_S))
     sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 5.0 * time_s)
     _read(tmp_path, foreignkit.sampled(foreignkit.truth(sine if rate_Hz > 100.0 else foreignkit.random()), rate_Hz))
-    assert capsys.readouterr().err == ""
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == (rate_Hz < 100.0) and all("one sample of the motor every 80 ms, too rare" in line for line in lines)
+
+
+def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
+    """Neither are they at 20 Hz where almost all samples stand."""
+    columns = foreignkit.sampled(truth, 20.0)
+    rest = {name: np.full(100 * len(values), values[0]) for name, values in columns.items()}
+    rest["time_s"] = 0.05 * np.arange(len(rest["time_s"]))
+    columns["time_s"] = columns["time_s"] + rest["time_s"][-1]
+    log = _read(tmp_path, {name: np.concatenate([rest[name], columns[name]]) for name in columns})
+    assert "one sample of the motor every 50 ms, too rare" in capsys.readouterr().err
+    assert len(log.samples) <= 101 * len(columns["time_s"])
+
+
+_NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
+
+
+@pytest.mark.parametrize(("factor", "said"), [(-1.0, "ClampForceRef falls while CurrentQ rises"), (1.0, "")])
+@pytest.mark.parametrize("motion", [foreignkit.slow, foreignkit.random])
+def test_a_torque_sensor_the_wrong_way_round_is_told_without_an_angle(tmp_path, capsys, motion, factor, said):
+    """A motor on a dynamometer: speed, current and torque, no angle."""
+    columns = foreignkit.sampled(foreignkit.truth(motion()), 250.0)
+    _read(tmp_path, _wrong(columns, "force_N", factor=factor), _NO_ANGLE)
+    told = capsys.readouterr().err
+    assert said in told and ("scale: -1" in told) == bool(said)
+
+
+def test_inertia_alone_turns_no_torque_sensor_round(tmp_path, capsys):
+    """At the top of a fast sine the current brakes the motor while the force is largest."""
+    time_s = foreignkit.FINE_S * np.arange(round(4.0 / foreignkit.FINE_S))
+    sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 7.0 * time_s)
+    columns = foreignkit.sampled(foreignkit.truth(sine), 500.0)
+    assert np.corrcoef(columns["current_A"], columns["force_N"])[0, 1] < -0.6
+    _read(tmp_path, columns, _NO_ANGLE)
+    assert "scale: -1" not in capsys.readouterr().err
 
 
 def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):

@@ -165,7 +165,10 @@ class Campaign:
         cycle = float(np.median(log.samples["dt"][1:])) if len(log.samples) > 1 else np.inf
         lacking = None
         if len(log.samples) < _LEAST_SAMPLES or cycle > _LONGEST_CYCLE_S:
-            lacking = f"{len(log.samples)} samples, one every {1e3 * cycle:.0f} ms"
+            apart = float(np.median(np.diff(log.time_s))) if len(log.samples) > 1 else np.inf
+            lacking = f"{len(log.samples)} samples, one every {1e3 * apart:.0f} ms"
+            if cycle > _LONGEST_CYCLE_S:
+                lacking += ", and the way between two is unknown; expected 100 Hz or a slower motion"
         elif not force_N > _LEAST_FORCE * actuator.rated_clamp_force_N:
             lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
         elif not np.isfinite(noise_N):

@@ -17,6 +17,9 @@ _TRAVEL_RAD = 1.0
 _TOLD_APART = 0.5
 #: Share of the largest force that it must change by from one end of the travel to the other.
 _FOLLOWS = 0.2
+#: Correlation of force and the current that accelerates nothing, negative, from which one of the two is turned round. Friction
+#: that holds the force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
+_AGAINST = 0.5
 #: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
 _LEAST_CLAMP_N = 100.0
 #: Share of the range that one step takes where a value starts anew, and how often it has to.
@@ -37,6 +40,10 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
+        # The travel tells nothing of directions; current and force do.
+        speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
+        if not (speed is None or current is None or force is None or (angle or speed.integral()).way_is_unknown):
+            lines += _against_each_other(speed, current, force)
         return lines
     if jump := _starts_anew(angle.values):
         return [
@@ -48,6 +55,28 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if force is not None and np.ptp(force.values):
         lines += _turned_force(angle, force)
     return lines
+
+
+def _against_each_other(speed: Series, current: Series, force: Series) -> list[str]:
+    """A line where the force falls whenever the current rises that does not accelerate the motor."""
+    times = current.time_ns
+    at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
+    known = np.isfinite(at) & np.isfinite(acceleration)
+    if np.sum(known) < _LEAST or not np.ptp(at[known]):
+        return []
+    left = current.values[known]
+    if np.ptp(acceleration[known]):
+        columns = np.stack([np.ones(np.sum(known)), at[known], acceleration[known]], axis=1)
+        if abs(np.corrcoef(columns[:, 1], columns[:, 2])[0, 1]) > _TOLD_APART:
+            return []
+        left = left - np.linalg.lstsq(columns, left)[0][2] * acceleration[known]
+    correlation = float(np.corrcoef(left, at[known])[0, 1]) if np.ptp(left) else 0.0
+    if correlation > -_AGAINST:
+        return []
+    return [
+        f"ClampForceRef falls while CurrentQ rises (correlation {correlation:.2f}), and positive current clamps: "
+        "`scale: -1` of one of the two?"
+    ]
 
 
 def _starts_anew(values: np.ndarray) -> float:

@@ -99,7 +99,7 @@ class MappingFile(Struct, kw_only=True):
     dbc: str | None = None
     #: Instead of `dbc`, of a rig with several buses: by a name of yours.
     buses: dict[str, Bus] = field(default_factory=dict)
-    #: Of a .csv or .parquet table; channels of a measurement have times of their own.
+    #: Of a table (.csv, .txt, .tsv, .dat, .parquet); channels of a measurement have times of their own.
     time: Time | None = None
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
@@ -288,7 +288,7 @@ class Mapping:
             for name, signals in self.messages.items()
         }
         for corner in CORNERS:
-            for line in contradictions(corner, messages):
+            for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 print(f"{path}: {corner}: {line}", file=sys.stderr)
         self._check_rate(path, messages)
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
@@ -369,6 +369,21 @@ def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bo
     by_channel = [set(payloads[channels[rows] == channel].tolist()) for channel in np.unique(channels[rows])]
     fewest = min(by_channel, key=len)
     return all(len(fewest - other) <= _LOST_COPIES * len(fewest) for other in by_channel)
+
+
+def _too_slow(corner: str, messages: dict) -> list[str]:
+    """A line on a motor that moves too fast for its samples."""
+    resolver = messages.get(f"EMB_{corner}_Resolver", {})
+    angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
+    if angle is None and isinstance(speed, Series):
+        angle = speed.integral()
+    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or not angle.way_is_unknown:
+        return []
+    return [
+        f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "
+        "and what lies between two samples is unknown; the torque path says nothing, and identify needs 10 ms (100 Hz) "
+        "or a slower motion"
+    ]
 
 
 _BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"

@@ -23,6 +23,10 @@ _SAME_PERIOD = 0.05
 #: Sampling period from which the way between two samples is unknown, in cycles: such samples are taken as they are too, and
 #: the estimator bridges what lies between. A brake clamps in some fifty cycles.
 _SPARSE_CYCLES = 5
+#: Sampling period up to which slow motion is filled in between its samples: a stop that comes and goes takes longer, ns. Share
+#: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
+#: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
+_LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
 #: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Share of values beyond what our message carries that an instrument's own faults do not make.
@@ -108,6 +112,19 @@ class Series:
     def is_sparse(self) -> bool:
         """Whether the way between two samples is unknown."""
         return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
+
+    @cached_property
+    def way_is_unknown(self) -> bool:
+        """Whether an angle's way between two samples is unknown: sparse samples of a motion that they do not resolve.
+
+        Left out, a sample of a smooth motion would be missed by the straight line between its neighbours four times as far as
+        the straight line between samples misses the way."""
+        if not self.is_sparse or self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
+            return self.is_sparse
+        missed = 0.25 * np.abs(self.values[1:-1] - 0.5 * (self.values[2:] + self.values[:-2]))
+        # A brake that stands for an hour says nothing of how its stops are sampled.
+        moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
+        return bool(moving.any()) and float(np.quantile(missed[moving], _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD
 
     @property
     def is_slow(self) -> bool:
@@ -429,7 +446,7 @@ def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
     times = angle.time_ns
     if len(times) < 3:
         return times, np.arange(len(times))
-    if angle.is_ours or angle.is_sparse:
+    if angle.is_ours or angle.way_is_unknown:
         steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
         return times, np.concatenate([[0], np.cumsum(steps)])
     return _grid(_stretches(times, _CARRIED_PERIODS * angle.period_ns), CYCLE_NS)

@@ -16,6 +16,9 @@ from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
+_TEXTS = (".csv", ".txt", ".tsv", ".dat")
+#: What a measurement file begins with, one that was not closed included.
+_MDF = (b"MDF     ", b"UnFinMF ")
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
@@ -43,10 +46,13 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
-    if ending in _MEASUREMENTS:
+    # `.dat` is what INCA calls a measurement, and what others call a text.
+    if ending in _MEASUREMENTS and (ending != ".dat" or content.startswith(_MDF)):
         return _channels(path, content, names), digest
-    if ending not in (".csv", ".parquet"):
-        raise InputError(f"{path}: expected a table (.csv, .parquet) or a measurement ({', '.join(_MEASUREMENTS)}): no dbc")
+    if ending not in (*_TEXTS, ".parquet"):
+        raise InputError(
+            f"{path}: expected a table ({', '.join(_TEXTS)}, .parquet) or a measurement ({', '.join(_MEASUREMENTS)}): no dbc"
+        )
     if time is None:
         raise InputError(f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`")
     table = _table(path, content, ending, [time.signal, *names])
@@ -151,6 +157,9 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         key=lambda at: (len({*names} & {*_cells(lines[at[0]], at[1])}), -at[0], lines[at[0]].count(at[1])),
     )
     cells = _cells(lines[header], delimiter)
+    if not {*names} & {*cells} and (found := _without_header(lines)):
+        header, delimiter = found
+        cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
     if delimiter == " ":
         content = b"\n".join(b" ".join(line.split()) for line in content.split(b"\n"))
     rows = [_cells(line, delimiter) for line in lines[header + 1 : header + 1 + _UNITS]]
@@ -205,6 +214,17 @@ def _cells(line: str, delimiter: str) -> list[str]:
         # As numpy.savetxt and MATLAB write a header.
         line = " ".join(line.split()).lstrip("#% ")
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+
+
+def _without_header(lines: list[str]) -> tuple[int, str] | None:
+    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them."""
+    for row, line in enumerate(lines):
+        if not line.strip() or line.lstrip().startswith(("#", "%")):
+            continue
+        parted = {mark: _cells(line, mark) for mark in (";", "\t", "|", ",", " ")}
+        mark = next((mark for mark, cells in parted.items() if len(cells) > 1), ",")
+        return (row - 1, mark) if all(map(_is_number, filter(None, parted[mark]))) else None
+    return None
 
 
 def _is_number(cell: str) -> bool:

@@ -1,0 +1,68 @@
+"""Runs of a geared robot motor against a torque sensor as logs that `emb-daemon diagnose` reads, and where to start from.
+
+    python tools/tmotor_to_log.py SysID/system_id_test_2/log_adc_and_motor.csv --output tmotor
+    emb-daemon diagnose tmotor/first_half.log --calibration tmotor/calibration.yaml --validate tmotor/second_half.log \\
+        --output tmotor/found
+
+Data at github.com/neurobionics/TMotorCANControl, commit bb8d071, folder src/TMotorCANControl/test/saved_logs/SysID (GPL-3; not
+copied here): an AK80-9 on CAN, planetary gear of 9 inside, at 100 Hz: speed and current of the drive, a torque sensor on its
+shaft, another motor holding against it. There is no angle. The sensor counts the other way round.
+
+The mapping onto the torque path, with a gear gain gamma that is a choice (0.5 mm per radian) and nothing more: clamp force =
+sensor torque / gamma. The torque constant to start from is the supplier's 0.105 N m/A times 9.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from embir_to_log import GEAR_GAIN_M_PER_RAD, starting_calibration
+
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import save_calibration
+from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.logs.mapping import Mapping
+
+CONSTANT_NM_PER_A = 0.945
+#: At the shaft, of rotor and gear, kg m2; of the gear, N m; fastest, rad/s: orders of magnitude of the supplier's sheet.
+NOMINAL_INERTIA, NOMINAL_COULOMB, FASTEST = 0.005, 0.3, 50.0
+
+MAPPING = f"""# Columns of the test stand.
+format: 1
+time: {{signal: loop_time, unit: s}}
+signals:
+  EMB_FL_Resolver.MotorSpeed: {{signal: motor_measured_speed, unit: rad/s}}
+  EMB_FL_Current.CurrentQ: {{signal: motor_measured_current, unit: A, mean_ms: 0}}
+  VEH_WheelSpeed.WheelSpeedFL: {{value: 0}}
+  RIG_FL_Force.ClampForceRef: {{signal: adc_measured_torque, unit: N, scale: {-1.0 / GEAR_GAIN_M_PER_RAD:g}}}
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="one run, log_adc_and_motor.csv")
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    arguments = parser.parse_args(argv)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    mapping, replace = arguments.output / "mapping.yaml", msgspec.structs.replace
+    try:
+        write_atomically(mapping, MAPPING.encode())
+        frames = Mapping(mapping).read(arguments.run)
+    except (OSError, InputError, InputErrors) as error:
+        print(error, file=sys.stderr)
+        return 2
+    half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
+    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
+        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
+    base = starting_calibration(CONSTANT_NM_PER_A)
+    motor = replace(base.motor, inertia_kg_m2=NOMINAL_INERTIA, maximum_speed_rad_per_s=FASTEST)
+    friction = replace(base.friction, offset_Nm=NOMINAL_COULOMB)
+    save_calibration(replace(base, actuator="AK80-9", motor=motor, friction=friction), arguments.output / "calibration.yaml")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
