@@ -6,7 +6,7 @@ import pytest
 
 from emb_daemon.models.lateness import LATENESS, follow
 from emb_daemon.offline import estimate
-from emb_daemon.wire.contract import OUT_OF_RANGE
+from emb_daemon.wire.contract import PATHS_DISAGREE
 
 _DT = 0.004
 _COUNT = 2.0 * np.pi / 4096
@@ -61,7 +61,7 @@ def test_a_late_angle_is_undone(parameters, late_s):
     lag = late_s * (np.gradient(force) / _DT)[second][stroke]
     assert np.sqrt(np.mean(error[stroke] ** 2)) < 0.3 * np.sqrt(np.mean(lag**2))
     assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
-    assert np.any(estimates["reasons"][second] & OUT_OF_RANGE) == (late_s > 2.0 * _DT)
+    assert np.all(estimates["reasons"][second] & PATHS_DISAGREE) == (late_s > 2.0 * _DT)
 
 
 def test_a_delay_that_the_calibration_knows_is_undone_once(parameters):

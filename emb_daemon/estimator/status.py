@@ -41,7 +41,7 @@ TABLE = {
     "model_error": Fact("more than noise is left unexplained", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque is beyond a healthy current sensor's", PATHS_DISAGREE, FUSED),
     "disc_uneven": Fact("the disc may be uneven in a way that the calibration does not know", PATHS_DISAGREE, FUSED),
-    "angle_late": Fact("the motor angle is over two cycles older than the speed that comes with it", OUT_OF_RANGE, FUSED),
+    "angle_late": Fact("the motor angle is over two cycles older than the speed that comes with it", PATHS_DISAGREE, FUSED),
     "resolver_implausible": Fact("the resolver is frozen, or contradicts itself", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake was not yet seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found wrong and is sought", CONTACT_UNCERTAIN, FUSED),
