@@ -58,9 +58,9 @@ PRIOR_ODDS = -6.0
 #: six such brakes that `studies.silent grid` draws (--faults knock_back --seed 12) 16 phases fail without and 6 with it.
 _JUMPS_BEFORE, _STOPS_BEFORE = 0.04, 16.0
 #: The same of a brake that this estimator has never seen brake, neither now nor before a restart: of so many one comes from a
-#: workshop with other pads, or another motor or current sensor, than its calibration's. Pads 30 % off in thickness or compound
-#: (`studies.silent grid --faults pads_thickness,pads_compound --count 6 --seed 31`) miss by 1.0 to 1.4 kN on their first
-#: stroke, until it turns round and tells pads from friction; at these odds 9 of 36 phases fail, 11 without.
+#: workshop with other pads or another contact than its calibration's. Pads 30 % off in thickness or compound (`studies.silent
+#: grid --faults pads_thickness,pads_compound --count 6 --seed 31`) miss by 1.0 to 1.4 kN on their first stroke, until it
+#: turns round and tells pads from friction; at these odds 9 of 36 phases fail, 11 without.
 _UNSEEN_ODDS = -4.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
@@ -136,7 +136,7 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.least = a.log_odds = _least_odds(s, kind)
-    if kind < DISC_GROWTH and s.stops == 0.0 and not s.braked and not s.resumed:
+    if kind == STIFFNESS_JUMP and s.stops == 0.0 and not s.braked and not s.resumed:
         a.log_odds = _UNSEEN_ODDS
     a.shift = 0.0
 
