@@ -397,56 +397,17 @@ def test_a_change_that_is_certain_is_not_doubted_until_the_release(p, opened):
 
 
 def test_what_is_not_suspected_is_looked_for_anew(p, opened):
-    """At each release, and after a second if nothing speaks for it; what is suspected is not forgotten by then."""
+    """After a second, and at each release; what is suspected is not forgotten by then."""
     s = opened[0]
-    s["contact"]["engaged"], s["braked"] = True, True
-    s["alternatives"]["log_odds"][:2] = PRIOR_ODDS + 1.0
-    assert not settle(s, p, False, 0.5) and np.all(s["alternatives"]["log_odds"][:2] == PRIOR_ODDS + 1.0)
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP] = -3.0
+    assert not settle(s, p, False, 0.5) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == -3.0
     settle(s, p, False, 0.6)
-    assert np.all(s["alternatives"]["log_odds"][:2] == PRIOR_ODDS) and s["open_s"] == 0.0
-    for kind in (STIFFNESS_JUMP, TORQUE_JUMP):
-        s["alternatives"]["log_odds"][kind] = -3.0
-        settle(s, p, False, 5.0)
-        assert s["alternatives"]["log_odds"][kind] == -3.0, "half of a stroke is no proof of either"
-        s["contact"]["engaged"] = False
-        settle(s, p, True, 0.004)
-        assert s["alternatives"]["log_odds"][kind] == PRIOR_ODDS
-        s["contact"]["engaged"] = True
+    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS and s["open_s"] == 0.0
     s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 1.0
     settle(s, p, False, 2.0)
     assert suspected(s) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == 1.0
     open_again(s, p)
     assert not suspected(s)
-
-
-@pytest.mark.parametrize("since", [None, "resumed", "braked"])
-def test_a_brake_that_was_never_seen_may_come_from_a_workshop(p, since):
-    """With other pads: more likely than that they changed between two stops, until it was seen to brake."""
-    s = new_state()[0]
-    set_priors(s["covariance"], p)
-    s["scale"] = 1.0
-    if since:
-        s[since] = True
-    open_all(s, p)
-    odds = s["alternatives"]["log_odds"]
-    assert odds[TORQUE_JUMP] == PRIOR_ODDS
-    assert odds[STIFFNESS_JUMP] == PRIOR_ODDS if since else odds[STIFFNESS_JUMP] > PRIOR_ODDS
-    assert not suspected(s) and s["alternatives"]["least"][STIFFNESS_JUMP] == PRIOR_ODDS
-
-
-@pytest.mark.parametrize("stiffness", [0.88, 1.12])
-def test_other_pads_are_not_taken_for_a_torque_constant(p, stiffness):
-    """A first stroke of 1.6 s and a hold: what turned round at the top told pads from friction, and nothing of the stroke that
-    it is weighed with is lost by then."""
-    other = p.copy()
-    other["curve"] *= stiffness
-    up = np.linspace(0.0, p["clearance"] + 16.0, 400)
-    path = np.concatenate([np.zeros(25), up, np.linspace(up[-1], up[-1] - 0.5, 15), np.full(750, up[-1] - 0.5)])
-    rows, force = brake.samples(other, path)
-    estimates = estimate(brake.noisy(rows, p), p)
-    error = np.abs(estimates["force"] - force)[-650:]
-    assert np.all(error < 2.0 * estimates["sigma"][-650:])
-    assert np.all(error < 0.25 * abs(1.0 - stiffness) * force[-650:]), "most of the change is in the force before the release"
 
 
 def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):

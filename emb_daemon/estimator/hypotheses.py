@@ -1,11 +1,11 @@
 """Hypotheses of one brake: it is as it was, or something has changed.
 
 Each is a Kalman filter over the errors of both paths. The first believes what it learned and only walks. The others are the
-first, opened again at every release and, where nothing speaks for them, every while by what `unknown` says may jump in the
-stiffness path or in the torque path; and a brake whose disc grows with heat, which shows slowly and is opened once. All
-explain the same torque; the ratios of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes,
-IEEE Trans. Automatic Control 10, 1965) say which holds, and the fused force is their mixture, so that an unproven change
-already counts in its standard deviation. A proven one becomes the first hypothesis.
+first, opened again at every release and every while by what `unknown` says may jump in the stiffness path or in the torque
+path; and a brake whose disc grows with heat, which shows slowly and is opened once. All explain the same torque; the ratios
+of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10,
+1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
+deviation. A proven one becomes the first hypothesis.
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
 torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
@@ -57,11 +57,6 @@ PRIOR_ODDS = -6.0
 #: stops are soon outweighed by what is seen: run-out or play of the wheel bearing, which knock pads back once, do it again. Of
 #: six such brakes that `studies.silent grid` draws (--faults knock_back --seed 12) 16 phases fail without and 6 with it.
 _JUMPS_BEFORE, _STOPS_BEFORE = 0.04, 16.0
-#: The same of a brake that this estimator has never seen brake, neither now nor before a restart: of so many one comes from a
-#: workshop with other pads or another contact than its calibration's. Pads 30 % off in thickness or compound (`studies.silent
-#: grid --faults pads_thickness,pads_compound --count 6 --seed 31`) miss by 1.0 to 1.4 kN on their first stroke, until it
-#: turns round and tells pads from friction; at these odds 9 of 36 phases fail, 11 without.
-_UNSEEN_ODDS = -4.0
 #: The same of a disc that grows though its calibration, which saw heat, does not know it.
 _GROWTH_ODDS = -8.0
 #: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases that `studies.silent
@@ -73,11 +68,8 @@ _DRIFT_ODDS = -2.0
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, 4.0
 #: Log odds that are as good as certainty.
 CERTAIN_ODDS = 100.0
-#: Time after which a jump that nothing speaks for is looked for anew, s, and log odds over the least at which nothing does. On
-#: the way to a force pads, torque constant and friction look alike; a jump begun anew in the middle of it is weighed against a
-#: first hypothesis that has taken for friction what the pads do. Other pads were taken for a torque constant 14 % off then,
-#: and 2.4 kN too little was stated as 0.2 kN unsure for a whole training (--faults pads_thickness --count 4 --seed 31).
-_OPENED_S, _NOTHING = 1.0, 1.5
+#: Time after which an unproven jump is looked for anew, s.
+_OPENED_S = 1.0
 #: Time after which the stronger of two proven alternatives is taken though they are alike, and a merely suspected one given up
 #: at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
@@ -136,8 +128,6 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.least = a.log_odds = _least_odds(s, kind)
-    if kind == STIFFNESS_JUMP and s.stops == 0.0 and not s.braked and not s.resumed:
-        a.log_odds = _UNSEEN_ODDS
     a.shift = 0.0
 
 
@@ -202,13 +192,6 @@ def likely_shift(s):
 def _speaks(a):
     """Whether what was seen speaks for an alternative: that it may happen is no sign that it has."""
     return a.log_odds > max(a.least, PRIOR_ODDS) + _SUSPECTED
-
-
-@njit
-def _refuted(s):
-    """Whether nothing that was seen speaks for a jump of either path."""
-    stiffness, torque = s.alternatives[STIFFNESS_JUMP], s.alternatives[TORQUE_JUMP]
-    return stiffness.log_odds < stiffness.least + _NOTHING and torque.log_odds < torque.least + _NOTHING
 
 
 @njit
@@ -341,7 +324,7 @@ def settle(s, p, released, dt):
                 s.jumps += 1.0
             return True
     given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
-    if given_up or (not suspected(s) and ((s.open_s > _OPENED_S and _refuted(s)) or released)):
+    if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
         open_again(s, p)
     return False
 
