@@ -25,8 +25,8 @@ STATES = 2 * ORDERS
 _AMPLITUDE_M = 7e-6
 #: Wear makes another disc of it within hours of braking, s.
 _WORN_S = 3600.0
-#: Log odds of a disc that its calibration does not know, and below which they do not fall.
-_PRIOR_ODDS, _LEAST_ODDS = -4.0, -6.0
+#: Log odds of a disc that its calibration does not know, below which they do not fall, and from which something speaks for it.
+_PRIOR_ODDS, _LEAST_ODDS, _SPEAKING_ODDS = -4.0, -6.0, -3.0
 #: Motion, s, after which it is another: what one stroke leaves unexplained is a shape, and any shape is a part of a period.
 _STROKE_S = 1.0
 #: Log odds that are as good as certainty.
@@ -105,7 +105,6 @@ def turn(u, m, slope, gear_gain, relaxation_time):
     """Advance by one sample: what each amplitude does to the force. ``slope`` N/rad of the static force."""
     if not u.known:
         u.log_odds = _PRIOR_ODDS
-        u.share = 1.0 / (1.0 + exp(-u.log_odds))
         _begin(u)
     angle = _wheel_angle(u, m)
     u.turned = u.turned or (m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S)
@@ -148,7 +147,8 @@ def _weigh(u, leverage, without, variance):
     edge = _GATE * _GATE * variance
     better = min(without * without, edge) - min((without - foretold) ** 2, edge)
     u.log_odds = min(max(u.log_odds + 0.5 * better / variance, _LEAST_ODDS), _CERTAIN_ODDS)
-    u.share = 1.0 / (1.0 + exp(-u.log_odds))
+    # An even disc, until something speaks for another: then no wheel frame, not even a forged one, touches the force.
+    u.share = 1.0 / (1.0 + exp(-u.log_odds)) if u.log_odds > _SPEAKING_ODDS else 0.0
 
 
 @njit
