@@ -1,6 +1,5 @@
 """What has jumped: each change of an ideal brake is attributed to its path, ends in a small error with a sigma that covers
-it, and
-nothing is proven where nothing has changed."""
+it, and nothing is proven where nothing has changed."""
 
 import brake
 import numpy as np
@@ -11,10 +10,13 @@ from emb_daemon.estimator.hypotheses import (
     CERTAIN_ODDS,
     DISC_GROWTH,
     DRIFT,
+    KEPT_JUMP,
     PRIOR_ODDS,
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     drift_odds,
+    drop_refuted,
+    exists,
     mix,
     open_again,
     open_all,
@@ -294,10 +296,10 @@ def test_odds_never_fall_below_their_start():
 def test_what_tells_two_changes_apart_outlasts_certainty(p):
     """However much both explain what nothing does, the one that explained more stays ahead by as much."""
     s = new_state()[0]
-    s["alternatives"]["log_odds"] = 150.0, 120.0, -7.0, 149.0
+    s["alternatives"]["log_odds"] = 150.0, 120.0, -7.0, -np.inf, 149.0
     s["alternatives"]["least"] = -8.0
     stay_finite(s)
-    assert s["alternatives"]["log_odds"].tolist() == [CERTAIN_ODDS, CERTAIN_ODDS - 30.0, -8.0, CERTAIN_ODDS - 1.0]
+    assert s["alternatives"]["log_odds"].tolist() == [CERTAIN_ODDS, CERTAIN_ODDS - 30.0, -8.0, -np.inf, CERTAIN_ODDS - 1.0]
 
 
 @pytest.fixture
@@ -348,7 +350,7 @@ def test_two_that_are_alike_wait_for_more_strokes(p, opened):
     s = opened[0]
     s["alternatives"]["log_odds"][:2] = 12.0, 10.0
     assert not settle(s, p, True, 0.004)
-    s["open_s"] = 20.1
+    s["alternatives"]["age_s"] = 20.1
     assert settle(s, p, True, 0.004)
 
 
@@ -402,7 +404,7 @@ def test_what_is_not_suspected_is_looked_for_anew(p, opened):
     s["alternatives"]["log_odds"][STIFFNESS_JUMP] = -3.0
     assert not settle(s, p, False, 0.5) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == -3.0
     settle(s, p, False, 0.6)
-    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS and s["open_s"] == 0.0
+    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS and s["alternatives"]["age_s"][STIFFNESS_JUMP] == 0.0
     s["alternatives"]["log_odds"][STIFFNESS_JUMP] = 1.0
     settle(s, p, False, 2.0)
     assert suspected(s) and s["alternatives"]["log_odds"][STIFFNESS_JUMP] == 1.0
@@ -412,8 +414,77 @@ def test_what_is_not_suspected_is_looked_for_anew(p, opened):
 
 def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):
     s = opened[0]
-    s["alternatives"]["log_odds"][STIFFNESS_JUMP], s["open_s"] = 1.0, 20.1
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP], s["alternatives"]["age_s"] = 1.0, 20.1
     settle(s, p, False, 0.004)
     assert suspected(s)
     settle(s, p, True, 0.004)
     assert not suspected(s)
+
+
+def _renewed(s, p, kind, odds):
+    """Looked for anew with ``odds`` for a jump of ``kind`` that was looked for until now."""
+    s["alternatives"]["log_odds"][kind], s["alternatives"]["age_s"][kind] = odds, 0.9
+    s["alternatives"]["error"][kind, SCALE] = odds
+    settle(s, p, True, 0.004)
+    return s["alternatives"][KEPT_JUMP]
+
+
+def test_the_likeliest_jump_is_kept_beside_its_successor(p, opened):
+    """With what it learned and its age, until a likelier one comes, nothing speaks for it any more, or what was seen counts no
+    more."""
+    s = opened[0]
+    assert not exists(_renewed(s, p, STIFFNESS_JUMP, PRIOR_ODDS + 0.5)), "no more than noise"
+    kept = _renewed(s, p, STIFFNESS_JUMP, -3.0)
+    assert kept["log_odds"] == kept["error"][SCALE] == -3.0 and kept["kind"] == STIFFNESS_JUMP and kept["age_s"] == 0.9
+    assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS
+    assert _renewed(s, p, TORQUE_JUMP, -3.5)["kind"] == STIFFNESS_JUMP
+    assert _renewed(s, p, TORQUE_JUMP, -2.5)["kind"] == TORQUE_JUMP
+    drop_refuted(s)
+    assert exists(kept)
+    kept["log_odds"] = PRIOR_ODDS
+    drop_refuted(s)
+    assert not exists(kept)
+    assert exists(_renewed(s, p, TORQUE_JUMP, -2.5))
+    open_again(s, p)
+    assert not exists(kept)
+    assert exists(_renewed(s, p, TORQUE_JUMP, -2.5))
+    kept["age_s"] = 20.1
+    settle(s, p, True, 0.004)
+    assert not exists(kept), "some stops did not prove it"
+
+
+def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):
+    s = opened[0]
+    kept = _renewed(s, p, STIFFNESS_JUMP, -3.0)
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP], kept["log_odds"] = 9.0, 10.0
+    kept["shift"] = 500.0
+    before = float(s["force"])
+    assert settle(s, p, True, 0.004)
+    assert s["jumps"] == 1.0 and s["force"] == before + 500.0
+
+
+@pytest.mark.parametrize("stiffness", [0.9, 0.94, 1.1])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_other_pads_are_known_after_their_first_stop(p, stiffness, seed):
+    """The way up, on which friction explains them as well, is weighed together with the way back."""
+    other = p.copy()
+    other["curve"] *= stiffness
+    rows, force = brake.samples(other, brake.stops(p, 3, seed))
+    estimates = estimate(brake.noisy(rows, p), p)
+    error = (estimates["force"] - force)[_STOP:]
+    assert np.mean(np.abs(error) < 2.0 * estimates["sigma"][_STOP:]) > 0.95
+    assert np.sqrt(np.mean(error**2)) < 70.0
+
+
+@pytest.mark.parametrize("noise_rad", [0.002, 0.008])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_noisy_angle_is_no_change(p, noise_rad, seed):
+    """One to five counts of a resolver: what goes back and forth turns no friction over, so that the torque of a motor that
+    stands speaks for no jump."""
+    rows, force = brake.samples(p, brake.stops(p, 4, seed))
+    rows = brake.noisy(rows, p)
+    rows["angle"] += np.random.default_rng(seed).normal(0.0, noise_rad, len(rows))
+    estimates = estimate(rows, p)
+    error = estimates["force"] - force
+    assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.97
+    assert np.sqrt(np.mean(error**2)) < 40.0

@@ -12,6 +12,8 @@ from emb_daemon.estimator.hypotheses import (
     DRIFT,
     contact_sigma,
     drift_odds,
+    drop_refuted,
+    exists,
     fold,
     learn,
     mix,
@@ -151,6 +153,8 @@ def _predict(s, p, m, spread, warmth, known):
     predict_errors(s.error, s.covariance, decay, noise_decay, noise, walked)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
+        if not exists(a):
+            continue
         if kind == DRIFT and not known:
             add_drift_walks(walked, p, m.wheel_speed != 0.0, m.dt)
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
@@ -199,6 +203,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
     for kind in range(ALTERNATIVES if not known else 0):
         a = s.alternatives[kind]
+        if not exists(a):
+            continue
         to_force(h, spread, a.slope, s.force + a.shift, warmth)
         taken = needed + leverage * a.shift
         to_torque(h, leverage, slope, s_mean, load + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
@@ -209,6 +215,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
+    drop_refuted(s)
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
         uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     return sqrt(moving + slow)

@@ -2,10 +2,14 @@
 
 Each is a Kalman filter over the errors of both paths. The first believes what it learned and only walks. The others are the
 first, opened again at every release and every while by what `unknown` says may jump in the stiffness path or in the torque
-path; and a brake whose disc grows with heat, which shows slowly and is opened once. All explain the same torque; the ratios
-of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10,
-1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
-deviation. A proven one becomes the first hypothesis.
+path; the likeliest of those that were opened before; and a brake whose disc grows with heat, which shows slowly and is opened
+once. All explain the same torque; the ratios of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic
+processes, IEEE Trans. Automatic Control 10, 1965) say which holds, and the fused force is their mixture, so that an unproven
+change already counts in its standard deviation. A proven one becomes the first hypothesis.
+
+On the way to a force pads, torque constant and friction look alike, and the first hypothesis bends its friction to what other
+pads do. A jump opened anew after that begins with the bent friction: only one that was open before tells them apart when the
+motor turns round. So the likeliest is kept beside its successor while anything speaks for it.
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
 torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
@@ -68,27 +72,32 @@ _DRIFT_ODDS = -2.0
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, 4.0
 #: Log odds that are as good as certainty.
 CERTAIN_ODDS = 100.0
-#: Time after which an unproven jump is looked for anew, s.
-_OPENED_S = 1.0
-#: Time after which the stronger of two proven alternatives is taken though they are alike, and a merely suspected one given up
-#: at the next release, s: some stops of ordinary driving.
+#: Time after which an unproven jump is looked for anew, s, and how much likelier than its successor, as log odds, it must have
+#: become to be kept beside it: by more than noise makes it.
+_OPENED_S, _KEPT = 1.0, 1.0
+#: Time, that in the clearance apart, after which the stronger of two proven alternatives is taken though they are alike, and a
+#: merely suspected one given up at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
 GATE = 5.0
 
-#: What may have changed at once, or with heat, and a brake that drifts, which never becomes the first hypothesis.
-ALTERNATIVES = 4
-STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, DRIFT = range(ALTERNATIVES)
+#: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
+#: first hypothesis.
+ALTERNATIVES = 5
+STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
-#: One hypothesis beside the first. ``log_odds`` against it, at ``least``, and the ``share`` that it has by them; ``slope``
-#: N/rad at its own contact angle; ``shift`` N: its force over the first one's.
+#: One hypothesis beside the first, of which ``kind`` a kept jump is. ``log_odds`` against the first, at ``least``, and the
+#: ``share`` that it has by them, none if there is no such hypothesis; ``age_s`` since it was opened, that in the clearance
+#: apart; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over the first one's.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
+        ("kind", "i8"),
+        ("age_s", "f8"),
         ("log_odds", "f8"),
         ("least", "f8"),
         ("share", "f8"),
@@ -128,15 +137,38 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.least = a.log_odds = _least_odds(s, kind)
-    a.shift = 0.0
+    a.shift = a.age_s = 0.0
+    a.kind = kind
+
+
+@njit
+def _forget_kept(s):
+    kept = s.alternatives[KEPT_JUMP]
+    kept.log_odds, kept.shift = -np.inf, 0.0
+
+
+@njit
+def exists(a):
+    """Whether there is such a hypothesis: a kept jump may be none."""
+    return a.log_odds > -np.inf
 
 
 @njit
 def open_again(s, p):
-    """Look for jumps from now on."""
+    """Look for jumps from now on; what was seen before tells nothing of them."""
     _open(s, p, STIFFNESS_JUMP)
     _open(s, p, TORQUE_JUMP)
-    s.open_s = 0.0
+    _forget_kept(s)
+
+
+@njit
+def _succeed(s, p, kind):
+    """Look for a jump of ``kind`` from now on; one that may have been before is kept if it is likelier than the kept one."""
+    a, kept = s.alternatives[kind], s.alternatives[KEPT_JUMP]
+    if a.log_odds > max(a.least + _KEPT, kept.log_odds):
+        copy_errors(kept.error, kept.covariance, a.error, a.covariance)
+        kept.kind, kept.age_s, kept.log_odds, kept.least, kept.shift = kind, a.age_s, a.log_odds, a.least, a.shift
+    _open(s, p, kind)
 
 
 @njit
@@ -148,12 +180,21 @@ def open_all(s, p):
 
 
 @njit
+def _likeliest(s):
+    best = 0
+    for i in range(1, DRIFT):
+        if s.alternatives[i].log_odds > s.alternatives[best].log_odds:
+            best = i
+    return s.alternatives[best]
+
+
+@njit
 def _strongest(s, but):
-    """Log odds of the strongest alternative ``but`` one."""
+    """Log odds of the strongest alternative that is of another kind than ``but``."""
     best = PRIOR_ODDS
-    for kind in range(DRIFT):
-        if kind != but:
-            best = max(best, s.alternatives[kind].log_odds)
+    for i in range(DRIFT):
+        if s.alternatives[i].kind != but:
+            best = max(best, s.alternatives[i].log_odds)
     return best
 
 
@@ -173,7 +214,7 @@ def _share_out(s):
 def drift_odds(s):
     """Log odds between which those of a drift stay. Whatever is the likeliest, it may be a drift that makes it so: until that
     is proven a share of it stays, and as it can explain anything a little at a time, never the larger one."""
-    likeliest = max(_strongest(s, -1), 0.0)
+    likeliest = max(_strongest(s, DRIFT), 0.0)
     return likeliest + _DRIFT_ODDS, likeliest
 
 
@@ -290,13 +331,22 @@ def weigh(a, least, most, first, first_variance, second, second_variance):
 
 
 @njit
+def drop_refuted(s):
+    """A kept jump is none once nothing speaks for it."""
+    kept = s.alternatives[KEPT_JUMP]
+    if kept.log_odds <= kept.least:
+        _forget_kept(s)
+
+
+@njit
 def stay_finite(s):
     """Log odds count from the first hypothesis; beyond certainty against it, what tells the alternatives apart stays."""
-    beyond = _strongest(s, -1) - CERTAIN_ODDS
+    beyond = _strongest(s, DRIFT) - CERTAIN_ODDS
     if beyond > 0.0:
         for kind in range(ALTERNATIVES):
             a = s.alternatives[kind]
-            a.log_odds = max(a.log_odds - beyond, a.least)
+            if exists(a):
+                a.log_odds = max(a.log_odds - beyond, a.least)
 
 
 @njit
@@ -305,27 +355,32 @@ def settle(s, p, released, dt):
 
     While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
     them apart, so nothing is proven before. The mixture does not wait."""
-    s.open_s += dt
     if s.contact.engaged:
         s.braked = True
     elif released and s.braked:
         s.braked = False
         s.stops += 1.0
-    for kind in range(DRIFT if released else 0):
-        a = s.alternatives[kind]
-        margin = _CLEARLY if s.open_s < _AMBIGUOUS_S else 0.0
-        # What is expected needs as much evidence as what is not: else one jump that was none would bring the next.
-        evidence = a.log_odds - max(a.least, PRIOR_ODDS) > _PROVEN - PRIOR_ODDS
-        if evidence and a.log_odds > _PROVEN and a.log_odds - _strongest(s, kind) >= margin:
-            copy_errors(s.error, s.covariance, a.error, a.covariance)
-            s.force += a.shift
-            s.drive += a.shift
-            if kind == STIFFNESS_JUMP:
-                s.jumps += 1.0
-            return True
-    given_up = released and s.open_s > _AMBIGUOUS_S and _strongest(s, -1) < _PROVEN
-    if given_up or (not suspected(s) and (s.open_s > _OPENED_S or released)):
-        open_again(s, p)
+    for i in range(0 if released else DRIFT):
+        s.alternatives[i].age_s += dt
+    a = _likeliest(s)
+    margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
+    # What is expected needs as much evidence as what is not: else one jump that was none would bring the next.
+    evidence = a.log_odds - max(a.least, PRIOR_ODDS) > _PROVEN - PRIOR_ODDS
+    if released and evidence and a.log_odds > _PROVEN and a.log_odds - _strongest(s, a.kind) >= margin:
+        copy_errors(s.error, s.covariance, a.error, a.covariance)
+        s.force += a.shift
+        s.drive += a.shift
+        if a.kind == STIFFNESS_JUMP:
+            s.jumps += 1.0
+        return True
+    stiffness, torque, kept = s.alternatives[STIFFNESS_JUMP], s.alternatives[TORQUE_JUMP], s.alternatives[KEPT_JUMP]
+    undecided = released and _strongest(s, DRIFT) < _PROVEN
+    waited_for = _speaks(stiffness) or _speaks(torque)
+    if (undecided and stiffness.age_s > _AMBIGUOUS_S) or (not waited_for and (released or stiffness.age_s > _OPENED_S)):
+        _succeed(s, p, STIFFNESS_JUMP)
+        _succeed(s, p, TORQUE_JUMP)
+    if undecided and kept.age_s > _AMBIGUOUS_S:
+        _forget_kept(s)
     return False
 
 
