@@ -9,7 +9,7 @@ from emb_daemon.jit import njit
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
-from emb_daemon.models.torque import friction_state, slid_angle, unexplained_torque
+from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Time between two samples up to which none is missing, s.
@@ -92,6 +92,22 @@ def settle_paths(s, p, m, factor):
 
 
 @njit
+def _slid(s, p, angle, travel, dt):
+    """Angle (rad) that the gear has slid through, with the motor at ``angle`` after ``travel`` rad.
+
+    A noisy angle goes back and forth, and friction that followed it would turn over and over while the motor stands: what the
+    torque then says of friction would pass for a change of the brake. Of noise that is known by its turning back, friction
+    follows what is more than its own presliding."""
+    s.turned_back = turned_back(s.turned_back, s.direction, travel, dt)
+    if travel != 0.0:
+        s.direction = travel
+    noise = p.presliding_angle if s.turned_back > NOISE_TURNS_BACK else 0.0
+    before = s.slid_angle
+    s.slid_angle = slid_angle(before, angle, max(noise, FLICKER_RAD))
+    return s.slid_angle - before
+
+
+@njit
 def torque_path(s, p, m):
     """Torque path over the cycle that ends at this sample.
 
@@ -99,8 +115,7 @@ def torque_path(s, p, m):
     the torque is NaN where it says nothing.
     """
     travel = m.angle - s.angle
-    slid = slid_angle(s.slid_angle, m.angle, FLICKER_RAD) - s.slid_angle
-    s.slid_angle += slid
+    slid = _slid(s, p, m.angle, travel, m.dt)
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )

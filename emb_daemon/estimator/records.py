@@ -102,8 +102,9 @@ STATE = np.dtype(
         ("spring_force", "f8"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
-        # Torque path.
-        *fields("f8", "friction_state slid_angle friction_mean friction_variance torque_age balance leverage"),
+        # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late.
+        *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back"),
+        *fields("f8", "torque_age balance leverage"),
         ("contact", CONTACT),
         ("plausibility", PLAUSIBILITY),
         # Age of the angle beside the speed, and beyond what the calibration knows, s.
@@ -113,7 +114,6 @@ STATE = np.dtype(
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
-        ("open_s", "f8"),
         # Whether the pads have touched since the last release; stops so far, and proven jumps of the stiffness path.
         ("braked", "?"),
         *fields("f8", "stops jumps"),

@@ -9,6 +9,19 @@ from math import exp
 
 from emb_daemon.jit import njit
 
+#: Time over which turning back is counted, s: a dozen samples. One reversal makes 0.08 of it.
+_OF_LATE_S = 0.05
+#: Share of turning back beyond which an angle's motion is noise: that turns back in two of three samples, in every other if it
+#: is a noisy speed added up, and a motor that swings at 10 Hz in one of twelve.
+NOISE_TURNS_BACK = 0.15
+
+
+@njit
+def turned_back(share, direction, travel, dt):
+    """Share of the samples in which the motor turned back of late, after one of ``travel`` rad in ``dt`` s; ``direction``: its
+    last way, any size."""
+    return share + ((travel * direction < 0.0) - share) * min(dt / _OF_LATE_S, 1.0)
+
 
 @njit
 def slid_angle(before, angle, flicker):
