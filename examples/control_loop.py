@@ -16,22 +16,26 @@ FASTEST = 150.0  # rad/s
 
 
 class ToyBrake:
-    """A motor that obeys speed commands and pads whose force follows the calibration's own curve."""
+    """A motor that obeys speed commands, pads whose force follows the calibration's own curve, and its friction."""
 
     def __init__(self, calibration):
         self.curve = curve_at(calibration.stiffness.curves, calibration.pad_thickness_mm)
+        self.share = 1.0 - math.exp(-DT_S / calibration.stiffness.relaxation_time_s)
         self.motor, self.friction, self.clearance = calibration.motor, calibration.friction, calibration.contact.clearance_rad
-        self.angle = self.speed = self.force = 0.0
+        self.angle = self.speed = self.force = self.turned = 0.0
 
     def move(self, speed: float) -> float:
         """Returns the mean motor current over the cycle."""
         before, self.angle = self.force, self.angle + speed * DT_S
         x = max(self.angle - self.clearance, 0.0)
-        self.force = sum(a * x ** (n + 1) for n, a in enumerate(self.curve))
+        self.force += self.share * (sum(a * x ** (n + 1) for n, a in enumerate(self.curve)) - self.force)
         mean = 0.5 * (before + self.force)
         torque = self.motor.inertia_kg_m2 * (speed - self.speed) / DT_S + self.motor.gear_gain_m_per_rad * mean
-        if speed != 0.0:
-            torque += math.copysign(self.friction.load_m_per_rad * mean + self.friction.offset_Nm, speed)
+        # Friction turns over within the presliding angle.
+        self.turned += (math.copysign(1.0, speed) - self.turned) * (
+            1.0 - math.exp(-abs(speed) * DT_S / self.friction.presliding_angle_rad)
+        )
+        torque += self.turned * (self.friction.load_m_per_rad * mean + self.friction.offset_Nm)
         self.speed = speed
         return torque / self.motor.torque_constant_Nm_per_A
 
