@@ -15,7 +15,6 @@ from emb_daemon.estimator.hypotheses import (
     STIFFNESS_JUMP,
     TORQUE_JUMP,
     drift_odds,
-    drop_refuted,
     exists,
     mix,
     open_again,
@@ -421,36 +420,41 @@ def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):
     assert not suspected(s)
 
 
-def _renewed(s, p, kind, odds):
-    """Looked for anew with ``odds`` for a jump of ``kind`` that was looked for until now."""
-    s["alternatives"]["log_odds"][kind], s["alternatives"]["age_s"][kind] = odds, 0.9
+def _renewed(s, p, kind, odds, released=True):
+    """Looked for anew with ``odds`` for a jump of ``kind`` that was looked for until now, after a release or in a stop."""
+    s["alternatives"]["log_odds"][kind], s["alternatives"]["age_s"][:2] = odds, 0.9
     s["alternatives"]["error"][kind, SCALE] = odds
-    settle(s, p, True, 0.004)
+    settle(s, p, released, 0.2)
     return s["alternatives"][KEPT_JUMP]
 
 
 def test_the_likeliest_jump_is_kept_beside_its_successor(p, opened):
-    """With what it learned and its age, until a likelier one comes, nothing speaks for it any more, or what was seen counts no
-    more."""
+    """With what it learned and its age, until a clearly likelier one comes, or what was seen counts no more."""
     s = opened[0]
     assert not exists(_renewed(s, p, STIFFNESS_JUMP, PRIOR_ODDS + 0.5)), "no more than noise"
-    kept = _renewed(s, p, STIFFNESS_JUMP, -3.0)
-    assert kept["log_odds"] == kept["error"][SCALE] == -3.0 and kept["kind"] == STIFFNESS_JUMP and kept["age_s"] == 0.9
+    kept = _renewed(s, p, STIFFNESS_JUMP, -3.5)
+    assert kept["log_odds"] == kept["error"][SCALE] == -3.5 and kept["kind"] == STIFFNESS_JUMP and kept["age_s"] == 0.9
     assert s["alternatives"]["log_odds"][STIFFNESS_JUMP] == PRIOR_ODDS
-    assert _renewed(s, p, TORQUE_JUMP, -3.5)["kind"] == STIFFNESS_JUMP
-    assert _renewed(s, p, TORQUE_JUMP, -2.5)["kind"] == TORQUE_JUMP
-    drop_refuted(s)
-    assert exists(kept)
-    kept["log_odds"] = PRIOR_ODDS
-    drop_refuted(s)
-    assert not exists(kept)
-    assert exists(_renewed(s, p, TORQUE_JUMP, -2.5))
+    assert _renewed(s, p, TORQUE_JUMP, -3.0)["kind"] == STIFFNESS_JUMP
+    assert _renewed(s, p, TORQUE_JUMP, -2.4)["kind"] == TORQUE_JUMP
     open_again(s, p)
     assert not exists(kept)
     assert exists(_renewed(s, p, TORQUE_JUMP, -2.5))
     kept["age_s"] = 20.1
     settle(s, p, True, 0.004)
     assert not exists(kept), "some stops did not prove it"
+
+
+def test_what_nothing_spoke_for_on_the_way_to_a_force_is_kept_for_the_way_back(p, opened):
+    """And no longer, if nothing spoke for it there either."""
+    s = opened[0]
+    kept = _renewed(s, p, STIFFNESS_JUMP, PRIOR_ODDS, released=False)
+    assert exists(kept) and kept["kind"] == STIFFNESS_JUMP and kept["error"][SCALE] == PRIOR_ODDS
+    assert _renewed(s, p, TORQUE_JUMP, PRIOR_ODDS + 0.5, released=False)["kind"] == STIFFNESS_JUMP
+    settle(s, p, False, 2.0)
+    assert exists(kept)
+    settle(s, p, True, 0.004)
+    assert not exists(kept)
 
 
 def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):
@@ -464,7 +468,7 @@ def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):
 
 
 @pytest.mark.parametrize("stiffness", [0.9, 0.94, 1.1])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_other_pads_are_known_after_their_first_stop(p, stiffness, seed):
     """The way up, on which friction explains them as well, is weighed together with the way back."""
     other = p.copy()

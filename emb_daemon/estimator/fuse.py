@@ -12,7 +12,6 @@ from emb_daemon.estimator.hypotheses import (
     DRIFT,
     contact_sigma,
     drift_odds,
-    drop_refuted,
     exists,
     fold,
     learn,
@@ -215,7 +214,6 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         if kind != DRIFT and abs(second) / sqrt(variance_a) < abs(out.innovation) / out.innovation_sigma:
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
-    drop_refuted(s)
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
         uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     return sqrt(moving + slow)

@@ -9,7 +9,7 @@ change already counts in its standard deviation. A proven one becomes the first 
 
 On the way to a force pads, torque constant and friction look alike, and the first hypothesis bends its friction to what other
 pads do. A jump opened anew after that begins with the bent friction: only one that was open before tells them apart when the
-motor turns round. So the likeliest is kept beside its successor while anything speaks for it.
+motor turns round. So the likeliest is kept beside its successor, until the release and while anything speaks for it.
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
 torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
@@ -162,10 +162,11 @@ def open_again(s, p):
 
 
 @njit
-def _succeed(s, p, kind):
-    """Look for a jump of ``kind`` from now on; one that may have been before is kept if it is likelier than the kept one."""
+def _succeed(s, p, kind, released):
+    """Look for a jump of ``kind`` from now on. The one before is kept if it is clearly likelier than the kept one; after a
+    release only if anything speaks for it, for what nothing spoke for on the way to a force may on the way back."""
     a, kept = s.alternatives[kind], s.alternatives[KEPT_JUMP]
-    if a.log_odds > max(a.least + _KEPT, kept.log_odds):
+    if a.log_odds > kept.log_odds + _KEPT and (not released or a.log_odds > a.least + _KEPT):
         copy_errors(kept.error, kept.covariance, a.error, a.covariance)
         kept.kind, kept.age_s, kept.log_odds, kept.least, kept.shift = kind, a.age_s, a.log_odds, a.least, a.shift
     _open(s, p, kind)
@@ -331,14 +332,6 @@ def weigh(a, least, most, first, first_variance, second, second_variance):
 
 
 @njit
-def drop_refuted(s):
-    """A kept jump is none once nothing speaks for it."""
-    kept = s.alternatives[KEPT_JUMP]
-    if kept.log_odds <= kept.least:
-        _forget_kept(s)
-
-
-@njit
 def stay_finite(s):
     """Log odds count from the first hypothesis; beyond certainty against it, what tells the alternatives apart stays."""
     beyond = _strongest(s, DRIFT) - CERTAIN_ODDS
@@ -377,9 +370,10 @@ def settle(s, p, released, dt):
     undecided = released and _strongest(s, DRIFT) < _PROVEN
     waited_for = _speaks(stiffness) or _speaks(torque)
     if (undecided and stiffness.age_s > _AMBIGUOUS_S) or (not waited_for and (released or stiffness.age_s > _OPENED_S)):
-        _succeed(s, p, STIFFNESS_JUMP)
-        _succeed(s, p, TORQUE_JUMP)
-    if undecided and kept.age_s > _AMBIGUOUS_S:
+        _succeed(s, p, STIFFNESS_JUMP, released)
+        _succeed(s, p, TORQUE_JUMP, released)
+    refuted = released and kept.log_odds <= kept.least
+    if refuted or (undecided and kept.age_s > _AMBIGUOUS_S):
         _forget_kept(s)
     return False
 
