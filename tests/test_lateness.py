@@ -4,7 +4,7 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.models.lateness import LATENESS, follow
+from emb_daemon.models.lateness import LATENESS, follow, interrupt
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
 
@@ -17,22 +17,29 @@ def _strokes(seconds=3.0):
     return (lambda t: 10.0 * (1.0 - np.cos(9.0 * t)) * (t > 0.0)), (lambda t: 90.0 * np.sin(9.0 * t) * (t > 0.0))
 
 
-def _age(late_s=0.0, gain=1.0, speed_late_s=0.0, seed=1):
+def _signals(late_s=0.0, gain=1.0, speed_late_s=0.0, seconds=3.0, seed=1):
+    """Angles (rad) and speeds (rad/s) as they are sampled."""
     angle, speed = _strokes()
-    time, rng = np.arange(0.0, 3.0, _DT), np.random.default_rng(seed)
+    time, rng = np.arange(0.0, seconds, _DT), np.random.default_rng(seed)
     angles = np.round(gain * angle(time - late_s) / _COUNT) * _COUNT
-    speeds = speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
-    a = np.zeros(1, LATENESS)[0]
-    for i in range(1, len(time)):
+    return angles, speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
+
+
+def _follow(a, angles, speeds):
+    for i in range(1, len(angles)):
         turned = 0.5 * (speeds[i] + speeds[i - 1]) * _DT
         follow(a, angles[i] - angles[i - 1], turned, speeds[i] - speeds[i - 1], _DT)
     return float(a["age"])
 
 
+def _age(**signals):
+    return _follow(np.zeros(1, LATENESS)[0], *_signals(**signals))
+
+
 @pytest.mark.parametrize("late_s", [0.001, 0.004, 0.009])
 @pytest.mark.parametrize("gain", [1.0, 0.95, 1.05])
 def test_the_age_is_found_whatever_the_gain(late_s, gain):
-    assert _age(late_s, gain) == pytest.approx(late_s, abs=0.1 * late_s + 2e-4)
+    assert _age(late_s=late_s, gain=gain) == pytest.approx(late_s, abs=0.1 * late_s + 2e-4)
 
 
 @pytest.mark.parametrize("gain", [0.93, 1.0, 1.07])
@@ -42,6 +49,48 @@ def test_an_angle_in_time_is_not_old(gain):
 
 def test_an_older_speed_says_nothing_of_the_angle():
     assert _age(speed_late_s=0.003) == 0.0
+
+
+def test_no_angle_is_older_than_the_oldest():
+    assert _age(late_s=0.016) == 0.015
+
+
+def test_one_stroke_tells():
+    assert _age(late_s=0.004, seconds=0.8) == pytest.approx(0.004, rel=0.2)
+
+
+def test_nothing_is_learned_of_a_motor_that_stands():
+    """Neither of its noise, nor of signals without any."""
+    a, rng = np.zeros(1, LATENESS)[0], np.random.default_rng(1)
+    assert _follow(a, np.zeros(10), np.zeros(10)) == 0.0
+    assert _follow(a, _COUNT * rng.integers(0, 2, 750), 0.3 * rng.standard_normal(750)) < 2e-4
+
+
+def test_an_age_is_kept_while_the_motor_stands_and_forgotten_when_it_has_gone():
+    a = np.zeros(1, LATENESS)[0]
+    assert _follow(a, *_signals(late_s=0.004, seconds=60.0)) == pytest.approx(0.004, rel=0.1)
+    assert _follow(a, np.zeros(2500), np.zeros(2500)) == pytest.approx(0.004, rel=0.1)
+    assert _follow(a, *_signals(seconds=120.0)) < 6e-4
+
+
+def test_neither_a_slip_nor_an_offset_of_the_speed_is_an_age():
+    """A resolver that slips on its shaft is off at once; a speed that is off by a little, ever more."""
+    angles, speeds = _signals(seconds=30.0)
+    angles[angles.size // 2 :] += 1.0
+    assert _follow(np.zeros(1, LATENESS)[0], angles, speeds) < 2e-4
+    angles, speeds = _signals(seconds=30.0)
+    assert _follow(np.zeros(1, LATENESS)[0], angles, speeds + 0.3) < 2e-4
+
+
+def test_after_an_interruption_what_is_apart_is_counted_anew():
+    """Samples of a fault that was found late say nothing of those after it; what was known before stays known."""
+    a = np.zeros(1, LATENESS)[0]
+    age = _follow(a, *_signals(late_s=0.004))
+    follow(a, 0.0, 0.05, 4.0, _DT)
+    interrupt(a)
+    assert a["apart"] == a["gained"] == a["gone"] == 0.0
+    follow(a, 0.0, 0.0, 0.0, _DT)
+    assert a["age"] == pytest.approx(age, rel=0.02)
 
 
 @pytest.mark.parametrize("late_s", [0.002, 0.006, 0.0095])
