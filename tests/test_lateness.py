@@ -4,6 +4,9 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.estimator import fuse, step
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.status import ANGLE_LATE
 from emb_daemon.models.lateness import LATENESS, follow, interrupt
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
@@ -123,3 +126,71 @@ def test_a_delay_that_the_calibration_knows_is_undone_once(parameters):
     p["effects"]["signal_delay"]["delay_s"] = 0.004
     error = (estimate(rows, p.reshape(1))["force"] - force)[750:]
     assert np.sqrt(np.mean(error**2)) < 60.0
+
+
+# In the estimator.
+
+
+@pytest.fixture
+def s():
+    return new_state()[0]
+
+
+def _turning(p):
+    """A sample of a motor that gains speed."""
+    m = brake.samples(p, np.zeros(2))[0][1]
+    m["angle"], m["speed"] = 0.5, 100.0
+    return m
+
+
+@pytest.mark.parametrize("what", ["nothing", "zero moved", "no time", "a sample missing", "drifting", "frozen"])
+def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
+    m = _turning(parameters[0])
+    step._follow_age(s, parameters[0], m, False)
+    before = s["lateness"].copy()
+    assert before["apart"] != 0.0 and before["gained"] == 100.0
+    if what == "no time":
+        m["dt"] = 0.0
+    elif what == "a sample missing":
+        m["dt"] = 0.008
+    elif what == "drifting":
+        s["drifting_s"] = 0.1
+    elif what == "frozen":
+        # The angle stands while the speed goes on.
+        s["plausibility"]["still"] = 5
+    step._follow_age(s, parameters[0], m, what == "zero moved")
+    followed = what == "nothing"
+    assert (s["lateness"]["gained"] != 0.0) == (s["lateness"]["apart"] != 0.0) == followed
+    assert (s["lateness"]["ss"] != before["ss"]) == followed
+
+
+def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s):
+    p, m = parameters[0], _turning(parameters[0])
+    s["lateness"]["ss"] = s["lateness"]["ww"] = 1e9
+    s["lateness"]["as_"] = -0.005 * 1e9
+    step._follow_age(s, p, m, False)
+    assert s["late"] == pytest.approx(0.005, rel=0.01)
+    p["effects"]["signal_delay"]["delay_s"] = 0.003
+    step._follow_age(s, p, m, False)
+    assert s["late"] == pytest.approx(0.002, rel=0.02)
+    p["clearance_sigma"] = 0.0
+    step._follow_age(s, p, m, False)
+    assert s["late"] == 0.0
+
+
+def test_what_a_late_angle_leaves_open_counts_while_the_speed_changes(parameters, s):
+    """The way of the speed gained meanwhile, 0.5 a t^2, on the stiffness."""
+    p, m = parameters[0], _turning(parameters[0])
+    s["slope"], s["gear_slope"] = 1000.0, 1.0
+    without = fuse._spread(s, p, m)
+    s["late"] = 0.009
+    more = np.sqrt(fuse._spread(s, p, m) ** 2 - without**2)
+    assert more == pytest.approx(0.5 * 0.009**2 * (100.0 / 0.004) * 1000.0)
+    s["speed"] = 100.0
+    assert fuse._spread(s, p, m) == without
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(0.0079, False), (0.0081, True)])
+def test_an_angle_over_two_cycles_old_is_told(parameters, s, late_s, told):
+    s["late"] = late_s
+    assert bool(fuse._facts_of_torque(s, parameters[0]) & ANGLE_LATE) == told

@@ -5,7 +5,9 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import uneven
+from emb_daemon.estimator import fuse, uneven
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.status import DISC_UNEVEN
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE, PULSE_MODULO, PULSES_PER_TURN
 
@@ -245,3 +247,25 @@ def test_what_is_half_believed_is_covered_and_told(p):
     assert uneven.applied(u) == 0.5 * u["shift"]
     assert uneven.unproven(u) == pytest.approx(0.5 * crest, rel=0.1)
     assert uneven.force_sigma(u) > max(sure, 0.45 * abs(u["shift"]))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.0, False), (0.5, True), (1.0, False)])
+def test_a_disc_is_told_while_it_is_not_sure(p, share, told):
+    s = new_state()[0]
+    s["uneven"]["amplitude"][0], s["uneven"]["force"][0], s["uneven"]["share"] = 10e-6, 2e7, share
+    assert bool(fuse._facts_of_torque(s, p) & DISC_UNEVEN) == told
+
+
+@pytest.mark.parametrize("stands", ["", "motor", "wheel"])
+def test_only_a_motor_that_moves_on_a_turning_disc_teaches(p, stands):
+    rows, state = _stops(p, 12.0, 0.0)[0], new_state()
+    # To the top of the second stop, and what follows.
+    top = _STOP + 425
+    estimate(rows[:top], p.reshape(1), state)
+    before, rows = state["uneven"]["amplitude"].copy(), rows[top : top + 125].copy()
+    if stands == "motor":
+        rows["angle"] = state["angle"]
+    elif stands == "wheel":
+        rows["wheel_speed"] = 0.0
+    estimate(rows, p.reshape(1), state)
+    assert np.any(state["uneven"]["amplitude"] != before) == (not stands)
