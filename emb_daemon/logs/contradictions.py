@@ -43,7 +43,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         # The travel tells nothing of directions; current and force do.
         speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
         if not (speed is None or current is None or force is None or (angle or speed.integral()).way_is_unknown):
-            lines += _against_each_other(speed, current, force)
+            lines += _find_opposed(speed, current, force)
         return lines
     if jump := _starts_anew(angle.values):
         return [
@@ -51,13 +51,13 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`",
         ]
     if current is not None and np.ptp(current.values):
-        lines += _turned_current(angle, current)
+        lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _turned_force(angle, force)
+        lines += _find_turned_force(angle, force)
     return lines
 
 
-def _against_each_other(speed: Series, current: Series, force: Series) -> list[str]:
+def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     """A line where the force falls whenever the current rises that does not accelerate the motor."""
     times = current.time_ns
     at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
@@ -101,7 +101,7 @@ def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.nda
     return current - np.linalg.lstsq(columns, current)[0][2] * acceleration
 
 
-def _turned_current(angle: Series, current: Series) -> list[str]:
+def _find_turned_current(angle: Series, current: Series) -> list[str]:
     acceleration = np.gradient(angle.derivative().values, 1e-9 * angle.time_ns)
     at = current.sampled(angle.time_ns)
     known = np.isfinite(at) & np.isfinite(acceleration)
@@ -126,7 +126,7 @@ def _turned_current(angle: Series, current: Series) -> list[str]:
     return []
 
 
-def _turned_force(angle: Series, force: Series) -> list[str]:
+def _find_turned_force(angle: Series, force: Series) -> list[str]:
     low, high = _by_travel(angle, force)
     largest = float(np.quantile(np.abs(force.values), 0.99))
     if abs(high - low) < _FOLLOWS * largest:
