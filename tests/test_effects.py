@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import hashlib
 import os
 import pickle
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core import config
 
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
@@ -136,21 +138,32 @@ def _of_a_widening_caliper():
     return dataclasses.replace(log, samples=samples)
 
 
-def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(tmp_path):
+@pytest.fixture
+def one_more(tmp_path) -> Path:
+    """A folder with a package that has one effect more. It is kept beside numba's for this state of the sources: the next run
+    compiles none of it."""
     root = Path(emb_daemon.__file__).parent.parent
-    for folder in ("emb_daemon", "config", "dbc"):
-        shutil.copytree(root / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    effects = tmp_path / "emb_daemon" / "effects"
     text = (root / "examples" / "own_effect.py").read_text().replace("caliper_widening", "own_effect")
+    kept = Path(config.CACHE_DIR) / f"one_more_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    if kept.exists():
+        return kept
+    new = tmp_path / "new"
+    for folder in ("emb_daemon", "config", "dbc"):
+        shutil.copytree(root / folder, new / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    effects = new / "emb_daemon" / "effects"
     (effects / "own_effect.py").write_text(text.partition('if __name__ == "__main__":')[0])
     registration = effects / "__init__.py"
     registration.write_text(
         registration.read_text().replace('    "thermocouple_lag",\n', '    "thermocouple_lag",\n    "own_effect",\n')
     )
+    return Path(shutil.move(new, kept))
+
+
+def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(one_more, tmp_path):
     (tmp_path / "log").write_bytes(pickle.dumps(_of_a_widening_caliper()))
-    environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    environment = os.environ | {"PYTHONPATH": str(one_more), "NUMBA_CACHE_DIR": str(one_more / "cache")}
     command = [sys.executable, "-c", _ONE_MORE, str(tmp_path / "log")]
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(command, env=environment, cwd=one_more, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     without, with_, found = done.stdout.splitlines()
     assert float(without) > 4.0 * float(with_)

@@ -4,7 +4,10 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.models.lateness import LATENESS, follow
+from emb_daemon.estimator import fuse, step
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.status import ANGLE_LATE
+from emb_daemon.models.lateness import LATENESS, follow, interrupt
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
 
@@ -17,22 +20,29 @@ def _strokes(seconds=3.0):
     return (lambda t: 10.0 * (1.0 - np.cos(9.0 * t)) * (t > 0.0)), (lambda t: 90.0 * np.sin(9.0 * t) * (t > 0.0))
 
 
-def _age(late_s=0.0, gain=1.0, speed_late_s=0.0, seed=1):
+def _signals(late_s=0.0, gain=1.0, speed_late_s=0.0, seconds=3.0, seed=1):
+    """Angles (rad) and speeds (rad/s) as they are sampled."""
     angle, speed = _strokes()
-    time, rng = np.arange(0.0, 3.0, _DT), np.random.default_rng(seed)
+    time, rng = np.arange(0.0, seconds, _DT), np.random.default_rng(seed)
     angles = np.round(gain * angle(time - late_s) / _COUNT) * _COUNT
-    speeds = speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
-    a = np.zeros(1, LATENESS)[0]
-    for i in range(1, len(time)):
+    return angles, speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
+
+
+def _follow(a, angles, speeds):
+    for i in range(1, len(angles)):
         turned = 0.5 * (speeds[i] + speeds[i - 1]) * _DT
         follow(a, angles[i] - angles[i - 1], turned, speeds[i] - speeds[i - 1], _DT)
     return float(a["age"])
 
 
+def _age(**signals):
+    return _follow(np.zeros(1, LATENESS)[0], *_signals(**signals))
+
+
 @pytest.mark.parametrize("late_s", [0.001, 0.004, 0.009])
 @pytest.mark.parametrize("gain", [1.0, 0.95, 1.05])
 def test_the_age_is_found_whatever_the_gain(late_s, gain):
-    assert _age(late_s, gain) == pytest.approx(late_s, abs=0.1 * late_s + 2e-4)
+    assert _age(late_s=late_s, gain=gain) == pytest.approx(late_s, abs=0.1 * late_s + 2e-4)
 
 
 @pytest.mark.parametrize("gain", [0.93, 1.0, 1.07])
@@ -42,6 +52,48 @@ def test_an_angle_in_time_is_not_old(gain):
 
 def test_an_older_speed_says_nothing_of_the_angle():
     assert _age(speed_late_s=0.003) == 0.0
+
+
+def test_no_angle_is_older_than_the_oldest():
+    assert _age(late_s=0.016) == 0.015
+
+
+def test_one_stroke_tells():
+    assert _age(late_s=0.004, seconds=0.8) == pytest.approx(0.004, rel=0.2)
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.02])
+def test_nothing_is_learned_of_a_motor_that_stands(noise):
+    """Neither of its noise, nor of signals without any."""
+    a, rng = np.zeros(1, LATENESS)[0], np.random.default_rng(1)
+    assert _follow(a, np.zeros(10), np.zeros(10)) == 0.0
+    assert _follow(a, _COUNT * rng.integers(0, 2, 750), noise * rng.standard_normal(750)) < 2e-4
+
+
+def test_an_age_is_kept_while_the_motor_stands_and_forgotten_when_it_has_gone():
+    a = np.zeros(1, LATENESS)[0]
+    assert _follow(a, *_signals(late_s=0.004, seconds=60.0)) == pytest.approx(0.004, rel=0.1)
+    assert _follow(a, np.zeros(2500), np.zeros(2500)) == pytest.approx(0.004, rel=0.1)
+    assert _follow(a, *_signals(seconds=120.0)) < 6e-4
+
+
+def test_neither_a_slip_nor_an_offset_of_the_speed_is_an_age():
+    """A resolver that slips on its shaft as each stroke begins is off at once; a speed that is off by a little, ever more."""
+    angles, speeds = _signals(seconds=30.0)
+    strokes = np.floor(9.0 * _DT * np.arange(len(angles)) / (2.0 * np.pi))
+    assert _follow(np.zeros(1, LATENESS)[0], angles - 4.0 * strokes, speeds) < 2e-4
+    assert _follow(np.zeros(1, LATENESS)[0], angles, speeds + 0.3) < 2e-4
+
+
+def test_after_an_interruption_what_is_apart_is_counted_anew():
+    """Samples of a fault that was found late say nothing of those after it; what was known before stays known."""
+    a = np.zeros(1, LATENESS)[0]
+    age = _follow(a, *_signals(late_s=0.004))
+    follow(a, 0.0, 0.05, 4.0, _DT)
+    interrupt(a)
+    assert a["apart"] == a["gained"] == a["gone"] == 0.0
+    follow(a, 0.0, 0.0, 0.0, _DT)
+    assert a["age"] == pytest.approx(age, rel=0.02)
 
 
 @pytest.mark.parametrize("late_s", [0.002, 0.006, 0.0095])
@@ -74,3 +126,71 @@ def test_a_delay_that_the_calibration_knows_is_undone_once(parameters):
     p["effects"]["signal_delay"]["delay_s"] = 0.004
     error = (estimate(rows, p.reshape(1))["force"] - force)[750:]
     assert np.sqrt(np.mean(error**2)) < 60.0
+
+
+# In the estimator.
+
+
+@pytest.fixture
+def s():
+    return new_state()[0]
+
+
+def _turning(p):
+    """A sample of a motor that gains speed."""
+    m = brake.samples(p, np.zeros(2))[0][1]
+    m["angle"], m["speed"] = 0.5, 100.0
+    return m
+
+
+@pytest.mark.parametrize("what", ["nothing", "zero moved", "no time", "a sample missing", "drifting", "frozen"])
+def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
+    m = _turning(parameters[0])
+    step._follow_age(s, parameters[0], m, False)
+    before = s["lateness"].copy()
+    assert before["apart"] != 0.0 and before["gained"] == 100.0
+    if what == "no time":
+        m["dt"] = 0.0
+    elif what == "a sample missing":
+        m["dt"] = 0.008
+    elif what == "drifting":
+        s["drifting_s"] = 0.1
+    elif what == "frozen":
+        # The angle stands while the speed goes on.
+        s["plausibility"]["still"] = 5
+    step._follow_age(s, parameters[0], m, what == "zero moved")
+    followed = what == "nothing"
+    assert (s["lateness"]["gained"] != 0.0) == (s["lateness"]["apart"] != 0.0) == followed
+    assert (s["lateness"]["ss"] != before["ss"]) == followed
+
+
+def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s):
+    p, m = parameters[0], _turning(parameters[0])
+    s["lateness"]["ss"] = s["lateness"]["ww"] = 1e9
+    s["lateness"]["as_"] = -0.005 * 1e9
+    step._follow_age(s, p, m, False)
+    assert s["late"] == pytest.approx(0.005, rel=0.01)
+    p["effects"]["signal_delay"]["delay_s"] = 0.003
+    step._follow_age(s, p, m, False)
+    assert s["late"] == pytest.approx(0.002, rel=0.02)
+    p["clearance_sigma"] = 0.0
+    step._follow_age(s, p, m, False)
+    assert s["late"] == 0.0
+
+
+def test_what_a_late_angle_leaves_open_counts_while_the_speed_changes(parameters, s):
+    """The way of the speed gained meanwhile, 0.5 a t^2, on the stiffness."""
+    p, m = parameters[0], _turning(parameters[0])
+    s["slope"], s["gear_slope"] = 1000.0, 1.0
+    without = fuse._spread(s, p, m)
+    s["late"] = 0.009
+    more = np.sqrt(fuse._spread(s, p, m) ** 2 - without**2)
+    assert more == pytest.approx(0.5 * 0.009**2 * (100.0 / 0.004) * 1000.0)
+    s["speed"] = 100.0
+    assert fuse._spread(s, p, m) == without
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(0.0079, False), (0.0081, True)])
+def test_an_angle_over_two_cycles_old_is_told(parameters, s, late_s, told):
+    s["late"] = late_s
+    assert bool(fuse._facts_of_torque(s, parameters[0]) & ANGLE_LATE) == told

@@ -5,7 +5,9 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import uneven
+from emb_daemon.estimator import fuse, uneven
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.status import DISC_UNEVEN
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE, PULSE_MODULO, PULSES_PER_TURN
 
@@ -69,11 +71,14 @@ def test_an_even_disc_stays_even(p, seed):
 # The filter alone.
 
 _VARIANCE, _SLOPE = 0.02**2, 2000.0
+#: Between which the log odds of an uneven disc stay.
+_LOG_ODDS_LIMITS = (-6.0, 20.0)
 
 
 def _feed(u, p, amplitude_m, seconds, seed=1, begin=0.0, strokes=True, leverage=4e-5):
-    """A disc under a constant slope of the force; the pads leave it every second if ``strokes``."""
-    rows, rng = brake.samples(p, np.zeros(round(seconds / 0.004) + 1))[0], np.random.default_rng(seed)
+    """A disc under a constant slope of the force; the pads leave it every second if ``strokes``. Returns the
+    highest log odds that it had."""
+    highest, rows, rng = -np.inf, brake.samples(p, np.zeros(round(seconds / 0.004) + 1))[0], np.random.default_rng(seed)
     shapes = np.zeros(uneven.STATES)
     for i in range(1, len(rows)):
         turned = begin + _TURNING * 0.004 * i
@@ -84,6 +89,8 @@ def _feed(u, p, amplitude_m, seconds, seed=1, begin=0.0, strokes=True, leverage=
         shapes[:] = [f(k * turned) for k in (1, 2) for f in (np.cos, np.sin)]
         more = _SLOPE / p["gear_gain"] * (shapes @ amplitude_m) * touching
         uneven.learn(u, leverage, leverage * more + np.sqrt(_VARIANCE) * rng.standard_normal(), _VARIANCE, 0.004)
+        highest = max(highest, float(u["log_odds"]))
+    return highest
 
 
 @pytest.fixture
@@ -97,12 +104,88 @@ def test_amplitudes_are_found_with_their_uncertainty(u, p):
     assert u["share"] > 0.99
     spread = np.sqrt(np.diag(u["covariance"]))
     assert np.all(np.abs(u["amplitude"] - true) < 4.0 * spread) and np.all(spread < 1e-6)
+    assert uneven.force_sigma(u) ** 2 >= 0.99 * u["force"] @ u["covariance"] @ u["force"] > 0.0
+
+
+def test_before_anything_was_seen_the_second_order_is_a_quarter_of_the_first(u, p):
+    _feed(u, p, np.zeros(uneven.STATES), 0.004)
+    spread = np.sqrt(np.diag(u["covariance"]))
+    assert spread[:2] == pytest.approx(7e-6, rel=0.01) and spread[2:] == pytest.approx(spread[:2] / 4.0, rel=0.01)
+
+
+def test_wear_makes_another_disc_of_it(u, p):
+    """After an hour in which the pads never touched, as much is open as at first; within a minute hardly anything."""
+    _feed(u, p, 1e-6 * np.array([8.0, -3.0, 1.5, 0.0]), 6.0)
+    spread = np.sqrt(np.diag(u["covariance"]))
+    row = brake.samples(p, np.zeros(2))[0][0]
+    row["dt"], row["wheel_speed"] = 1.0, _TURNING
+    for second in range(3600):
+        row["wheel_pulse"] = _TURNING * second * PULSES_PER_TURN / (2.0 * np.pi) // 1 % PULSE_MODULO
+        uneven.turn(u, row, 0.0, p["gear_gain"], 1e-6)
+        if second == 60:
+            assert np.sqrt(u["covariance"][0, 0]) < 1.5e-6
+    later = np.sqrt(np.diag(u["covariance"]) - spread**2)
+    assert later[:2] == pytest.approx(7e-6, rel=0.01) and later[2:] == pytest.approx(7e-6 / 4.0, rel=0.01)
+
+
+def test_the_force_follows_the_disc_with_the_pads_lag(u, p):
+    row = brake.samples(p, np.zeros(2))[0][1]
+    row["wheel_speed"] = _TURNING
+    uneven.turn(u, row, 0.0, p["gear_gain"], 0.04)
+    uneven.turn(u, row, _SLOPE, p["gear_gain"], 0.04)
+    assert np.all(np.abs(u["force"]) < 0.1 * np.abs(u["drive"])) and np.all(u["drive"] != 0.0)
 
 
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_noise_gives_nothing(u, p, seed):
     _feed(u, p, np.zeros(uneven.STATES), 6.0, seed)
     assert u["share"] < 0.02
+
+
+def test_until_something_speaks_for_it_the_force_is_that_of_an_even_disc(u, p):
+    """To the last bit."""
+    _feed(u, p, 1e-6 * np.array([15.0, 0.0, 0.0, 0.0]), 0.7, strokes=False)
+    assert abs(u["shift"]) > 10.0 and uneven.applied(u) == 0.0 and uneven.force_sigma(u) == 0.0
+
+
+def test_a_torque_that_no_disc_explains_teaches_nothing(u, p):
+    _feed(u, p, 1e-6 * np.array([8.0, -3.0, 1.5, 0.0]), 6.0)
+    before = u.copy()
+    uneven.learn(u, 4e-5, 100.0 * np.sqrt(_VARIANCE), _VARIANCE, 0.004)
+    assert np.all(u["amplitude"] == before["amplitude"]) and u["log_odds"] == before["log_odds"]
+
+
+def test_one_torque_beyond_its_noise_is_no_evidence_for_a_disc(u, p):
+    """Where much is possible much is learned of one sample, but not that earlier ones foretold it."""
+    _feed(u, p, 1e-6 * np.array([8.0, 0.0, 0.0, 0.0]), 3.0)
+    u["log_odds"], leverage = -6.0, 1.0
+    foretold = leverage * u["force"] @ u["earlier"]
+    u["covariance"] = 1e4 * np.eye(uneven.STATES)
+    uneven.learn(u, leverage, foretold, (foretold / 100.0) ** 2, 0.004)
+    assert -6.0 < u["log_odds"] <= -6.0 + 0.5 * 25.0 + 1e-9
+
+
+@pytest.mark.parametrize(("before_um", "after_um"), [(0.0, 12.0), (12.0, 0.0)])
+def test_no_past_is_so_long_that_another_disc_is_not_found(u, p, before_um, after_um):
+    """A disc that was even, or uneven, for as long as one likes is another after work in a workshop."""
+    before, after = (1e-6 * np.array([um, 0.0, 0.0, 0.0]) for um in (before_um, after_um))
+    u["log_odds"] = _LOG_ODDS_LIMITS[before_um > 0.0]
+    _feed(u, p, before, 6.0)
+    # What earlier strokes foretold is as wrong, or as right, as can be.
+    u["earlier"], u["stroke_s"] = before if before_um else after, 0.0
+    _feed(u, p, before, 0.9, 2, begin=6.0 * _TURNING, strokes=False)
+    assert u["log_odds"] == pytest.approx(_LOG_ODDS_LIMITS[before_um > 0.0], abs=0.2)
+    u["covariance"] += np.diag([(12e-6) ** 2] * 2 + [0.0] * 2)
+    _feed(u, p, after, 3.0, 3, begin=6.9 * _TURNING)
+    assert u["share"] > 0.99 if after_um else u["share"] < 0.02
+
+
+def test_noise_is_believed_as_rarely_as_the_odds_say(p):
+    """At odds of one in 55 before anything was seen, one even disc in 55 is ever thought as likely uneven as not."""
+    filters, highest = np.zeros(60, uneven.UNEVEN), []
+    for seed, u in enumerate(filters):
+        highest.append(_feed(u, p, np.zeros(uneven.STATES), 3.0, seed))
+    assert np.mean(np.array(highest) > 0.0) <= 1.0 / 55.0
 
 
 def test_one_stroke_proves_nothing(u, p):
@@ -113,25 +196,43 @@ def test_one_stroke_proves_nothing(u, p):
     assert u["share"] > 0.99
 
 
+def test_a_stroke_ends_when_the_pads_leave_the_disc(u, p):
+    _feed(u, p, 1e-6 * np.array([15.0, 0.0, 0.0, 0.0]), 0.996)
+    assert u["amplitude"][0] > 10e-6 and np.all(u["earlier"] == 0.0)
+    row = brake.samples(p, np.zeros(2))[0][1]
+    uneven.turn(u, row, 0.0, p["gear_gain"], 1e-6)
+    assert np.all(u["earlier"] == u["amplitude"])
+
+
 def test_a_lost_phase_begins_anew(u, p):
     """The counter was silent for more turns than it counts: the disc is as uneven as before, and nobody knows where."""
     _feed(u, p, 1e-6 * np.array([12.0, 0.0, 0.0, 0.0]), 6.0)
     rows = brake.samples(p, np.zeros(3))[0]
-    rows["wheel_speed"], rows["dt"], rows["has_wheel_pulse"] = _TURNING, 2.0, [False, False, True]
-    for row in rows[:2]:
+    rows["wheel_speed"], rows["dt"], rows["has_wheel_pulse"] = _TURNING, 1.5, [False, False, True]
+    for row in rows:
         uneven.turn(u, row, _SLOPE, p["gear_gain"], 1e-6)
-    assert u["amplitude"][0] > 10e-6, "four seconds are carried on by the wheel speed"
+    assert u["amplitude"][0] > 10e-6, "three seconds are carried on by the wheel speed"
     rows["dt"] = 20.0
     for row in rows:
         uneven.turn(u, row, _SLOPE, p["gear_gain"], 1e-6)
-    assert np.all(u["amplitude"] == 0.0) and u["share"] > 0.99
+    assert np.all(u["amplitude"] == 0.0) and np.all(u["earlier"] == 0.0) and u["share"] > 0.99
     assert np.sqrt(u["covariance"][0, 0]) > 10e-6
+
+
+def test_without_counter_and_speed_the_phase_is_lost_at_once(u, p):
+    _feed(u, p, 1e-6 * np.array([12.0, 0.0, 0.0, 0.0]), 6.0)
+    rows = brake.samples(p, np.zeros(3))[0][1:]
+    rows["has_wheel_pulse"], rows["has_wheel_speed"] = [False, True], False
+    for row in rows:
+        uneven.turn(u, row, _SLOPE, p["gear_gain"], 1e-6)
+    assert np.all(u["amplitude"] == 0.0) and u["share"] > 0.99
 
 
 def test_a_disc_that_has_not_turned_is_its_contact_angle(u, p):
     rows = brake.samples(p, np.zeros(50))[0]
     for row in rows:
         uneven.turn(u, row, _SLOPE, p["gear_gain"], 0.03)
+    u["share"] = 1.0
     assert uneven.force_sigma(u) == 0.0 and uneven.applied(u) == 0.0
 
 
@@ -143,5 +244,28 @@ def test_what_is_half_believed_is_covered_and_told(p):
     crest = _SLOPE / p["gear_gain"] * np.hypot(*u["amplitude"][:2])
     assert uneven.unproven(u) < 0.01 * crest
     u["share"] = 0.5
+    assert uneven.applied(u) == 0.5 * u["shift"]
     assert uneven.unproven(u) == pytest.approx(0.5 * crest, rel=0.1)
     assert uneven.force_sigma(u) > max(sure, 0.45 * abs(u["shift"]))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.0, False), (0.5, True), (1.0, False)])
+def test_a_disc_is_told_while_it_is_not_sure(p, share, told):
+    s = new_state()[0]
+    s["uneven"]["amplitude"][0], s["uneven"]["force"][0], s["uneven"]["share"] = 10e-6, 2e7, share
+    assert bool(fuse._facts_of_torque(s, p) & DISC_UNEVEN) == told
+
+
+@pytest.mark.parametrize("stands", ["", "motor", "wheel"])
+def test_only_a_motor_that_moves_on_a_turning_disc_teaches(p, stands):
+    rows, state = _stops(p, 12.0, 0.0)[0], new_state()
+    # To the top of the second stop, and what follows.
+    top = _STOP + 425
+    estimate(rows[:top], p.reshape(1), state)
+    before, rows = state["uneven"]["amplitude"].copy(), rows[top : top + 125].copy()
+    if stands == "motor":
+        rows["angle"] = state["angle"]
+    elif stands == "wheel":
+        rows["wheel_speed"] = 0.0
+    estimate(rows, p.reshape(1), state)
+    assert np.any(state["uneven"]["amplitude"] != before) == (not stands)

@@ -84,23 +84,32 @@ def starting_calibration(constant: float) -> object:
     )
 
 
+def write_logs(run: Path, mapping: str, folder: Path) -> None:
+    """A run as this mapping reads it, whole and in two halves, beside the mapping.
+
+    Raises:
+        InputError, InputErrors, OSError: it cannot be read with it.
+    """
+    write_atomically(folder / "mapping.yaml", mapping.encode())
+    frames = Mapping(folder / "mapping.yaml").read(run)
+    half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
+    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
+        write_atomically(folder / f"{name}.log", format_candump(part).encode())
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="one run, futek_test_*.csv")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     arguments = parser.parse_args(argv)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    mapping = arguments.output / "mapping.yaml"
     try:
         constant, sensor = read_header(arguments.run)
-        write_atomically(mapping, MAPPING.format(sensor=sensor, newton_per_Nm=1.0 / GEAR_GAIN_M_PER_RAD).encode())
-        frames = Mapping(mapping).read(arguments.run)
+        mapping = MAPPING.format(sensor=sensor, newton_per_Nm=1.0 / GEAR_GAIN_M_PER_RAD)
+        write_logs(arguments.run, mapping, arguments.output)
     except (OSError, InputError, InputErrors) as error:
         print(error, file=sys.stderr)
         return 2
-    half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
-    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
-        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
     save_calibration(starting_calibration(constant), arguments.output / "calibration.yaml")
     return 0
 

@@ -17,14 +17,10 @@ import sys
 from pathlib import Path
 
 import msgspec
-import numpy as np
-from embir_to_log import GEAR_GAIN_M_PER_RAD, starting_calibration
+from embir_to_log import GEAR_GAIN_M_PER_RAD, starting_calibration, write_logs
 
-from emb_daemon.atomic import write_atomically
 from emb_daemon.calibration.files import save_calibration
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.logs.candump import format_candump
-from emb_daemon.logs.mapping import Mapping
 
 CONSTANT_NM_PER_A = 0.945
 #: At the shaft, of rotor and gear, kg m2; of the gear, N m; fastest, rad/s: orders of magnitude of the supplier's sheet.
@@ -47,16 +43,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     arguments = parser.parse_args(argv)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    mapping, replace = arguments.output / "mapping.yaml", msgspec.structs.replace
     try:
-        write_atomically(mapping, MAPPING.encode())
-        frames = Mapping(mapping).read(arguments.run)
+        write_logs(arguments.run, MAPPING, arguments.output)
     except (OSError, InputError, InputErrors) as error:
         print(error, file=sys.stderr)
         return 2
-    half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
-    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
-        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
+    replace = msgspec.structs.replace
     base = starting_calibration(CONSTANT_NM_PER_A)
     motor = replace(base.motor, inertia_kg_m2=NOMINAL_INERTIA, maximum_speed_rad_per_s=FASTEST)
     friction = replace(base.friction, offset_Nm=NOMINAL_COULOMB)

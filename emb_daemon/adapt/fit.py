@@ -352,7 +352,7 @@ def _force_sigma(curve, scale, covariance, top):
     return sqrt(constant), sqrt(share), sqrt(variance.max())
 
 
-def _excited(angle, force, residual, low, high, limits):
+def _is_excited(angle, force, residual, low, high, limits):
     """Whether each of equal force ranges, and the clearance where it was asked for, was passed in both directions by enough
     samples."""
     known = np.isfinite(residual)
@@ -467,7 +467,7 @@ def _judge(rows, fit, base, found):
     if evidence["top_force_N"] < covered:
         return r.NOT_COVERED, f"{evidence['top_force_N']:.0f} N of {covered:.0f} N"
     low = max(0.01 * base.training_force_N, limits.low_force_N)
-    if not _excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
+    if not _is_excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
         return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"

@@ -46,7 +46,7 @@ class Evaluation:
     evidence: dict[str, float] = field(default_factory=dict)
 
 
-def _mounted(calibration: Calibration) -> range:
+def _mounted_curves(calibration: Calibration) -> range:
     """Indices of the curves between which `calibration.types.curve_at` finds that of the mounted pads."""
     thicknesses = [curve.pad_thickness_mm for curve in calibration.stiffness.curves]
     upper = int(np.clip(np.searchsorted(thicknesses, calibration.pad_thickness_mm), 1, max(len(thicknesses) - 1, 1)))
@@ -55,13 +55,13 @@ def _mounted(calibration: Calibration) -> range:
 
 def curve_terms(calibration: Calibration) -> int:
     """Number of coefficients of the curve that training can teach."""
-    return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted(calibration))
+    return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted_curves(calibration))
 
 
 def curve_values(calibration: Calibration, coefficients) -> dict[str, float]:
     """The keys that make ``coefficients`` the curve of the mounted pads: both curves beside their thickness become it."""
     values = {}
-    for index in _mounted(calibration):
+    for index in _mounted_curves(calibration):
         for term in range(len(calibration.stiffness.curves[index].coefficients)):
             value = float(coefficients[term]) if term < len(coefficients) else 0.0
             values[f"stiffness.curves[{index}].coefficients[{term}]"] = value

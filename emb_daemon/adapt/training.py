@@ -51,7 +51,7 @@ def _obstacle(a, m, estimate, limits, others_hold):
         return r.BAD_INPUT
     if m.park_brake != e.PARK_APPLIED:
         return r.PARK_BRAKE_LEFT
-    if m.vehicle_speed > 0.0 or (m.has_wheel_speed and m.wheel_speed > _STANDING_RAD_S) or _rolled(a, m):
+    if m.vehicle_speed > 0.0 or (m.has_wheel_speed and m.wheel_speed > _STANDING_RAD_S) or _has_rolled(a, m):
         return r.VEHICLE_MOVED
     if a.asked and m.brake_request != 0.0:
         return r.BRAKE_REQUESTED
@@ -61,7 +61,7 @@ def _obstacle(a, m, estimate, limits, others_hold):
 
 
 @njit
-def _rolled(a, m):
+def _has_rolled(a, m):
     """Whether the wheel turned since the car was found standing."""
     if not m.has_wheel_pulse:
         return False

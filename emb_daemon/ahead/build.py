@@ -66,7 +66,7 @@ def _wrapper(entry: Entry):
     return scope[entry.name], tuple(kinds)
 
 
-def _lowered(entry: Entry) -> str:
+def _lower(entry: Entry) -> str:
     """LLVM's text of an entry point with all that it calls, and of what calls it with words in memory, under its name in C."""
     wrapper, kinds = _wrapper(entry)
     compiled = numba.njit(types.void(*kinds), nogil=True, error_model="numpy", no_cfunc_wrapper=True)(wrapper)
@@ -91,13 +91,13 @@ def _lowered(entry: Entry) -> str:
     )
 
 
-def _merged(entries: list[Entry], sources: str, triple: str):
+def _merge(entries: list[Entry], sources: str, triple: str):
     """One module of all entry points, in which nothing else but its `mark` can be seen from outside."""
     marked = f"@{mark(sources)} = constant i8 0"
     whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NO_OWNERS}{marked}\n')
     for entry in entries:
         # numba compiles for this machine; what it writes before it optimises is the same for all.
-        text = re.sub(r'(?m)^target (datalayout|triple) = ".*"$', "", _lowered(entry))
+        text = re.sub(r'(?m)^target (datalayout|triple) = ".*"$', "", _lower(entry))
         whole.link_in(llvm.parse_assembly(f'target triple = "{triple}"\n{text}'))
     visible = {mark(sources), *(entry.name for entry in entries)}
     for symbol in (*whole.functions, *whole.global_variables):
@@ -117,7 +117,7 @@ def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
     machine = llvm.Target.from_triple(target.triple).create_target_machine(cpu=target.cpu, opt=3, reloc="pic")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", numba.NumbaWarning)
-        module = _merged(entries, sources, target.triple)
+        module = _merge(entries, sources, target.triple)
     module.data_layout = str(machine.target_data)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=3))
     before, after = llvm.create_new_module_pass_manager(), llvm.create_new_module_pass_manager()
@@ -152,7 +152,7 @@ def linker_for(machine: str) -> list[str]:
     raise Unavailable(f"no linker for {machine} is installed: {packages} has one")
 
 
-def _linked(elf: bytes, command: list[str]) -> bytes:
+def _link(elf: bytes, command: list[str]) -> bytes:
     """The shared object of a relocatable one. Raises Unavailable with what the linker says if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder, "kernels.o"), Path(folder, "kernels.so")
@@ -179,7 +179,7 @@ def build(entries: list[Entry], sources: str, target: Target, path: Path) -> Non
     if linker is None:
         return write_atomically(path, elf)
     content = seal(
-        _linked(elf, linker),
+        _link(elf, linker),
         sources=sources,
         machine=target.machine,
         cpu=target.cpu,

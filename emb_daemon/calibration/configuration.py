@@ -115,7 +115,7 @@ class Setup:
             dbc, files = self.configuration.dbc, {name: c.calibration for name, c in self.configuration.corners.items()}
         except InputError as error:
             faults += error.faults
-            dbc, files = _named(self.path)
+            dbc, files = _read_named(self.path)
         try:
             self.layout = load_layout(folder / dbc if dbc else None, tuple(files))
         except InputError as error:
@@ -141,7 +141,7 @@ class Setup:
             self.parameters[CORNERS.index(name)] = to_parameters(calibration)
 
 
-def _named(path: Path) -> tuple[str | None, dict[str, str]]:
+def _read_named(path: Path) -> tuple[str | None, dict[str, str]]:
     """(DBC, calibration by corner) that a faulty configuration names all the same: their faults are told with its own."""
     try:
         content = load_yaml(path, Any)

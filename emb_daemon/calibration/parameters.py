@@ -139,7 +139,7 @@ def moved(calibration: Calibration, values: Mapping[str, float], *, checked: boo
     for key in values:
         value_of(calibration, key)
     changed = reduce(lambda result, key: _set(result, _parts(key), float(values[key])), values, calibration)
-    return _revalidated(changed, values) if checked else changed
+    return _validate(changed, values) if checked else changed
 
 
 def keys(calibration: Calibration) -> list[str]:
@@ -195,7 +195,7 @@ def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
         return value
     part, rest = parts[0], parts[1:]
     if isinstance(node, msgspec.Struct):
-        # No __post_init__: validity as a whole is for `_revalidated` to judge.
+        # No __post_init__: validity as a whole is for `_validate` to judge.
         result = copy.copy(node)
         msgspec.structs.force_setattr(result, part, _set(getattr(node, part), rest, value))
         return result
@@ -204,7 +204,7 @@ def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
     return (*node[:part], _set(node[part], rest, value), *node[part + 1 :])
 
 
-def _revalidated(calibration: Calibration, values: Mapping[str, float]) -> Calibration:
+def _validate(calibration: Calibration, values: Mapping[str, float]) -> Calibration:
     faults = []
     for key, value in values.items():
         limits = parameter(calibration, key)

@@ -407,7 +407,7 @@ class Calibration(Struct, kw_only=True):
     def __reduce__(self):
         # A default that is left out is told by identity: field by field, a copy in another process would state it and have
         # another hash.
-        return _decoded, (msgspec.json.encode(self),)
+        return _decode, (msgspec.json.encode(self),)
 
     @property
     def training_force_N(self) -> float:
@@ -416,7 +416,7 @@ class Calibration(Struct, kw_only=True):
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
 
 
-def _decoded(content: bytes) -> Calibration:
+def _decode(content: bytes) -> Calibration:
     return msgspec.json.decode(content, type=Calibration)
 
 

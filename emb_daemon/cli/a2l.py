@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_output(arguments.output, [arguments.config], (".a2l",))
     setup, connection = Setup(arguments.config), None
     if arguments.udp:
-        connection = over_udp(*host_and_port("--udp", arguments.udp))
+        connection = over_udp(*host_and_port(arguments.udp))
     elif arguments.can:
         bitrate = arguments.bitrate or setup.configuration.bus.bitrate
         connection = over_can(arguments.request_id, arguments.response_id, bitrate)

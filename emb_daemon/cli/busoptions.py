@@ -32,11 +32,11 @@ def _can_id(text: str) -> int:
     return value
 
 
-def host_and_port(option: str, text: str) -> tuple[str, int]:
-    """Of HOST:PORT, as ``option`` has it; raises InputError of anything else."""
+def host_and_port(text: str) -> tuple[str, int]:
+    """Of HOST:PORT, as --udp has it; raises InputError of anything else."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 0xFFFF:
-        raise InputError(f"{option} {text}: expected HOST:PORT, such as 127.0.0.1:5555")
+        raise InputError(f"--udp {text}: expected HOST:PORT, such as 127.0.0.1:5555")
     return host, int(port)
 
 

@@ -2,13 +2,13 @@
 
 import argparse
 import json
-import signal
 import sys
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options, host_and_port
 from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 
 EXAMPLE = (
@@ -77,17 +77,15 @@ def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
     from emb_daemon.monitor.recording import Recording
     from emb_daemon.monitor.web import Datagrams, Web, hand_out
 
-    receivers, stopped = [], []
+    receivers, stopped = [], stop_signals()
     if arguments.udp is not None:
-        receivers.append(Datagrams(*host_and_port("--udp", arguments.udp)))
+        receivers.append(Datagrams(*host_and_port(arguments.udp)))
     if arguments.web is not None:
         receivers.append(Web(arguments.web, title))
         print(f"http://127.0.0.1:{receivers[-1].port}/", flush=True)
     if arguments.record is not None:
         check_output(arguments.record, [], (".mcap",))
         receivers.append(Recording(arguments.record))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.append(True))
     try:
         hand_out(bus, receivers, lambda: bool(stopped))
     finally:

@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
     sign = np.asarray
     if arguments.keys:
-        read, sign = _secured(arguments, read)
+        read, sign = _secure(arguments, read)
     replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read, *window)
     if arguments.output and ending_of(arguments.output) in FRAME_ENDINGS:
         write_frames(
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _secured(arguments: argparse.Namespace, read):
+def _secure(arguments: argparse.Namespace, read):
     """``read`` of authentic frames alone, and what authenticates frames, as the daemon does both."""
     from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile
     from emb_daemon.wire.keys import load_keys

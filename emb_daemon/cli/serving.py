@@ -13,13 +13,18 @@ class Server(Protocol):
     def step(self) -> None: ...
 
 
-def serve(server: Server, greeting: str) -> None:
-    """Print that it is there, and step it until SIGTERM or SIGINT; a trouble is printed to standard error when it changes."""
+def stop_signals() -> list[bool]:
+    """Empty until SIGTERM or SIGINT."""
     stopped: list[bool] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.append(True))
+    return stopped
+
+
+def serve(server: Server, greeting: str) -> None:
+    """Print that it is there, and step it until SIGTERM or SIGINT; a trouble is printed to standard error when it changes."""
+    stopped, told = stop_signals(), ""
     print(greeting, flush=True)
-    told = ""
     while not stopped:
         server.step()
         if server.trouble != told:

@@ -49,7 +49,7 @@ def _udp(text: str):
     from emb_daemon.workshop.ifdata import over_udp
     from emb_daemon.workshop.measure import Udp
 
-    host, port = host_and_port("--udp", text)
+    host, port = host_and_port(text)
     transport = Udp(host, port)
     return transport, over_udp(host, transport.port), f"UDP {host}:{transport.port}"
 

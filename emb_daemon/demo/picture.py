@@ -58,7 +58,7 @@ def _draw_force(axes, time: np.ndarray, truth: np.ndarray, estimate: Comparison,
     speed.set_ylim(-0.4, max(1.25 * float(np.max(truth["vehicle_speed"])), 1.0))
     legends = axes.get_legend_handles_labels(), speed.get_legend_handles_labels()
     axes.legend(*(one + other for one, other in zip(*legends, strict=True)), loc="upper left", ncols=4)
-    _shade(axes, time, truth["park_brake"][:, 0] > 0, "parked")
+    _mark_parked(axes, time, truth["park_brake"][:, 0] > 0)
 
 
 def _draw_errors(axes, comparisons: list[Comparison], corners: tuple[str, ...]) -> None:
@@ -90,11 +90,10 @@ def _draw_heat(axes, time: np.ndarray, truth: np.ndarray, estimated_s: np.ndarra
     axes.set_ylim(top=1.15 * axes.get_ylim()[1])
 
 
-def _shade(axes, time: np.ndarray, where: np.ndarray, label: str) -> None:
+def _mark_parked(axes, time: np.ndarray, where: np.ndarray) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         left, right = time[start], time[min(end, len(time) - 1)]
         axes.axvspan(left, right, color="#f0ead6", zorder=0)
-        axes.text(
-            0.5 * (left + right), 0.93, label, transform=axes.get_xaxis_transform(), ha="center", color="#8a7f5c", fontsize=9
-        )
+        middle, across = 0.5 * (left + right), axes.get_xaxis_transform()
+        axes.text(middle, 0.93, "parked", transform=across, ha="center", color="#8a7f5c", fontsize=9)

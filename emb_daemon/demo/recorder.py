@@ -88,9 +88,9 @@ class Recorder:
     def recent_responses(self, row: int) -> np.ndarray:
         """Response times (s) of one corner's estimates of the last two seconds or so."""
         start = max(self.count - 1000 * len(self.corners), 0)
-        return self._matched(row, start, self.count)[3]
+        return self._match(row, start, self.count)[3]
 
-    def _matched(self, row: int, start: int, stop: int):
+    def _match(self, row: int, start: int, stop: int):
         """(frames of the clamp force, their row in the truth, status, response time in s)."""
         corner = CORNERS.index(self.corners[row])
         frames, cycle = self.frames[start:stop], self.frame_cycle[start:stop]
@@ -106,7 +106,7 @@ class Recorder:
 
     def compare(self, row: int) -> Comparison:
         """One corner from beginning to end; answers to a sample only, not predictions in its absence."""
-        frames, at, status, response = self._matched(row, 0, self.count)
+        frames, at, status, response = self._match(row, 0, self.count)
         corner = self.corners[row]
         columns = Decoder().columns(frames, f"EMB_{corner}_ClampForce")
         answers = columns["InputAge"] == 0.0

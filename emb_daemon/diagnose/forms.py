@@ -176,10 +176,11 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             yield "lag", "odd_power", reach, 0.0, 1.0, time
         return
     centre = _COLD_C if signal in _TEMPERATURES else 0.0
+    farthest = max(abs(low - centre), abs(high - centre))
     signed = low < 0.0 and signal not in _TEMPERATURES
     even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
     for exponent in _EXPONENTS:
-        yield "none", "even_power" if even else "odd_power", max(abs(low - centre), abs(high - centre)), centre, exponent, 1.0
+        yield "none", "even_power" if even else "odd_power", farthest, centre, exponent, 1.0
     for share in _SCALES:
         yield "none", "saturation" if signed and not even else "decay", share * reach, 0.0, 1.0, 1.0
     if even:
@@ -190,7 +191,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         yield "none", "onset", width, low + place * width, 1.0, 1.0
     if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
-            yield "lag", "odd_power", max(abs(low - centre), abs(high - centre)), centre, 1.0, time
+            yield "lag", "odd_power", farthest, centre, 1.0, time
 
 
 def _responses(reach: float) -> Iterator[_Shape]:

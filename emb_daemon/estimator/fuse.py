@@ -94,7 +94,8 @@ _LATE = 0.3
 _LONG_LIKELY = 62.5
 #: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
 _TELLING = 0.1
-#: Cycles by which an angle is late from where it is told, as of one whose frame is late.
+#: Cycles by which an angle is late from where it is told: one sampled in the cycle before, in a frame that waits for the next,
+#: is no fault.
 _TOLD_CYCLES = 2.0
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3

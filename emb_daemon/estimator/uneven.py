@@ -25,13 +25,19 @@ STATES = 2 * ORDERS
 _AMPLITUDE_M = 7e-6
 #: Wear makes another disc of it within hours of braking, s.
 _WORN_S = 3600.0
-#: Log odds of a disc that its calibration does not know, below which they do not fall, and from which something speaks for it.
-_PRIOR_ODDS, _LEAST_ODDS, _SPEAKING_ODDS = -4.0, -6.0, -3.0
-#: Motion, s, after which it is another: what one stroke leaves unexplained is a shape, and any shape is a part of a period.
+#: Log odds of a disc that its calibration does not know: one in 55. Of an even disc they rise by k with a probability of at
+#: most exp(-k) (Ville's inequality for likelihood ratios), so that the same share of even discs is ever thought uneven
+#: (`test_uneven.py::test_noise_is_believed_as_rarely_as_the_odds_say`).
+_PRIOR_ODDS = -4.0
+#: Those below which they do not fall, as of a jump (`hypotheses.PRIOR_ODDS`): a disc that warps later need not make up for the
+#: past. Those from which something speaks for it: evidence of a factor e, at which a twentieth of it is believed.
+_LEAST_ODDS, _SPEAKING_ODDS = -6.0, -3.0
+#: Motion of one stroke, s, at most: what one leaves unexplained is a shape, and any shape is a part of a period. In a second
+#: the wheel of a car at walking pace has turned once, and a stroke that goes on is held against what it showed so far.
 _STROKE_S = 1.0
-#: Log odds that are as good as certainty.
+#: Log odds at which they stop, as good as certainty: of a disc that is even again some samples tell.
 _CERTAIN_ODDS = 20.0
-#: Standard deviations of the innovation beyond which a sample teaches nothing.
+#: Standard deviations of the innovation beyond which a sample teaches nothing, as in `hypotheses`: sensors jump.
 _GATE = 5.0
 #: Way, rad, over which a wheel speed that is off by a hundredth, uncorrected by the counter, loses the phase by a radian: less
 #: than half of what the counter counts before it begins anew.

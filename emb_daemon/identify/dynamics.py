@@ -37,6 +37,10 @@ _LEAST = 1e-4
 EPISODE = 250
 
 
+#: (error of the stiffness path, reference force) in N on one log, where there is a reference.
+Errors = tuple[np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Pads:
     """Logs with one pair of pads, which share a characteristic curve."""
@@ -140,6 +144,27 @@ def simulate(log: Log, calibration: Calibration, thickness_mm: float, clearance:
     samples = log.samples.copy()
     _delay(samples, log.samples, delay_s)
     return stiffness_force(samples, to_parameters(here))
+
+
+def path_errors(log: Log, calibration: Calibration, thickness_mm: float, clearance: float, delay_s: float = 0.0) -> Errors:
+    """Of the stiffness path on a log; as the daemon has it without ``delay_s``, for the reference's delay is none of the
+    brake's."""
+    error = simulate(log, calibration, thickness_mm, clearance, delay_s) - log.force_N
+    known = np.isfinite(error)
+    return error[known], log.force_N[known]
+
+
+def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, slow: bool = True) -> list[Errors]:
+    """Errors of a fit to first halves: on the second halves of random logs and, if ``slow``, on slow logs whole."""
+    found = []
+    for pads, curve in zip(groups, fit.curves, strict=True):
+        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
+            if is_slow(log) and not slow:
+                continue
+            force = log.force_N.copy()
+            force[: 0 if is_slow(log) else len(force) // 2] = np.nan
+            found.append(path_errors(replace(log, force_N=force), fit.calibration, pads.thickness_mm, clearance, delay_s))
+    return found
 
 
 def _delay(into: np.ndarray, samples: np.ndarray, delay_s: float) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def with_sigma(value: float, sigma: float | None = None, factor: float = 1.0) -> str:
+def with_sigma(value: float, sigma: float | None, factor: float = 1.0) -> str:
     """Value ± sigma, with the digits that sigma leaves."""
     value *= factor
     if sigma is None or not np.isfinite(sigma) or sigma <= 0.0:

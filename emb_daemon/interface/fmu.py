@@ -143,7 +143,7 @@ def _description(variables: list[_Variable], token: str, about: str) -> bytes:
     return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)
 
 
-def _compiled(folder: Path, kernels: Path) -> bytes:
+def _compile(folder: Path, kernels: Path) -> bytes:
     """The FMU's own library, which finds the kernels beside itself. Raises Unavailable without a compiler."""
     if not shutil.which("cc"):
         raise Unavailable("no C compiler is installed: gcc is one")
@@ -186,7 +186,7 @@ def make_fmu(calibration: Calibration, kernels: Path) -> bytes:
         where = f"binaries/{platform.machine()}-linux"
         for path, data in (
             ("modelDescription.xml", _description(variables, token, about)),
-            (f"{where}/{_NAME}.so", _compiled(folder, library)),
+            (f"{where}/{_NAME}.so", _compile(folder, library)),
             (f"{where}/{library.name}", library.read_bytes()),
         ):
             # The same content gives the same file.

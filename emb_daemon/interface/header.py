@@ -25,14 +25,14 @@ _TEXT = Path(__file__).with_name("emb.h.in").read_text(encoding="utf-8")
 _KINDS = {"f": "double", "i": "int64_t", "b": "bool"}
 
 
-def _declared(kind: np.dtype, name: str, shape: tuple[int, ...], describe_field, indent: str) -> Iterator[str]:
+def _declare(kind: np.dtype, name: str, shape: tuple[int, ...], describe_field, indent: str) -> Iterator[str]:
     """Lines of a member of a struct."""
     dimensions = "".join(f"[{size}]" for size in shape)
     if kind.names:
         yield f"{indent}struct {{"
         for field in kind.names:
             below = kind.fields[field][0]
-            yield from _declared(below.base, field, below.shape, lambda _: "", indent + "    ")
+            yield from _declare(below.base, field, below.shape, lambda _: "", indent + "    ")
         yield f"{indent}}} {name}{dimensions};"
     else:
         comment = describe_field(name)
@@ -43,7 +43,7 @@ def _struct(record: np.dtype, name: str, describe_field=lambda _: "") -> str:
     lines = ["typedef struct {"]
     for field in record.names:
         kind = record.fields[field][0]
-        lines += _declared(kind.base, field, kind.shape, describe_field, "    ")
+        lines += _declare(kind.base, field, kind.shape, describe_field, "    ")
     return "\n".join([*lines, f"}} {name};"])
 
 
@@ -56,7 +56,7 @@ def _number(value) -> str:
     return repr(float(value)) if np.isfinite(value) else f"{'-' if value < 0 else ''}(1.0 / 0.0)"
 
 
-def _initialised(record: np.void, offset: int, keys: dict[int, Place], indent: str) -> Iterator[str]:
+def _initialise(record: np.void, offset: int, keys: dict[int, Place], indent: str) -> Iterator[str]:
     """Lines that set what of a record is not zero, with the calibration's key and unit beside each number that has one."""
     for field in record.dtype.names:
         value, start = record[field], offset + record.dtype.fields[field][1]
@@ -71,10 +71,10 @@ def _initialised(record: np.void, offset: int, keys: dict[int, Place], indent: s
         if value.ndim:
             for index, element in enumerate(value):
                 yield f"{indent}    [{index}] = {{"
-                yield from _initialised(element, start + index * value.itemsize, keys, indent + "        ")
+                yield from _initialise(element, start + index * value.itemsize, keys, indent + "        ")
                 yield f"{indent}    }},"
         else:
-            yield from _initialised(value, start, keys, indent + "    ")
+            yield from _initialise(value, start, keys, indent + "    ")
         yield f"{indent}}},"
 
 
@@ -105,5 +105,5 @@ def header(calibration: Calibration) -> str:
         asserts="\n".join(asserts),
         mark=mark(installed_digest()),
         function=signature.name_in_c(answer),
-        calibration="\n".join(_initialised(to_parameters(calibration), 0, keys, "    ")),
+        calibration="\n".join(_initialise(to_parameters(calibration), 0, keys, "    ")),
     )

@@ -43,7 +43,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         # The travel tells nothing of directions; current and force do.
         speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
         if not (speed is None or current is None or force is None or (angle or speed.integral()).way_is_unknown):
-            lines += _against_each_other(speed, current, force)
+            lines += _find_opposed(speed, current, force)
         return lines
     if jump := _starts_anew(angle.values):
         return [
@@ -51,26 +51,21 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`",
         ]
     if current is not None and np.ptp(current.values):
-        lines += _turned_current(angle, current)
+        lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _turned_force(angle, force)
+        lines += _find_turned_force(angle, force)
     return lines
 
 
-def _against_each_other(speed: Series, current: Series, force: Series) -> list[str]:
+def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     """A line where the force falls whenever the current rises that does not accelerate the motor."""
     times = current.time_ns
     at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
     known = np.isfinite(at) & np.isfinite(acceleration)
     if np.sum(known) < _LEAST or not np.ptp(at[known]):
         return []
-    left = current.values[known]
-    if np.ptp(acceleration[known]):
-        columns = np.stack([np.ones(np.sum(known)), at[known], acceleration[known]], axis=1)
-        if abs(np.corrcoef(columns[:, 1], columns[:, 2])[0, 1]) > _TOLD_APART:
-            return []
-        left = left - np.linalg.lstsq(columns, left)[0][2] * acceleration[known]
-    correlation = float(np.corrcoef(left, at[known])[0, 1]) if np.ptp(left) else 0.0
+    left = _without_inertia(current.values[known], at[known], acceleration[known])
+    correlation = float(np.corrcoef(left, at[known])[0, 1]) if left is not None and np.ptp(left) else 0.0
     if correlation > -_AGAINST:
         return []
     return [
@@ -95,24 +90,28 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
     return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
 
 
-def _without_inertia(angle: Series, current: Series) -> Series | None:
-    """The current that does not accelerate the motor; None where load and acceleration cannot be told apart, as in a sine."""
+def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
+    """The current that does not accelerate the motor; None where what loads it and acceleration cannot be told apart, as in a
+    sine."""
+    if not np.ptp(acceleration):
+        return current
+    if abs(np.corrcoef(load, acceleration)[0, 1]) > _TOLD_APART:
+        return None
+    columns = np.stack([np.ones(len(load)), load, acceleration], axis=1)
+    return current - np.linalg.lstsq(columns, current)[0][2] * acceleration
+
+
+def _find_turned_current(angle: Series, current: Series) -> list[str]:
     acceleration = np.gradient(angle.derivative().values, 1e-9 * angle.time_ns)
     at = current.sampled(angle.time_ns)
     known = np.isfinite(at) & np.isfinite(acceleration)
-    if np.sum(known) < _LEAST or not np.ptp(acceleration[known]):
-        return None
-    columns = np.stack([np.ones(np.sum(known)), angle.values[known], acceleration[known]], axis=1)
-    if abs(np.corrcoef(columns[:, 1], columns[:, 2])[0, 1]) > _TOLD_APART:
-        return None
-    return Series(angle.time_ns[known], at[known] - np.linalg.lstsq(columns, at[known])[0][2] * acceleration[known])
-
-
-def _turned_current(angle: Series, current: Series) -> list[str]:
-    if (current := _without_inertia(angle, current)) is None:
+    if np.sum(known) < _LEAST:
         return []
-    low, high = _by_travel(angle, current)
-    enough = _HOLDS * np.quantile(np.abs(current.values), 0.99)
+    left = _without_inertia(at[known], angle.values[known], acceleration[known])
+    if left is None:
+        return []
+    low, high = _by_travel(angle, Series(angle.time_ns[known], left))
+    enough = _HOLDS * np.quantile(np.abs(left), 0.99)
     if max(abs(low), abs(high)) < enough:
         return []
     if high < -max(enough, _MORE * abs(low)):
@@ -127,7 +126,7 @@ def _turned_current(angle: Series, current: Series) -> list[str]:
     return []
 
 
-def _turned_force(angle: Series, force: Series) -> list[str]:
+def _find_turned_force(angle: Series, force: Series) -> list[str]:
     low, high = _by_travel(angle, force)
     largest = float(np.quantile(np.abs(force.values), 0.99))
     if abs(high - low) < _FOLLOWS * largest:

@@ -188,7 +188,7 @@ class MappedBus(PythonCanBus):
 
     def drain(self) -> np.ndarray:
         rows = []
-        for message, time_ns in self._arrived():
+        for message, time_ns in self._receive():
             rows += self.heard(message, time_ns)
         return np.array(rows, FRAME)
 
@@ -206,7 +206,7 @@ class MappedBus(PythonCanBus):
     def _sample(self, corner: str, resolver: _Message, time_ns: int) -> list[tuple | None]:
         """A sample of a corner, and the slow messages that are due."""
         rows = [
-            slow.frame(_completed(slow), time_ns)
+            slow.frame(_complete(slow), time_ns)
             for name, slow in self._messages.items()
             if not name.endswith(("_Resolver", "_Current")) and self._is_due(slow, time_ns)
         ]
@@ -243,7 +243,7 @@ def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
     return known | {"MotorSpeed": float(unrepeated(known["MotorSpeed"], resolver.counter))}
 
 
-def _completed(slow: _Message) -> dict[str, float]:
+def _complete(slow: _Message) -> dict[str, float]:
     """A slow message's values, with those that others stand in for (`resample.SUBSTITUTES`)."""
     known = {name: v.last if isinstance(v, _Value) else v for name, v in slow.signals.items()}
     plates = [known[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in known]
@@ -265,7 +265,7 @@ class ReferenceBus(PythonCanBus):
 
     def drain(self) -> np.ndarray:
         rows = []
-        for message, time_ns in self._arrived():
+        for message, time_ns in self._receive():
             if self._concerns_us(message) and not message.is_error_frame:
                 rows.append(
                     (time_ns, int.from_bytes(message.data[:8], "little"), message.arbitration_id, len(message.data), 0)

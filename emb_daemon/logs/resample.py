@@ -20,8 +20,8 @@ from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
 
 #: Deviation of a rig's sampling period from ours up to which its samples are taken as they are.
 _SAME_PERIOD = 0.05
-#: Sampling period from which the way between two samples is unknown, in cycles: such samples are taken as they are too, and
-#: the estimator bridges what lies between. A brake clamps in some fifty cycles.
+#: Sampling period from which a fast motion's way between two samples is unknown, in cycles: such samples are taken as they are
+#: too, and the estimator bridges what lies between. A brake clamps in some fifty cycles.
 _SPARSE_CYCLES = 5
 #: Sampling period up to which slow motion is filled in between its samples: a stop that comes and goes takes longer, ns. Share
 #: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
@@ -110,7 +110,7 @@ class Series:
 
     @property
     def is_sparse(self) -> bool:
-        """Whether the way between two samples is unknown."""
+        """Whether a fast motion's way between two samples is unknown."""
         return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
 
     @cached_property

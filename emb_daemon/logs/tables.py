@@ -221,9 +221,9 @@ def _without_header(lines: list[str]) -> tuple[int, str] | None:
     for row, line in enumerate(lines):
         if not line.strip() or line.lstrip().startswith(("#", "%")):
             continue
-        parted = {mark: _cells(line, mark) for mark in (";", "\t", "|", ",", " ")}
-        mark = next((mark for mark, cells in parted.items() if len(cells) > 1), ",")
-        return (row - 1, mark) if all(map(_is_number, filter(None, parted[mark]))) else None
+        # A comma last but for blanks: it may be a decimal one.
+        mark = next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ",")
+        return (row - 1, mark) if all(map(_is_number, filter(None, _cells(line, mark)))) else None
     return None
 
 

@@ -1,8 +1,9 @@
 """By how much the resolver's angle is older than the speed that comes with it.
 
-What the angle lacks of the integrated speed is then the time times the speed. Both are followed over a tenth of a second; a
-gain of the resolver, in proportion to the way, is fitted beside the time, or it would look like one. Neither signal can be
-ahead of the motor: a speed that is older, as a filtered one is, says nothing of the angle.
+What the angle lacks of the integrated speed is then the time times the speed. Both are followed over a tenth of a second.
+A gain of the resolver lacks a share of the way: it is fitted beside the time and not used, because without it a gain of seven
+hundredths looks like an age. Neither signal can be ahead of the motor: a speed that is older, as a filtered one is, says
+nothing of the angle.
 """
 
 from math import exp
@@ -11,12 +12,19 @@ import numpy as np
 
 from emb_daemon.jit import fields, njit
 
-#: Time over which angle and speed are followed, and over which what they said is kept, s.
+#: Time over which angle and speed are followed, s: that of a stroke, over which neither an offset of the speed nor a slip of
+#: the resolver adds up. Time over which what they said is kept, s: some stops.
 _FOLLOWED_S, _KEPT_S = 0.1, 60.0
-#: Noise of the angle less integrated speed, rad: some counts, and the speed's noise over the time above; samples that share
-#: it; ages that an angle has, s, and at most; gains that a resolver has, share.
-_NOISE_RAD, _ALIKE, _AGE_S, _OLDEST_S, _GAIN = 0.01, 25.0, 0.002, 0.015, 0.02
-#: A sample that is further off than the oldest angle makes it, rad, is another fault's.
+#: Noise of the angle less integrated speed, rad, standard deviation: 0.3 rad/s of the speed, added up over the time above in
+#: samples of 4 ms, make 0.004, a resolver's own error of ten arc minutes 0.003, counts 0.002. Samples that share it: those of
+#: the time above.
+_NOISE_RAD, _ALIKE = 0.01, 25.0
+#: Standard deviation of ages before anything is known, s: a value of any moment of the last cycle of 4 ms. The oldest, s: a
+#: sample, a frame and a gateway each a cycle late; an older one is a fault that `plausibility` tells.
+_AGE_S, _OLDEST_S = 0.002, 0.015
+#: Standard deviation of a resolver's gain, share.
+_GAIN = 0.02
+#: How much further off than the oldest angle makes it a sample may be, rad: ten times its noise; beyond is another fault's.
 _BEYOND_RAD = 0.1
 
 #: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. The others:

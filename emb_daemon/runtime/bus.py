@@ -49,7 +49,7 @@ class PythonCanBus:
             self._early.append(message)
         return message is not None
 
-    def _arrived(self) -> Iterator[tuple]:
+    def _receive(self) -> Iterator[tuple]:
         """python-can messages that have come, with their time on the monotonic clock in ns."""
         import can
 
@@ -68,7 +68,7 @@ class PythonCanBus:
             yield message, stamp if 0 <= now - stamp < 1_000_000_000 else now
 
     def drain(self) -> np.ndarray:
-        count, arrived = 0, self._arrived()
+        count, arrived = 0, self._receive()
         while count < len(self._frames) and (found := next(arrived, None)):
             message, time_ns = found
             if not self._concerns_us(message) or self._is_echo(message):
@@ -125,7 +125,7 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
         InputError: no interface is named, or an unknown one.
         Unavailable: it cannot be opened now.
     """
-    chosen = _chosen({"interface": interface, "channel": channel, **options})
+    chosen = _choose_options({"interface": interface, "channel": channel, **options})
     if chosen["interface"] == "socketcan":
         return open_socketcan(str(chosen["channel"]), ids)
     # Its multicast loops back, or programs on one machine could not hear each other.
@@ -134,10 +134,10 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
 
 def open_python_can(options: dict):
     """python-can's own bus with all frames in it, by the options of `open_bus`; errors as there."""
-    return _open(_chosen(options))
+    return _open(_choose_options(options))
 
 
-def _chosen(given: dict) -> dict:
+def _choose_options(given: dict) -> dict:
     import can
 
     try:

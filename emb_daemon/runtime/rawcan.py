@@ -56,12 +56,12 @@ _libc = ctypes.CDLL(None, use_errno=True)
 class _Batch:
     """Preallocated message headers that point at frame and control buffers."""
 
-    def __init__(self, capacity: int, frame_bytes: int, control: bool):
-        self.raw = np.zeros(capacity, _CAN_FRAME)
-        self.control = np.zeros((capacity, _CONTROL_BYTES), np.uint8)
-        self._iov = np.zeros(capacity, _IOVEC)
-        self.headers = np.zeros(capacity, _MMSGHDR)
-        rows = np.arange(capacity, dtype=np.uint64)
+    def __init__(self, frame_bytes: int, control: bool):
+        self.raw = np.zeros(_CAPACITY, _CAN_FRAME)
+        self.control = np.zeros((_CAPACITY, _CONTROL_BYTES), np.uint8)
+        self._iov = np.zeros(_CAPACITY, _IOVEC)
+        self.headers = np.zeros(_CAPACITY, _MMSGHDR)
+        rows = np.arange(_CAPACITY, dtype=np.uint64)
         self._iov["base"] = self.raw.ctypes.data + rows * _CAN_FRAME.itemsize
         self._iov["length"] = frame_bytes
         self.headers["iov"] = self._iov.ctypes.data + rows * _IOVEC.itemsize
@@ -147,8 +147,8 @@ class RawCanSocket:
     def __init__(self, sock: socket.socket, stamped: bool = False, reopen=None):
         self._socket, self._reopen = sock, reopen
         frame_bytes = _CAN_FRAME.itemsize if stamped else _CAN_FRAME_BYTES
-        self._received = _Batch(_CAPACITY, frame_bytes, control=True)
-        self._sent = _Batch(_CAPACITY, frame_bytes, control=False)
+        self._received = _Batch(frame_bytes, control=True)
+        self._sent = _Batch(frame_bytes, control=False)
         self._stamped = stamped
         self._frames = np.zeros(_CAPACITY, FRAME)
         #: When the queue was last looked into, the last frame's time, and when to try for another socket, if this one is gone.

@@ -273,7 +273,7 @@ class Verifier:
                 _judge(incoming, row, known)
                 continue
             while held and (len(held) >= _MOST_HELD or row[0] - held[0][0] > _HELD_NS):
-                known.append(_refused(held.pop(0), row[0]))
+                known.append(_refuse(held.pop(0), row[0]))
             held.append(row)
         return np.array(known, FRAME)
 
@@ -292,7 +292,7 @@ def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
         if len(slot) == 1:
             slot.clear()
             continue
-        known += [_refused(held, time_ns) for held in slot if held is not frame and not (held[1] ^ data) & 0xF00]
+        known += [_refuse(held, time_ns) for held in slot if held is not frame and not (held[1] ^ data) & 0xF00]
         slot[:] = [held for held in slot if (held[1] ^ data) & 0xF00]
 
 
@@ -326,5 +326,5 @@ def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns
     return None
 
 
-def _refused(row: tuple, time_ns: int) -> tuple:
+def _refuse(row: tuple, time_ns: int) -> tuple:
     return (time_ns, *row[1:4], UNAUTHENTIC)

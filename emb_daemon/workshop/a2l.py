@@ -55,7 +55,7 @@ ASAP2_VERSION 1 61
 """
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + text.translate(_ASCII).replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
@@ -79,11 +79,11 @@ class _Methods:
     def of_unit(self, unit: str) -> str:
         unit = "" if unit == "1" else unit.translate(_ASCII)
         name = "CM." + ("".join(letter if letter.isalnum() else "_" for letter in unit) or "NONE")
-        self.blocks[name] = _block("COMPU_METHOD", f'{name} "" IDENTICAL "%12.6" {_quoted(unit)}')
+        self.blocks[name] = _block("COMPU_METHOD", f'{name} "" IDENTICAL "%12.6" {_quote(unit)}')
         return name
 
     def of_words(self, name: str, words: Mapping[int, str]) -> str:
-        rows = [f"{code} {_quoted(word)}" for code, word in sorted(words.items())]
+        rows = [f"{code} {_quote(word)}" for code, word in sorted(words.items())]
         self.blocks[f"CT.{name}"] = _block("COMPU_VTAB", f'CT.{name} "" TAB_VERB {len(rows)}', *rows)
         self.blocks[f"CM.{name}"] = _block("COMPU_METHOD", f'CM.{name} "" TAB_VERB "%3.0" ""', f"COMPU_TAB_REF CT.{name}")
         return f"CM.{name}"
@@ -100,7 +100,7 @@ def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> 
     meaning = signal.meaning
     if signal.name == "reasons":
         meaning += ", from the lowest: " + ", ".join(REASONS)
-    head = f"{CORNERS[corner]}.{signal.name} {_quoted(meaning)} {kind} {method} 0 0 {limits}"
+    head = f"{CORNERS[corner]}.{signal.name} {_quote(meaning)} {kind} {method} 0 0 {limits}"
     return _block("MEASUREMENT", head, f"ECU_ADDRESS 0x{address_of(corner, index):X}")
 
 
@@ -151,4 +151,4 @@ def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | N
 
 
 def _group(name: str, about: str, keyword: str, members: list[str]) -> str:
-    return _block("GROUP", f"{name} {_quoted(about)}", "ROOT", f"/begin {keyword}", *members, f"/end {keyword}")
+    return _block("GROUP", f"{name} {_quote(about)}", "ROOT", f"/begin {keyword}", *members, f"/end {keyword}")

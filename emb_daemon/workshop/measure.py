@@ -88,14 +88,14 @@ class Udp:
         datagram, held, unsent = bytearray(), 0, 0
         for packet in packets:
             if len(datagram) + _HEADER.size + len(packet) > _DATAGRAM:
-                unsent += held * (not self._sent(datagram))
+                unsent += held * (not self._send_datagram(datagram))
                 datagram, held = bytearray(), 0
             datagram += _HEADER.pack(len(packet), self._counter) + packet
             self._counter = (self._counter + 1) & 0xFFFF
             held += 1
-        return unsent + held * (not self._sent(datagram))
+        return unsent + held * (not self._send_datagram(datagram))
 
-    def _sent(self, datagram: bytearray) -> bool:
+    def _send_datagram(self, datagram: bytearray) -> bool:
         if datagram and self._master is not None:
             try:
                 self._socket.sendto(datagram, self._master)

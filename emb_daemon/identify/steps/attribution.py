@@ -20,8 +20,9 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.selection import Progress, Selection
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.estimator.heat import TOUCHING_N
+from emb_daemon.identify.dynamics import Errors
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.steps.held_out import Errors, Fold
+from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS
 from emb_daemon.offline import Log

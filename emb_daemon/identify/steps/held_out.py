@@ -7,14 +7,11 @@ import numpy as np
 from emb_daemon.calibration.parameters import CLEARANCE, value_of
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import Pads, fit_dynamics, is_slow, simulate
+from emb_daemon.identify.dynamics import Errors, Pads, fit_dynamics, path_errors
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import Log
-
-#: (error of the stiffness path, reference force) in N on one log, where there is a reference.
-Errors = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +38,7 @@ class Fold(Step):
         clearance = value_of(calibration, CLEARANCE)
         return replace(
             self,
-            errors=[_errors(log, calibration, self.pads, clearance) for log in self.held_out],
+            errors=[path_errors(log, calibration, self.pads.thickness_mm, clearance) for log in self.held_out],
             unexplained=[unexplained_current(log, found, calibration) for log in self.held_out],
         )
 
@@ -65,24 +62,6 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
         pads=pads,
         held_out=pads.random,
         torque=torque,
-        errors=[_errors(log, own.calibration, pads, clearance) for log in pads.random],
+        errors=[path_errors(log, own.calibration, pads.thickness_mm, clearance) for log in pads.random],
         unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],
     )
-
-
-def _errors(log: Log, calibration: Calibration, pads: Pads, clearance: float, rows: slice = slice(None)) -> Errors:
-    """Of the stiffness path as the daemon has it: the delay of the rig's reference is none of the brake's."""
-    force = log.force_N[rows]
-    error = simulate(log, calibration, pads.thickness_mm, clearance)[rows] - force
-    known = np.isfinite(error)
-    return error[known], force[known]
-
-
-def second_halves(stiffness: StiffnessStep) -> list[Errors]:
-    """Errors where no thickness can be left out: of the fit on first halves, on the second halves, slow logs whole."""
-    fit, errors = stiffness.chosen.fit, []
-    for pads, curve in zip(stiffness.pads, fit.curves, strict=True):
-        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
-            rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
-            errors.append(_errors(log, fit.calibration, pads, clearance, rows))
-    return errors

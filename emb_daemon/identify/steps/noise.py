@@ -12,9 +12,9 @@ import numpy as np
 from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import EPISODE
+from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
 from emb_daemon.identify.steps import Step
-from emb_daemon.identify.steps.held_out import Errors, Fold, second_halves
+from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
 from emb_daemon.identify.steps.torque import (
     INERTIA,
@@ -74,7 +74,8 @@ def identify(
         errors = [pair for fold in folds for pair in fold.errors]
         held_out = [left for fold in folds for left in fold.unexplained]
     else:
-        errors, held_out = second_halves(stiffness), [unexplained_current(log, torque.fit, known) for log in torque.logs]
+        errors = errors_unseen(stiffness.pads, stiffness.chosen.fit)
+        held_out = [unexplained_current(log, torque.fit, known) for log in torque.logs]
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
             "levels come from the second halves of the random logs."

@@ -15,11 +15,12 @@ from emb_daemon.identify.dynamics import (
     OPTIONAL,
     RELAXATION,
     DynamicsFit,
+    Errors,
     Pads,
     curve_keys,
+    errors_unseen,
     fit_dynamics,
     is_slow,
-    simulate,
     starting_point,
 )
 from emb_daemon.identify.steps import Step
@@ -54,7 +55,7 @@ class Candidate:
 
     effects: tuple[Effect, ...]
     fit: DynamicsFit
-    held_out: list[tuple[np.ndarray, np.ndarray]]
+    held_out: list[Errors]
     clear: bool
 
     @property
@@ -137,26 +138,13 @@ def _quasistatic(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
     large."""
     start = moved(starting_point(pads, nominal, ()), {RELAXATION: USUAL_RELAXATION_S})
     fit = fit_dynamics(pads, start, fixed=True)
-    held_out = [
-        (simulate(log, fit.calibration, own.thickness_mm, clearance) - log.force_N, log.force_N)
-        for own, curve in zip(pads, fit.curves, strict=True)
-        for log, clearance in zip(own.logs, curve.clearances_rad, strict=True)
-    ]
-    chosen = Candidate((), fit, held_out, clear=True)
+    chosen = Candidate((), fit, errors_unseen(pads, fit), clear=True)
     return _step(pads, nominal, fit, [chosen], chosen, [])
 
 
 def _candidate(groups: list[Pads], nominal: Calibration, effects: tuple[Effect, ...]) -> Candidate:
     fit = fit_dynamics(groups, starting_point(groups, nominal, effects), fraction=0.5, search=True)
-    any_random = any(pads.random for pads in groups)
-    held_out = []
-    for pads, curve in zip(groups, fit.curves, strict=True):
-        for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
-            if is_slow(log) and any_random:
-                continue
-            rows = slice(0 if is_slow(log) else len(log.samples) // 2, None)
-            force = log.force_N[rows]
-            held_out.append((simulate(log, fit.calibration, pads.thickness_mm, clearance, fit.delay_s)[rows] - force, force))
+    held_out = errors_unseen(groups, fit, fit.delay_s, slow=False)
     amplitudes = [f"effects.{effect.name}.{amplitude.name}" for effect in effects for amplitude in effect.amplitudes]
     return Candidate(effects, fit, held_out, all(fit.value(a) > _CLEAR * fit.sigmas[a] for a in amplitudes))
 
