@@ -11,7 +11,10 @@ import pytest
 import emb_daemon
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.diagnose.comparison import errors, whole
+from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.screening import Screening
 from emb_daemon.logs import resample
 from emb_daemon.wire.contract import reason_words
 
@@ -81,7 +84,53 @@ def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
     bench = Bench([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], without_load)
     assert bench.channels == ["torque"] and whole(bench) == "torque"
     assert errors(bench, without_load).rmse("torque") < 250.0
+    # What matters, and what rivals of a term differ by, are shares of the load.
+    assert Screening(bench, Model.of(bench)).force_N == pytest.approx(5000.0 / np.sqrt(2.0), rel=0.05)
     assert errors(bench, moved(without_load, {"motor.torque_constant_Nm_per_A": 0.06})).rmse("torque") > 500.0
+
+
+def _on_a_dynamometer(scatter: float, load: float):
+    """A motor of 0.85 of its stated constant that turns to and fro against a load: calibration, the true constant, and logs
+    to fit and to judge. ``load``: share of its current that it gets from the load and does not draw from its own speed;
+    ``scatter`` of friction, in A."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    stated = moved(stated, {"friction.load_m_per_rad": 0.0})
+    motor, constant = stated.motor, 0.85 * stated.motor.torque_constant_Nm_per_A
+
+    def log(seed: int, size_A: float):
+        random = np.random.default_rng(seed)
+        time_s = 0.004 * np.arange(5000)
+        speed = 30.0 * np.sin(2.0 * np.pi * time_s / 1.7)
+        held = [np.repeat(random.normal(size=5000 // n), n) for n in (100, 40)]
+        torque = constant * size_A * held[0]
+        lost = stated.friction.offset_Nm * np.sign(speed) + scatter * constant * held[1]
+        lost += motor.inertia_kg_m2 * np.gradient(speed, time_s)
+        force = (load * torque - (lost if load == 1.0 else 0.0)) / motor.gear_gain_m_per_rad
+        current = (torque if load == 1.0 else load * torque + lost) / constant
+        columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
+        return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+    return stated, constant, log(1, 3.0), log(2, 9.0)
+
+
+def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load():
+    """Of a motor whose current is commanded: on larger loads the constant that was fitted to small ones must hold."""
+    stated, constant, fit, judge = _on_a_dynamometer(scatter=1.8, load=1.0)
+    result = diagnose([fit], stated, [judge])
+    assert result.calibration.motor.torque_constant_Nm_per_A == pytest.approx(constant, rel=0.05)
+    before, after = (errors.rmse("torque") for errors in (result.before, result.after))
+    table = np.column_stack([fit.samples["current_q"], np.sign(fit.samples["speed"])])
+    plain = np.linalg.lstsq(table, fit.force_N, rcond=None)[0]
+    left = judge.force_N - np.column_stack([judge.samples["current_q"], np.sign(judge.samples["speed"])]) @ plain
+    assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
+
+
+def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
+    stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
+    found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A
+    assert 0.95 * constant < found < 1.05 * stated.motor.torque_constant_Nm_per_A
 
 
 def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):
