@@ -257,6 +257,52 @@ def test_a_faulty_table_is_refused_in_one_line(tmp_path, capsys, name, content, 
     assert line.startswith(f"{tmp_path / name}: ") and expected in line, line
 
 
+def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
+    """Its first column has no name, as a table that counts its rows has none."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    columns["time_s"] = columns["time_s"][0] + 0.004 * np.arange(len(columns["time_s"]))
+    path, log = foreignkit.write_table(tmp_path / "a.csv", columns), {}
+    for time in ("time: {rate_Hz: 250}", "time: {signal: column 1}"):
+        path.write_text(path.read_text().replace('"time_s"', '""', 1))
+        (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("time: {signal: time_s}", time))
+        log[time] = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    counted, timed = log.values()
+    assert np.array_equal(counted.samples["angle"], timed.samples["angle"])
+    assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ("time: {signal: time_s}", "time: {}", "expected either signal (a column) or rate_Hz"),
+        ("time: {signal: time_s}", "time: {signal: t, rate_Hz: 9}", "expected either signal (a column) or rate_Hz"),
+        (
+            "angle_rad, unit: rad",
+            "x, unit: mm",
+            "x is a travel in mm, not the motor's angle; state `unit: rad`, and as `scale`",
+        ),
+        ("speed_rad_per_s, unit: rad/s", "v, unit: mm/s", "v is a travel in mm/s, not the motor's angle; state `unit: rad/s`"),
+        ("force_N, unit: N", "force_N, unit: stone", "unit 'stone' of force_N is unknown; state one of N, kN"),
+    ],
+)
+def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace(before, after))
+    with pytest.raises(InputErrors) as error:
+        Mapping(tmp_path / "mapping.yaml")
+    [line] = str(error.value).splitlines()
+    assert expected in line
+
+
+@pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])
+def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(tmp_path, unit, newton):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}"))
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"force_N": columns["force_N"] / newton})
+    force = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).force_N
+    assert np.nanmax(force) == pytest.approx(np.nanmax(columns["force_N"]), rel=1e-3)
+
+
 def _without(text: str, *words: str) -> str:
     return "".join(line for line in text.splitlines(keepends=True) if not any(word in line for word in words))
 

@@ -163,6 +163,49 @@ def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):
     assert "does it start anew? Then state its `period`" in capsys.readouterr().err
 
 
+def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
+    time_s = 0.004 * np.arange(1000)
+    still = 0.0 * time_s
+    columns = {"time_s": time_s, "angle_rad": 25.0 * time_s, "speed_rad_per_s": 25.0 * 30.0 / np.pi + still}
+    _read(tmp_path, columns | {"current_A": 1.0 + still, "plate_C": 22.0 + still, "force_N": still})
+    assert "rpm taken for rad/s, or the reverse" in capsys.readouterr().err
+    assert not [warning for warning in recwarn if warning.category is RuntimeWarning]
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "said"),
+    [
+        (2.0 * np.pi, ": 6.28319 rad in the rig's unit"),
+        (360.0, "360, with `unit: deg`"),
+        (1.0, "1, with `unit: rev`"),
+        (4096.0, "4096 counts in a turn? `unit: rev`, `scale: 0.000244140625`, `period: 4096`"),
+    ],
+)
+def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_turn, said):
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow()), 250.0)
+    turns = 3.0 * columns["angle_rad"] / (2.0 * np.pi)
+    _read(tmp_path, columns | {"angle_rad": per_turn * (turns % 1.0)})
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("per_rad", "whole", "said"),
+    [
+        (1.0, False, ""),
+        (180.0 / np.pi, False, "if its values are degrees, `unit: deg` makes"),
+        (5e4, True, "counts of an encoder? Then `unit: rev`"),
+        (5e4, False, "or is the unit of time wrong?"),
+    ],
+)
+def test_an_angle_in_another_unit_is_told_without_a_speed(truth, tmp_path, capsys, per_rad, whole, said):
+    columns = foreignkit.sampled(truth, 250.0)
+    angle = per_rad * columns["angle_rad"] + 0.3
+    mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS)
+    _read(tmp_path, columns | {"angle_rad": np.rint(angle) if whole else angle}, mapping)
+    lines = [line for line in capsys.readouterr().err.splitlines() if "which no motor does" in line]
+    assert len(lines) == bool(said) and all(said in line for line in lines)
+
+
 def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):
     """Neither hard motion alone nor a clamped, a held, or a released brake alone says that anything is turned round."""
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)

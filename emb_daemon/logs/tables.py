@@ -6,6 +6,7 @@ import io
 import re
 import sys
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,8 @@ _CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
+#: Column names listed where one was not found.
+_LISTED = 20
 #: Cells that say that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -54,11 +57,13 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
             f"{path}: expected a table ({', '.join(_TEXTS)}, .parquet) or a measurement ({', '.join(_MEASUREMENTS)}): no dbc"
         )
     if time is None:
-        raise InputError(f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`")
-    table = _table(path, content, ending, [time.signal, *names])
+        raise InputError(
+            f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`, or "
+            "`time: {rate_Hz: 100}` where it has none"
+        )
+    table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
     columns = {name: _numbers(path, table, name) for name in names}
-    # Of a clock, seconds already.
-    seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
+    seconds = _seconds(path, table, time)
     known = np.isfinite(seconds)
     if np.any(np.abs(seconds[known]) > LATEST_S):
         raise InputError(
@@ -67,6 +72,14 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     columns = {name: values[known] for name, values in columns.items()}
     stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
     return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
+
+
+def _seconds(path: Path, table, time) -> np.ndarray:
+    """When each row was written, s."""
+    if time.signal is None:
+        return np.arange(table.num_rows) / time.rate_Hz
+    # Of a clock, seconds already.
+    return _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
 
 
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
@@ -81,8 +94,13 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
     for name in names:
         if (count := table.column_names.count(name)) != 1:
             there = "no such column" if count == 0 else f"{count} such columns"
-            raise InputError(f"{path}: {name}: {there}; the table has {', '.join(table.column_names)}")
+            raise InputError(f"{path}: {name}: {there}; the table has {_some(name, table.column_names)}")
     return table
+
+
+def _some(wanted: str, names: list[str]) -> str:
+    """Names to tell someone who misspelt one: all, or of many those most like it."""
+    return ", ".join(names if len(names) <= _LISTED else [*get_close_matches(wanted, names, _LISTED, 0.0), "…"])
 
 
 def _is_clock(column) -> bool:
@@ -169,6 +187,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         cells.pop()
     elif len(first) - len(cells) == 1 and not first[-1]:
         cells.append("")
+    cells = [cell or f"column {number + 1}" for number, cell in enumerate(cells)]
     odd = []
 
     def leave_out(row) -> str:
