@@ -236,12 +236,21 @@ def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit
     assert "times as fast" not in capsys.readouterr().err
 
 
+_HEAD = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
         ("a.csv", "time_s,angle_rad\n0,0\n", "current_A: no such column; the table has time_s, angle_rad"),
-        ("a.csv", "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n0,x,0,0,0,0\n", "expected a column of numbers"),
+        ("a.csv", _HEAD + "0,x,0,0,0,0\n", "expected a column of numbers"),
         ("a.csv", "", "not readable"),
+        (
+            "a.csv",
+            _HEAD + "0,0,0,0,0,0\n" + "0,0,0,0\n" * 9,
+            "9 of 10 rows have another number of cells than 6, the first of them 4",
+        ),
+        ("a.csv", _HEAD + "0,,,0,0,0\n", "no value of angle_rad"),
         ("a.parquet", "no parquet", "not readable"),
         ("a.mf4", "no measurement", "not readable as a measurement"),
         ("a.blf", "", "expected a table"),
@@ -270,6 +279,29 @@ def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
     counted, timed = log.values()
     assert np.array_equal(counted.samples["angle"], timed.samples["angle"])
     assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("{cells},0", "rows have 7 cells, the header names 6; the last are column 7"),
+        ('"{number}",{cells}', ""),
+        ("{number},{cells}", ""),
+        ("{cells},", ""),
+    ],
+)
+def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, said):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    header, *rows = (
+        foreignkit.write_table(tmp_path / "a.csv", foreignkit.sampled(foreignkit.truth(), 250.0)).read_text().split()
+    )
+    plain = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    capsys.readouterr()
+    lines = [header, *(row.format(cells=cells, number=n + 1) for n, cells in enumerate(rows))]
+    (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
+    log = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert log.samples.tobytes() == plain.samples.tobytes()
+    assert capsys.readouterr().err == (f"{tmp_path / 'b.csv'}: {said}\n" if said else "")
 
 
 @pytest.mark.parametrize(

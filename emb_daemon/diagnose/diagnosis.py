@@ -135,7 +135,11 @@ def diagnose(
     progress("cutting the logs into episodes", 0.02)
     bench = Bench(fit_logs, calibration)
     if bench.episodes < EPISODES:
-        told = f"only {bench.episodes} episodes, expected at least {EPISODES} to tell effect from chance"
+        count = "one episode" if bench.episodes == 1 else f"{bench.episodes} episodes"
+        told = (
+            f"only {count} (stops, strokes or holds, between which the motor turns), expected at least {EPISODES} to tell "
+            "effect from chance"
+        )
         raise InputError(f"{fit_logs[0].path}: {told}")
     result = diagnose_bench(bench, Bench(validate, calibration) if validate else None, progress)
     return replace(result, seconds=time.monotonic() - begin)

@@ -325,9 +325,11 @@ class Mapping:
         names = {}
         for source in filter(None, clocks):
             message, _, _ = source.name.rpartition(".")
-            frame_id = self.databases[source.bus].get_message_by_name(message).frame_id if self.databases else None
-            channel = self.channels.get(source.bus)
-            place = [f"{frame_id:#x}"] * bool(self.databases) + [f"channel {channel}"] * (channel is not None)
+            place, channel = [], self.channels.get(source.bus)
+            if self.databases:
+                place.append(f"{self.databases[source.bus].get_message_by_name(message).frame_id:#x}")
+            if channel is not None:
+                place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
         return ", ".join(names)
 

@@ -185,8 +185,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     first = rows[units] if rows else cells
     if len(cells) - len(first) == 1 and not cells[-1]:
         cells.pop()
-    elif len(first) - len(cells) == 1 and not first[-1]:
-        cells.append("")
+    elif len(first) > len(cells):
+        cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units : header + 2 + units])
     cells = [cell or f"column {number + 1}" for number, cell in enumerate(cells)]
     odd = []
 
@@ -210,9 +210,29 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     # Where a comma does not separate, it is a decimal one; a number may have it for the first time after many rows.
     if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
         table = read(",")
+    if len(odd) > table.num_rows:
+        raise InputError(
+            f"{path}: {len(odd)} of {len(odd) + table.num_rows} rows have another number of cells than {len(cells)}, the "
+            f"first of them {odd[0].actual_columns}; expected a table with the columns {_some('', cells)}"
+        )
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
     return table
+
+
+def _with_nameless(path: Path, names: list[str], rows: list[list[str]], lines: list[str]) -> list[str]:
+    """Names of a table whose rows have more cells than its header: a first column that counts or names the rows, as R and
+    pandas write it, has none; else the last ones have none."""
+    more = len(rows[0]) - len(names)
+    if more == 1 and not rows[0][-1]:
+        return [*names, ""]
+    counts = [row[0] for row in rows if row]
+    numbered = len(counts) > 1 and counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
+    if more == 1 and (numbered or lines[0].lstrip().startswith('"')):
+        return ["", *names]
+    last = ", ".join(f"column {len(names) + n + 1}" for n in range(more))
+    print(f"{path}: rows have {len(rows[0])} cells, the header names {len(names)}; the last are {last}", file=sys.stderr)
+    return [*names, *[""] * more]
 
 
 def _as_utf8(content: bytes) -> bytes:
