@@ -15,6 +15,7 @@ from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
+from emb_daemon.errors import InputError
 from emb_daemon.logs import resample
 from emb_daemon.wire.contract import reason_words
 
@@ -131,6 +132,32 @@ def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
     stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
     found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A
     assert 0.95 * constant < found < 1.05 * stated.motor.torque_constant_Nm_per_A
+
+
+def test_a_motor_that_turns_on_and_on_is_followed(capsys):
+    """Further than our message's angle reaches, in one direction, so that load, friction and constant resemble each other."""
+    stated, constant, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+    random, time_s = np.random.default_rng(1), 0.004 * np.arange(8000)
+    speed = 150.0 + 40.0 * np.sin(2.0 * np.pi * time_s / 3.0)
+    current = 4.0 + 3.0 * np.repeat(random.normal(size=80), 100)
+    torque = constant * current - stated.friction.offset_Nm - stated.motor.inertia_kg_m2 * np.gradient(speed, time_s)
+    force = torque / stated.motor.gear_gain_m_per_rad + 100.0 * random.normal(size=8000)
+    columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
+    log = _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+    assert "MotorAngle covers 4828 rad, more than our message carries" in capsys.readouterr().err
+    turns = (log.samples["angle"] - columns["angle_rad"]) / (2.0 * np.pi)
+    assert np.abs(turns - np.rint(turns)).max() < 0.001 and set(np.rint(turns)) == {0.0, -534.0}
+    found = diagnose([log], stated)
+    assert found.after.rmse("torque") < 0.25 * found.before.rmse("torque")
+
+
+def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():
+    stated, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+    time_s = 0.1 * np.arange(2000)
+    angle, force = 20.0 * np.sin(3.0 * time_s), 2000.0 * np.sin(0.7 * time_s)
+    log = _log({"time_s": time_s, "angle_rad": angle, "current_A": force / 1000.0, "force_N": force}, current_mean_s=0.0)
+    with pytest.raises(InputError, match=r"no sample of it can be judged.* its samples are 100 ms apart"):
+        diagnose([log], stated)
 
 
 def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):

@@ -141,7 +141,10 @@ def diagnose(
             "effect from chance"
         )
         raise InputError(f"{fit_logs[0].path}: {told}")
-    result = diagnose_bench(bench, Bench(validate, calibration) if validate else None, progress)
+    judges = Bench(validate, calibration) if validate else None
+    for judging in filter(None, (bench, judges)):
+        _refuse_silent(judging)
+    result = diagnose_bench(bench, judges, progress)
     return replace(result, seconds=time.monotonic() - begin)
 
 
@@ -191,6 +194,17 @@ def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:
         for log in fit_logs:
             if len(judge.samples) == len(log.samples) and judge.samples.tobytes() == log.samples.tobytes():
                 raise InputError(f"{judge.path}: is {log.path}, which chooses; expected another log to judge")
+
+
+def _refuse_silent(bench: Bench) -> None:
+    if any(np.any(residual) for residual in bench.residuals({}).values()):
+        return
+    log = bench.trials[0].log
+    apart = 1e3 * float(np.median(log.samples["dt"]))
+    raise InputError(
+        f"{log.path}: no sample of it can be judged; expected motor, current and reference at 100 Hz or more, or slower "
+        f"motion: its samples are {apart:.3g} ms apart"
+    )
 
 
 # -- findings ---------------------------------------------------------------------------------------------------------

@@ -256,7 +256,7 @@ class Bench:
             mean[0] *= 0.5
         left = trace["torque"] - trace["leverage"] * mean
         if self.load_follows:
-            load = left / self.calibration.motor.gear_gain_m_per_rad
+            load = left / trace["leverage"]
         else:
             # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
             load = left / trace["torque_constant"] * self.newton_per_ampere

@@ -408,6 +408,8 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
             raw = absent
         else:
             column = np.broadcast_to(np.asarray(source, float), times.shape)
+            if name == "MotorAngle":
+                column = _within(message.name, column, layout["low"], layout["high"])
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
                 print(
@@ -429,6 +431,20 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
         for frame, counter in zip(frames, counters.tolist(), strict=True):
             frame["data"] = protect(message.frame_id, frame["data"], counter, 0)
     return frames
+
+
+def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndarray:
+    """An angle (rad) that starts anew by whole turns where our message no longer carries it: of a motor that turns on and on,
+    the load is a function of its current, not of how far it has come."""
+    if not np.any((angle < low) | (angle > high)):
+        return angle
+    period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
+    print(
+        f"{message}: MotorAngle covers {np.nanmax(angle) - np.nanmin(angle):.4g} rad, more than our message carries and than "
+        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?",
+        file=sys.stderr,
+    )
+    return low + np.mod(angle - low, period)
 
 
 def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.ndarray | float | None:
