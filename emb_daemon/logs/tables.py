@@ -28,6 +28,8 @@ _PREAMBLE, _UNITS = 60, 3
 _MOST_ODD = 0.01
 #: A time of day with parts of a second, or minutes and seconds, after a German date or none; others are pyarrow's to read.
 _CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)")
+#: What calls a column by its place.
+_BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
@@ -83,7 +85,7 @@ def _seconds(path: Path, table, time) -> np.ndarray:
 
 
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
-    """The table in a file (pyarrow.Table), which has each of ``names`` once."""
+    """The table in a file (pyarrow.Table), with ``names`` as its columns."""
     import pyarrow
     import pyarrow.parquet
 
@@ -91,11 +93,21 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
         table = pyarrow.parquet.read_table(io.BytesIO(content)) if ending == ".parquet" else _text_table(path, content, names)
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
-    for name in names:
-        if (count := table.column_names.count(name)) != 1:
-            there = "no such column" if count == 0 else f"{count} such columns"
+    found = {name: _place(name, table.column_names) for name in names}
+    for name, place in found.items():
+        if place is None:
+            count = table.column_names.count(name)
+            there = f"{count} such columns, of which `column N` is one by its place" if count else "no such column"
             raise InputError(f"{path}: {name}: {there}; the table has {_some(name, table.column_names)}")
-    return table
+    return pyarrow.table({name: table.column(place) for name, place in found.items()})
+
+
+def _place(name: str, names: list[str]) -> int | None:
+    """Place of a column among a table's ``names``, also of one that is called by it; None if there is none, or several."""
+    if names.count(name) == 1:
+        return names.index(name)
+    place = _BY_PLACE.fullmatch(name)
+    return int(place[1]) - 1 if place and not names.count(name) and int(place[1]) <= len(names) else None
 
 
 def _some(wanted: str, names: list[str]) -> str:
@@ -175,7 +187,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         key=lambda at: (len({*names} & {*_cells(lines[at[0]], at[1])}), -at[0], lines[at[0]].count(at[1])),
     )
     cells = _cells(lines[header], delimiter)
-    if not {*names} & {*cells} and (found := _without_header(lines)):
+    by_place = all(map(_BY_PLACE.fullmatch, names))
+    if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
         header, delimiter = found
         cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
     if delimiter == " ":
@@ -187,7 +200,6 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         cells.pop()
     elif len(first) > len(cells):
         cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units : header + 2 + units])
-    cells = [cell or f"column {number + 1}" for number, cell in enumerate(cells)]
     odd = []
 
     def leave_out(row) -> str:
@@ -205,7 +217,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         )
 
     table = read(".")
-    wanted = [table[name] for name in names if table.column_names.count(name) == 1]
+    wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
     texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
     # Where a comma does not separate, it is a decimal one; a number may have it for the first time after many rows.
     if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
@@ -255,19 +267,23 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 
-def _without_header(lines: list[str]) -> tuple[int, str] | None:
-    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them."""
+def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
+    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them, unless
+    ``words`` may."""
     for row, line in enumerate(lines):
         if not line.strip() or line.lstrip().startswith(("#", "%")):
             continue
         parted = {mark: _cells(line, mark) for mark in (";", "\t", "|", ",", " ")}
         mark = next((mark for mark, cells in parted.items() if len(cells) > 1), ",")
-        return (row - 1, mark) if all(map(_is_number, filter(None, parted[mark]))) else None
+        if all(map(_is_number, filter(None, parted[mark]))):
+            return row - 1, mark
+        if not words:
+            return None
     return None
 
 
 def _is_number(cell: str) -> bool:
-    return cell.lstrip("+-.,")[:1].isdigit()
+    return cell.lstrip("+-.,")[:1].isdigit() or cell.lstrip("+-").lower() in ("inf", "nan")
 
 
 def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
