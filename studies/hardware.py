@@ -148,7 +148,7 @@ def tmotor(folder: Path, work: Path) -> list[str]:
         halves = ([base / f"{half}_half.log"] for half in ("first", "second"))
         gamma = convert.GEAR_GAIN_M_PER_RAD
         row = _diagnosed(path.parent.name, next(halves), base, next(halves), gamma, base / "found")
-        rows.append(row + " | ".join(["", *(f"{error:.2f}" for error in _plain_fits(base, gamma).values()), ""]).rstrip())
+        rows.append(" ".join([row, *(f"{error:.3f} |" for error in _plain_fits(base, gamma).values())]))
     return rows
 
 

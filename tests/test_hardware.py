@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import emb_daemon
+from emb_daemon.calibration.files import save_calibration
 from emb_daemon.calibration.parameters import moved
+from emb_daemon.cli.main import main
 from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
@@ -149,6 +151,15 @@ def test_a_motor_that_turns_on_and_on_is_followed(capsys):
     assert np.abs(turns - np.rint(turns)).max() < 0.001 and set(np.rint(turns)) == {0.0, -534.0}
     found = diagnose([log], stated)
     assert found.after.rmse("torque") < 0.25 * found.before.rmse("torque")
+
+
+def test_replay_of_a_machine_without_pads_says_what_a_clamp_force_is_not(tmp_path, capsys, stops):
+    save_calibration(_on_a_dynamometer(scatter=0.0, load=1.0)[0], tmp_path / "c.yaml")
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = foreignkit.write_table(tmp_path / "a.parquet", stops)
+    mapping, calibration = str(tmp_path / "mapping.yaml"), str(tmp_path / "c.yaml")
+    assert main(["replay", str(table), "--mapping", mapping, "--calibration", calibration]) == 0
+    assert f"{calibration}: nothing to clamp within 10000 rad" in capsys.readouterr().err
 
 
 def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():

@@ -32,9 +32,6 @@ HEAT_CHANNELS = ("temperature", "brake_torque")
 _SLIDING, _TOUCHING_N = 1.0, 300.0
 #: Brake torque (N m) below which a sensor shows nothing but its noise.
 _BRAKING_NM = 20.0
-#: Clearance (rad) from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is
-#: some ten, and a screw of this many turns longer than a caliper.
-_NOTHING_TO_CLAMP_RAD = 1e3
 #: Squared partial correlation of current and load from which, where nothing is clamped, the current is there for the load.
 #: Below it most of the current turns the machine itself, and a constant fitted to the load would be less than half of the
 #: motor's (regression dilution).
@@ -158,8 +155,7 @@ class Bench:
 
         self.trials = list(self._map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
-        #: Whether the motor can reach pads at all; else the load on the spindle is no function of its angle.
-        self.clamps = calibration.contact.clearance_rad < _NOTHING_TO_CLAMP_RAD
+        self.clamps = calibration.contact.is_in_reach
         self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
         self.channels = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
