@@ -1,11 +1,13 @@
 """A rig that nobody here built, through every command that reads its logs: see `foreignkit`."""
 
 import json
+from pathlib import Path
 
 import foreignkit
 import numpy as np
 import pyarrow.parquet
 import pytest
+from scipy.io import savemat
 
 import emb_daemon
 from emb_daemon.cli.main import main
@@ -279,6 +281,54 @@ def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
     counted, timed = log.values()
     assert np.array_equal(counted.samples["angle"], timed.samples["angle"])
     assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
+
+
+def _written(path: Path, variables: dict) -> Path:
+    if path.suffix == ".mat":
+        savemat(path, variables)
+    else:
+        np.savez(path, **variables)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".mat", ".npz"])
+def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A"})
+    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    motion = np.column_stack([columns["angle_rad"], columns["speed_rad_per_s"]])
+    rest = {name: values for name, values in columns.items() if name not in ("angle_rad", "speed_rad_per_s", "force_N")}
+    mapping = foreignkit.COLUMNS.replace("angle_rad", "motion column 1").replace("speed_rad_per_s", "motion column 2")
+    if ending == ".mat":
+        mapping = mapping.replace("signal: force_N", "signal: cell.load.N")
+        cell = {"cell": {"load": {"N": columns["force_N"]}, "serial": 7}}
+    else:
+        cell = {"force_N": columns["force_N"]}
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    path = _written(tmp_path / f"b{ending}", rest | cell | {"motion": motion.T})
+    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+
+
+def test_variables_that_are_no_table_are_refused(tmp_path):
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    for faulty, expected in (
+        (columns | {"angle_rad": columns["angle_rad"][:-1]}, "variables of one length expected, found .*angle_rad 2998"),
+        ({name: values for name, values in columns.items() if name != "current_A"}, "current_A: no such variable of numbers"),
+    ):
+        path = _written(tmp_path / "a.npz", faulty)
+        with pytest.raises(InputError, match=expected):
+            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    for content, ending in ((b"no archive", ".npz"), (b"PK\x03\x04", ".npz"), (b"MATLAB 5.0", ".mat"), (bytes(200), ".mat")):
+        path = tmp_path / f"b{ending}"
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="not readable"):
+            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
+    with pytest.raises(InputError, match=r"MATLAB 7\.3 \(HDF5\); expected one saved with -v7"):
+        load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
 
 
 def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):

@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
+from emb_daemon.logs import arrays
 from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
+_TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
 #: What a measurement file begins with, one that was not closed included.
 _MDF = (b"MDF     ", b"UnFinMF ")
 #: What parts cells; last, any run of blanks.
@@ -54,10 +56,9 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     # `.dat` is what INCA calls a measurement, and what others call a text.
     if ending in _MEASUREMENTS and (ending != ".dat" or content.startswith(_MDF)):
         return _channels(path, content, names), digest
-    if ending not in (*_TEXTS, ".parquet"):
-        raise InputError(
-            f"{path}: expected a table ({', '.join(_TEXTS)}, .parquet) or a measurement ({', '.join(_MEASUREMENTS)}): no dbc"
-        )
+    if ending not in _TABLES:
+        tables, measurements = ", ".join(_TABLES), ", ".join(_MEASUREMENTS)
+        raise InputError(f"{path}: expected a table ({tables}) or a measurement ({measurements}): no dbc")
     if time is None:
         raise InputError(
             f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`, or "
@@ -89,6 +90,8 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
     import pyarrow
     import pyarrow.parquet
 
+    if ending in arrays.ENDINGS:
+        return _of_arrays(path, arrays.read_arrays(path, content, ending), names)
     try:
         table = pyarrow.parquet.read_table(io.BytesIO(content)) if ending == ".parquet" else _text_table(path, content, names)
     except pyarrow.ArrowException as error:
@@ -100,6 +103,19 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
             there = f"{count} such columns, of which `column N` is one by its place" if count else "no such column"
             raise InputError(f"{path}: {name}: {there}; the table has {_some(name, table.column_names)}")
     return pyarrow.table({name: table.column(place) for name, place in found.items()})
+
+
+def _of_arrays(path: Path, found: dict[str, np.ndarray], names: list[str]):
+    import pyarrow
+
+    for name in names:
+        if name not in found:
+            raise InputError(f"{path}: {name}: no such variable of numbers; it has {_some(name, list(found))}")
+    lengths = {name: len(found[name]) for name in names}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"{path}: variables of one length expected, found {told}")
+    return pyarrow.table({name: found[name] for name in names})
 
 
 def _place(name: str, names: list[str]) -> int | None:
