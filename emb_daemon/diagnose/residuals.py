@@ -117,13 +117,17 @@ def _explained(trials: Sequence[Trial]) -> float:
         samples = trial.log.samples
         speed, current = samples["speed"], samples["current_q"]
         known = samples["has_current"] & np.isfinite(trial.force_N)
-        own = np.column_stack([np.ones(len(speed)), np.sign(speed), speed, np.gradient(speed), current, trial.force_N])
+        own = np.column_stack(
+            [np.ones(len(speed)), np.sign(speed), speed, np.diff(speed, prepend=speed[:1]), current, trial.force_N]
+        )
         tables.append(own[known])
     table = np.concatenate(tables)
     if len(table) < table.shape[1] or not np.ptp(table[:, 4]) or not np.ptp(table[:, 5]):
         return 0.0
     rest = table[:, 4:] - table[:, :4] @ np.linalg.lstsq(table[:, :4], table[:, 4:], rcond=None)[0]
-    return float(np.corrcoef(rest.T)[0, 1] ** 2)
+    products = rest.T @ rest
+    size = products[0, 0] * products[1, 1]
+    return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
 
 
 class Bench:
