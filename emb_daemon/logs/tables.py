@@ -68,10 +68,9 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     columns = {name: _numbers(path, table, name) for name in names}
     seconds = _seconds(path, table, time)
     known = np.isfinite(seconds)
-    if np.any(np.abs(seconds[known]) > LATEST_S):
-        raise InputError(
-            f"{path}: {time.signal}: {np.max(np.abs(seconds[known])):g} s are no time; is `time.unit`, {time.unit}, right?"
-        )
+    if len(seconds[known]) and (largest := float(np.max(np.abs(seconds[known])))) > LATEST_S:
+        hint = _other_unit(largest, time)
+        raise InputError(f"{path}: {time.signal}: {largest:g} s are no time; is `time.unit`, {time.unit}, right?{hint}")
     columns = {name: values[known] for name, values in columns.items()}
     stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
     return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
@@ -83,6 +82,15 @@ def _seconds(path: Path, table, time) -> np.ndarray:
         return np.arange(table.num_rows) / time.rate_Hz
     # Of a clock, seconds already.
     return _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
+
+
+def _other_unit(largest_s: float, time) -> str:
+    """What the largest time would be in the largest smaller unit that makes a time of it, in words."""
+    for unit in ("ms", "us", "ns"):
+        seconds = largest_s * UNITS[unit][1] / UNITS[time.unit][1]
+        if seconds <= LATEST_S:
+            return f" As {unit} it is {seconds:.10g} s"
+    return ""
 
 
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
