@@ -188,6 +188,7 @@ def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_t
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("rate_Hz", [50.0, 250.0])
 @pytest.mark.parametrize(
     ("per_rad", "whole", "said"),
     [
@@ -197,8 +198,8 @@ def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_t
         (5e4, False, "or is the unit of time wrong?"),
     ],
 )
-def test_an_angle_in_another_unit_is_told_without_a_speed(truth, tmp_path, capsys, per_rad, whole, said):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_an_angle_in_another_unit_is_told_without_a_speed(tmp_path, capsys, per_rad, whole, said, rate_Hz):
+    columns = foreignkit.sampled(foreignkit.truth(), rate_Hz)
     angle = per_rad * columns["angle_rad"] + 0.3
     mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS)
     _read(tmp_path, columns | {"angle_rad": np.rint(angle) if whole else angle}, mapping)

@@ -48,8 +48,8 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
-    if angle is not None and not angle.is_sparse:
-        if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := _starts_anew(angle.values)):
+    if angle is not None:
+        if not angle.is_sparse and np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := _starts_anew(angle.values)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _too_fast(angle)
