@@ -1,6 +1,6 @@
 """Measured hardware: what the product makes of machines that nobody here built, beside the best plain fits.
 
-    python -m studies.hardware --cranfield data/raw --embir futek_data --emps emps --output work
+    python -m studies.hardware --cranfield data/raw --embir futek_data --tmotor SysID --emps emps --output work
 
 Each set is optional; what `tools/` needs of each is said there, with sources. Logs and reports stay in ``--output``.
 
@@ -9,11 +9,12 @@ that park brake training starts with (`adapt.pairs`), scaled on the normal runs 
 alone, from the same runs, which cannot know that friction has changed. Friction is called changed where it leaves the scatter
 of the normal runs.
 
-EMBiR dynamometer: `emb-daemon diagnose` on the first half of a run, judged on the second, and on runs of other days.
+EMBiR dynamometer: `emb-daemon diagnose` on the first half of a run, judged on the second, and on runs of other days. Geared
+robot motor: the same of every run, each judged on its own second half.
 """
 
 import argparse
-import importlib.util
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -41,11 +42,10 @@ EMBIR_OTHERS = ("23_04_2021_19-57-18", "11_05_2021_18-12-52", "24_05_2021_15-00-
 
 
 def tool(name: str):
-    """A converter out of tools/ as a module."""
-    spec = importlib.util.spec_from_file_location(name, _TOOLS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    """A converter out of tools/ as a module; some share what others have."""
+    if str(_TOOLS) not in sys.path:
+        sys.path.append(str(_TOOLS))
+    return importlib.import_module(name)
 
 
 # -- Cranfield --------------------------------------------------------------------------------------------------------
@@ -137,6 +137,21 @@ def embir(folder: Path, work: Path) -> list[str]:
     ]  # fmt: skip
 
 
+def tmotor(folder: Path, work: Path) -> list[str]:
+    """Torque error in N m before and after, beside plain fits, on the second half of each run."""
+    convert = tool("tmotor_to_log")
+    rows = ["| run | before | after | found | constant and offset | friction | saturation |", "|---|---|---|---|---|---|---|"]
+    for path in sorted(folder.glob("*/log_adc_and_motor.csv")):
+        base = work / path.parent.name
+        if convert.main([str(path), "--output", str(base)]):
+            continue
+        halves = ([base / f"{half}_half.log"] for half in ("first", "second"))
+        gamma = convert.GEAR_GAIN_M_PER_RAD
+        row = _diagnosed(path.parent.name, next(halves), base, next(halves), gamma, base / "found")
+        rows.append(" ".join([row, *(f"{error:.3f} |" for error in _plain_fits(base, gamma).values())]))
+    return rows
+
+
 def _diagnosed(name: str, logs: list[Path], base: Path, validate: list[Path], gamma: float, output: Path) -> str:
     others = ["--validate", *map(str, validate)] if validate else []
     calibration = str(base / "calibration.yaml")
@@ -170,6 +185,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cranfield", type=Path, metavar="DIR", help="data/raw of Rocket-RAG")
     parser.add_argument("--embir", type=Path, metavar="DIR", help="futek_data of actuator-dynamometer")
+    parser.add_argument("--tmotor", type=Path, metavar="DIR", help="SysID of TMotorCANControl")
     parser.add_argument("--emps", type=Path, metavar="DIR", help="with DATA_EMPS.mat and DATA_EMPS_PULSES.mat")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="for logs and reports")
     arguments = parser.parse_args(argv)
@@ -178,6 +194,8 @@ def main(argv: list[str] | None = None) -> int:
         lines += ["Cranfield ball screw, RMS error of the load on runs 6 to 10", "", *cranfield(arguments.cranfield), ""]
     if arguments.embir:
         lines += ["EMBiR dynamometer", "", *embir(arguments.embir, arguments.output), ""]
+    if arguments.tmotor:
+        lines += ["AK80-9, second half of each run, N·m", "", *tmotor(arguments.tmotor, arguments.output / "tmotor"), ""]
     if arguments.emps:
         lines += ["EMPS", "", *emps(arguments.emps, arguments.output / "emps"), ""]
     print("\n".join(lines))

@@ -33,12 +33,16 @@ def opened(html: str, folder) -> dict:
 
 def said_by(html: str, folder, script: str):
     """What a script behind the page's own makes of the document's title, as JSON; promises are waited for."""
+    return said_at(folder / "page.html", html, script)
+
+
+def said_at(path, html: str, script: str):
+    """The same of a page with the files that lie about ``path``."""
     if not _CHROMIUM:
         pytest.skip("NOT RUN: no Chromium here (Debian: apt-get install chromium)")
-    path = folder / "page.html"
     path.write_text(html.replace("<head>", "<head>" + _BEFORE, 1).replace("</body>", script + "</body>", 1))
     command = [_CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1280,900",
-               f"--user-data-dir={folder}/profile", "--dump-dom", path.as_uri()]  # fmt: skip
+               f"--user-data-dir={path.parent}/profile", "--dump-dom", path.as_uri()]  # fmt: skip
     result = subprocess.run(command, capture_output=True, text=True, timeout=90, check=True)
     return json.loads(re.search(r"<title>(.*?)</title>", result.stdout, re.DOTALL)[1])
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browserkit import said_at
 
 from emb_daemon import __version__
 from emb_daemon.cli.main import COMMANDS
@@ -13,6 +14,20 @@ from emb_daemon.cli.main import COMMANDS
 _ROOT = Path(__file__).parent.parent
 _PAGES = [*sorted(_ROOT.glob("docs/*.md")), _ROOT / "README.md", _ROOT / "CHANGELOG.md"]
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+#: What a reader finds who opens the pages as files, by what is typed: addresses of the results.
+_SEARCH = """<script>
+(async function () {
+  var found = {};
+  for (var words of ["resolv", "mapping.yaml", "clamp: force?", "xyzzy"]) {
+    document.getElementById("mkdocs-search-query").value = words;
+    await searchPages();
+    found[words] = Array.from(document.querySelectorAll("#mkdocs-search-results a")).map(a => a.getAttribute("href"));
+  }
+  document.title = JSON.stringify(found);
+})();
+</script>"""
 
 
 def _anchors(path: Path) -> set[str]:
@@ -74,6 +89,10 @@ def test_the_site_builds(tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, cwd=_ROOT)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "site" / "calibration.html").is_file()
+    found = said_at(tmp_path / "site" / "page.html", (tmp_path / "site" / "index.html").read_text(encoding="utf-8"), _SEARCH)
+    assert any(page.startswith("./wire.html") for page in found["resolv"])
+    assert any(page.startswith("./mapping.html") for page in found["mapping.yaml"][:3])
+    assert found["clamp: force?"] and not found["xyzzy"]
 
 
 def test_the_changelog_knows_this_version():

@@ -1,11 +1,13 @@
 """A rig that nobody here built, through every command that reads its logs: see `foreignkit`."""
 
 import json
+from pathlib import Path
 
 import foreignkit
 import numpy as np
 import pyarrow.parquet
 import pytest
+from scipy.io import savemat
 
 import emb_daemon
 from emb_daemon.cli.main import main
@@ -236,12 +238,21 @@ def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit
     assert "times as fast" not in capsys.readouterr().err
 
 
+_HEAD = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
         ("a.csv", "time_s,angle_rad\n0,0\n", "current_A: no such column; the table has time_s, angle_rad"),
-        ("a.csv", "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n0,x,0,0,0,0\n", "expected a column of numbers"),
+        ("a.csv", _HEAD + "0,x,0,0,0,0\n", "expected a column of numbers"),
         ("a.csv", "", "not readable"),
+        (
+            "a.csv",
+            _HEAD + "0,0,0,0,0,0\n" + "0,0,0,0\n" * 9,
+            "9 of 10 rows have another number of cells than 6, the first of them 4",
+        ),
+        ("a.csv", _HEAD + "0,,,0,0,0\n", "no value of angle_rad"),
         ("a.parquet", "no parquet", "not readable"),
         ("a.mf4", "no measurement", "not readable as a measurement"),
         ("a.blf", "", "expected a table"),
@@ -255,6 +266,159 @@ def test_a_faulty_table_is_refused_in_one_line(tmp_path, capsys, name, content, 
     assert main(["replay", str(tmp_path / name), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
     *_notes, line = capsys.readouterr().err.splitlines()
     assert line.startswith(f"{tmp_path / name}: ") and expected in line, line
+
+
+def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
+    """Its first column has no name, as a table that counts its rows has none."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    columns["time_s"] = columns["time_s"][0] + 0.004 * np.arange(len(columns["time_s"]))
+    path, log = foreignkit.write_table(tmp_path / "a.csv", columns), {}
+    for time in ("time: {rate_Hz: 250}", "time: {signal: column 1}"):
+        path.write_text(path.read_text().replace('"time_s"', '""', 1))
+        (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("time: {signal: time_s}", time))
+        log[time] = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    counted, timed = log.values()
+    assert np.array_equal(counted.samples["angle"], timed.samples["angle"])
+    assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
+
+
+def _written(path: Path, variables: dict) -> Path:
+    if path.suffix == ".mat":
+        savemat(path, variables)
+    else:
+        np.savez(path, **variables)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".mat", ".npz"])
+def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A"})
+    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    motion = np.column_stack([columns["angle_rad"], columns["speed_rad_per_s"]])
+    rest = {name: values for name, values in columns.items() if name not in ("angle_rad", "speed_rad_per_s", "force_N")}
+    mapping = foreignkit.COLUMNS.replace("angle_rad", "motion column 1").replace("speed_rad_per_s", "motion column 2")
+    if ending == ".mat":
+        mapping = mapping.replace("signal: force_N", "signal: cell.load.N")
+        cell = {"cell": {"load": {"N": columns["force_N"]}, "serial": 7}}
+    else:
+        cell = {"force_N": columns["force_N"]}
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    path = _written(tmp_path / f"b{ending}", rest | cell | {"motion": motion.T})
+    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+
+
+def test_variables_that_are_no_table_are_refused(tmp_path):
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    for faulty, expected in (
+        (columns | {"angle_rad": columns["angle_rad"][:-1]}, "variables of one length expected, found .*angle_rad 2998"),
+        ({name: values for name, values in columns.items() if name != "current_A"}, "current_A: no such variable of numbers"),
+    ):
+        path = _written(tmp_path / "a.npz", faulty)
+        with pytest.raises(InputError, match=expected):
+            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    for content, ending in ((b"no archive", ".npz"), (b"PK\x03\x04", ".npz"), (b"MATLAB 5.0", ".mat"), (bytes(200), ".mat")):
+        path = tmp_path / f"b{ending}"
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="not readable"):
+            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
+    with pytest.raises(InputError, match=r"MATLAB 7\.3 \(HDF5\); expected one saved with -v7"):
+        load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+
+
+def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):
+    """Two instruments in one table, each with its times, as an acquisition tool writes them; a first value that is none."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    plain = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read)
+    names, values = list(columns), [*columns.values(), columns["time_s"]]
+    rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
+    tool = 'Timestamp,2020-03-16 17:04:51,Unit,"V"\nInterval,0.004\n'
+    (tmp_path / "a.csv").write_text("\n".join([tool + ",".join([*names, "time_s"]), *rows]))
+    (tmp_path / "b.csv").write_text("\n".join([",".join(["nan"] * 5 + ["inf", "0"]), *rows]))
+    for name, mapping in (
+        ("a", foreignkit.COLUMNS.replace("signal: time_s", "signal: column 1")),
+        ("a", _by_place(names)),
+        ("b", _by_place(names)),
+    ):
+        (tmp_path / "mapping.yaml").write_text(mapping)
+        log = load_log(tmp_path / f"{name}.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+        _assert_same(log.samples, plain.samples)
+    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS)
+    with pytest.raises(InputError, match="time_s: 2 such columns, of which `column N` is one by its place"):
+        load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+
+
+def _assert_same(one: np.ndarray, other: np.ndarray) -> None:
+    for name in other.dtype.names:
+        np.testing.assert_array_equal(one[name], other[name], name)
+
+
+def _by_place(names: list[str]) -> str:
+    mapping = foreignkit.COLUMNS
+    for number, name in enumerate(names):
+        mapping = mapping.replace(f"signal: {name}", f"signal: column {number + 1}")
+    return mapping
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("{cells},0", "rows have 7 cells, the header names 6; the last are column 7"),
+        ('"{number}",{cells}', ""),
+        ("{number},{cells}", ""),
+        ("{cells},", ""),
+    ],
+)
+def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, said):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    header, *rows = (
+        foreignkit.write_table(tmp_path / "a.csv", foreignkit.sampled(foreignkit.truth(), 250.0)).read_text().split()
+    )
+    plain = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    capsys.readouterr()
+    lines = [header, *(row.format(cells=cells, number=n + 1) for n, cells in enumerate(rows))]
+    (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
+    log = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    _assert_same(log.samples, plain.samples)
+    assert capsys.readouterr().err == (f"{tmp_path / 'b.csv'}: {said}\n" if said else "")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ("time: {signal: time_s}", "time: {}", "expected either signal (a column) or rate_Hz"),
+        ("time: {signal: time_s}", "time: {signal: t, rate_Hz: 9}", "expected either signal (a column) or rate_Hz"),
+        (
+            "angle_rad, unit: rad",
+            "x, unit: mm",
+            "x is a travel in mm, not the motor's angle; state `unit: rad`, and as `scale`",
+        ),
+        ("speed_rad_per_s, unit: rad/s", "v, unit: mm/s", "v is a travel in mm/s, not the motor's angle; state `unit: rad/s`"),
+        ("force_N, unit: N", "force_N, unit: stone", "unit 'stone' of force_N is unknown; state one of N, kN"),
+    ],
+)
+def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace(before, after))
+    with pytest.raises(InputErrors) as error:
+        Mapping(tmp_path / "mapping.yaml")
+    [line] = str(error.value).splitlines()
+    assert expected in line
+
+
+@pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])
+def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(tmp_path, unit, newton):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}"))
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"force_N": columns["force_N"] / newton})
+    force = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).force_N
+    assert np.nanmax(force) == pytest.approx(np.nanmax(columns["force_N"]), rel=1e-3)
 
 
 def _without(text: str, *words: str) -> str:

@@ -9,9 +9,15 @@ import numpy as np
 import pytest
 
 import emb_daemon
+from emb_daemon.calibration.files import save_calibration
 from emb_daemon.calibration.parameters import moved
+from emb_daemon.cli.main import main
 from emb_daemon.diagnose.comparison import errors, whole
+from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.screening import Screening
+from emb_daemon.errors import InputError
 from emb_daemon.logs import resample
 from emb_daemon.wire.contract import reason_words
 
@@ -81,7 +87,88 @@ def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
     bench = Bench([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], without_load)
     assert bench.channels == ["torque"] and whole(bench) == "torque"
     assert errors(bench, without_load).rmse("torque") < 250.0
+    # What matters, and what rivals of a term differ by, are shares of the load.
+    assert Screening(bench, Model.of(bench)).force_N == pytest.approx(5000.0 / np.sqrt(2.0), rel=0.05)
     assert errors(bench, moved(without_load, {"motor.torque_constant_Nm_per_A": 0.06})).rmse("torque") > 500.0
+
+
+def _on_a_dynamometer(scatter: float, load: float):
+    """A motor of 0.85 of its stated constant that turns to and fro against a load: calibration, the true constant, and logs
+    to fit and to judge. ``load``: share of its current that it gets from the load and does not draw from its own speed;
+    ``scatter`` of friction, in A."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    stated = moved(stated, {"friction.load_m_per_rad": 0.0})
+    motor, constant = stated.motor, 0.85 * stated.motor.torque_constant_Nm_per_A
+
+    def log(seed: int, size_A: float):
+        random = np.random.default_rng(seed)
+        time_s = 0.004 * np.arange(5000)
+        speed = 30.0 * np.sin(2.0 * np.pi * time_s / 1.7)
+        held = [np.repeat(random.normal(size=5000 // n), n) for n in (100, 40)]
+        torque = constant * size_A * held[0]
+        lost = stated.friction.offset_Nm * np.sign(speed) + scatter * constant * held[1]
+        lost += motor.inertia_kg_m2 * np.gradient(speed, time_s)
+        force = (load * torque - (lost if load == 1.0 else 0.0)) / motor.gear_gain_m_per_rad
+        current = (torque if load == 1.0 else load * torque + lost) / constant
+        columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
+        return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+    return stated, constant, log(1, 3.0), log(2, 9.0)
+
+
+def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load():
+    """Of a motor whose current is commanded: on larger loads the constant that was fitted to small ones must hold."""
+    stated, constant, fit, judge = _on_a_dynamometer(scatter=1.8, load=1.0)
+    result = diagnose([fit], stated, [judge])
+    assert result.calibration.motor.torque_constant_Nm_per_A == pytest.approx(constant, rel=0.05)
+    before, after = (errors.rmse("torque") for errors in (result.before, result.after))
+    table = np.column_stack([fit.samples["current_q"], np.sign(fit.samples["speed"])])
+    plain = np.linalg.lstsq(table, fit.force_N, rcond=None)[0]
+    left = judge.force_N - np.column_stack([judge.samples["current_q"], np.sign(judge.samples["speed"])]) @ plain
+    assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
+
+
+def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
+    stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
+    found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A
+    assert 0.95 * constant < found < 1.05 * stated.motor.torque_constant_Nm_per_A
+
+
+def test_a_motor_that_turns_on_and_on_is_followed(capsys):
+    """Further than our message's angle reaches, in one direction, so that load, friction and constant resemble each other."""
+    stated, constant, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+    random, time_s = np.random.default_rng(1), 0.004 * np.arange(8000)
+    speed = 150.0 + 40.0 * np.sin(2.0 * np.pi * time_s / 3.0)
+    current = 4.0 + 3.0 * np.repeat(random.normal(size=80), 100)
+    torque = constant * current - stated.friction.offset_Nm - stated.motor.inertia_kg_m2 * np.gradient(speed, time_s)
+    force = torque / stated.motor.gear_gain_m_per_rad + 100.0 * random.normal(size=8000)
+    columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
+    log = _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+    assert "MotorAngle covers 4828 rad, more than our message carries" in capsys.readouterr().err
+    turns = (log.samples["angle"] - columns["angle_rad"]) / (2.0 * np.pi)
+    assert np.abs(turns - np.rint(turns)).max() < 0.001 and set(np.rint(turns)) == {0.0, -534.0}
+    found = diagnose([log], stated)
+    assert found.after.rmse("torque") < 0.25 * found.before.rmse("torque")
+
+
+def test_replay_of_a_machine_without_pads_says_what_a_clamp_force_is_not(tmp_path, capsys, stops):
+    save_calibration(_on_a_dynamometer(scatter=0.0, load=1.0)[0], tmp_path / "c.yaml")
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = foreignkit.write_table(tmp_path / "a.parquet", stops)
+    mapping, calibration = str(tmp_path / "mapping.yaml"), str(tmp_path / "c.yaml")
+    assert main(["replay", str(table), "--mapping", mapping, "--calibration", calibration]) == 0
+    assert f"{calibration}: nothing to clamp within 10000 rad" in capsys.readouterr().err
+
+
+def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():
+    stated, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+    time_s = 0.1 * np.arange(2000)
+    angle, force = 20.0 * np.sin(3.0 * time_s), 2000.0 * np.sin(0.7 * time_s)
+    log = _log({"time_s": time_s, "angle_rad": angle, "current_A": force / 1000.0, "force_N": force}, current_mean_s=0.0)
+    with pytest.raises(InputError, match=r"no sample of it can be judged.* its samples are 100 ms apart"):
+        diagnose([log], stated)
 
 
 def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):

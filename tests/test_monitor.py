@@ -4,15 +4,20 @@ import json
 import math
 import threading
 import time
+from types import SimpleNamespace
 
 import can
 import numpy as np
 import pytest
 import wirekit
+from rich.console import Console
 
 from emb_daemon.cli.main import main
+from emb_daemon.demo import view
+from emb_daemon.demo.recorder import Recorder
 from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener
 from emb_daemon.monitor.view import render, sparkline, summary
+from emb_daemon.plant.records import TRUTH
 from emb_daemon.wire.contract import REASONS
 
 S = SECOND_NS
@@ -32,8 +37,6 @@ def _hear(*frames) -> Listener:
 
 
 def _text(listener, now_ns=101 * S, width=80, height=24) -> list[str]:
-    from rich.console import Console
-
     console = Console(width=width, height=height, color_system=None, force_terminal=True)
     with console.capture() as capture:
         console.print(render(listener, now_ns, "can0", width, height))
@@ -157,3 +160,28 @@ def test_nobody_there_is_said_and_the_status_is_1(capsys, monkeypatch):
 def test_a_summary_names_the_reasons():
     status = wirekit.frame("EMB_FL_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8)
     assert summary(_hear(_force(0), status), 101 * S)[0].endswith("; signal stuck")
+
+
+@pytest.mark.parametrize(("width", "left_out"), [(80, {"mode", "surface"}), (140, set())])
+def test_the_demo_shows_whole_columns_at_any_width(width, left_out):
+    """Nothing of what is shown is cut off; what finds no room is left out."""
+    recorder = Recorder(("FL", "FR", "RL", "RR"), 1.0)
+    truth = np.zeros(4, TRUTH)
+    truth["force"], truth["mean"][:, 0] = 23_456.0, 345.0
+    recorder.sent(100 * S, truth)
+    for corner in recorder.corners:
+        frames = (
+            _force(0, 23.45, corner=corner),
+            wirekit.frame(f"EMB_{corner}_PadTemp", 100 * S, InnerSurfaceTemp=512.0, InnerMeanTemp=345.0),
+            wirekit.frame(f"EMB_{corner}_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8),
+        )
+        recorder.heard(np.concatenate(frames))
+    daemon, live = SimpleNamespace(ticks=10, missed=0), SimpleNamespace(late=0, lost=0)
+    console = Console(width=width, height=24, color_system=None, force_terminal=True)
+    with console.capture() as capture:
+        console.print(view.render(recorder, daemon, live, 1.0, [], width))
+    text = capture.get()
+    assert all(len(line) <= width for line in text.splitlines())
+    shown = {"FL", "RR", "23.45 kN", "0.24", "23.46", "345 °C", "clamp force", "source", "status", "signal stuck"}
+    assert all(cell in text for cell in shown | {"mode", "surface"} - left_out) and "…" not in text
+    assert not any(cell in text for cell in left_out)

@@ -104,7 +104,7 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
         (lambda t: 1e3 * t, "one value every 4 s; expected 1e-05 to 1 s; is the unit of time right?"),
         (lambda t: 1e6 * t, "one value every 4e+03 s"),
         (lambda t: 1e-6 * t, "one value every 4e-09 s"),
-        (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right?"),
+        (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right? As us it is 1790000"),
         (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
         (lambda t: 0.0 * t, "749 values, all of them of one time"),
         (lambda t: np.concatenate([t[:400], t[: len(t) - 400]]), "time goes back by 1.596 s after value 400"),
@@ -161,6 +161,50 @@ def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):
     columns = foreignkit.sampled(truth, 500.0)
     _read(tmp_path, columns | {"angle_rad": columns["angle_rad"] % (2.0 * np.pi)})
     assert "does it start anew? Then state its `period`" in capsys.readouterr().err
+
+
+def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
+    time_s = 0.004 * np.arange(1000)
+    still = 0.0 * time_s
+    columns = {"time_s": time_s, "angle_rad": 25.0 * time_s, "speed_rad_per_s": 25.0 * 30.0 / np.pi + still}
+    _read(tmp_path, columns | {"current_A": 1.0 + still, "plate_C": 22.0 + still, "force_N": still})
+    assert "rpm taken for rad/s, or the reverse" in capsys.readouterr().err
+    assert not [warning for warning in recwarn if warning.category is RuntimeWarning]
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "said"),
+    [
+        (2.0 * np.pi, ": 6.28319 rad in the rig's unit"),
+        (360.0, "360, with `unit: deg`"),
+        (1.0, "1, with `unit: rev`"),
+        (4096.0, "4096 counts in a turn? `unit: rev`, `scale: 0.000244140625`, `period: 4096`"),
+    ],
+)
+def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_turn, said):
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow()), 250.0)
+    turns = 3.0 * columns["angle_rad"] / (2.0 * np.pi)
+    _read(tmp_path, columns | {"angle_rad": per_turn * (turns % 1.0)})
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate_Hz", [50.0, 250.0])
+@pytest.mark.parametrize(
+    ("per_rad", "whole", "said"),
+    [
+        (1.0, False, ""),
+        (180.0 / np.pi, False, "if its values are degrees, `unit: deg` makes"),
+        (5e4, True, "counts of an encoder? Then `unit: rev`"),
+        (5e4, False, "or is the unit of time wrong?"),
+    ],
+)
+def test_an_angle_in_another_unit_is_told_without_a_speed(tmp_path, capsys, per_rad, whole, said, rate_Hz):
+    columns = foreignkit.sampled(foreignkit.truth(), rate_Hz)
+    angle = per_rad * columns["angle_rad"] + 0.3
+    mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS)
+    _read(tmp_path, columns | {"angle_rad": np.rint(angle) if whole else angle}, mapping)
+    lines = [line for line in capsys.readouterr().err.splitlines() if "which no motor does" in line]
+    assert len(lines) == bool(said) and all(said in line for line in lines)
 
 
 def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):

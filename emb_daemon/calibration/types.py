@@ -126,6 +126,11 @@ class Stiffness(Struct, kw_only=True):
                 )
 
 
+#: Clearance from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is some ten,
+#: and a screw of this many turns longer than a caliper.
+_NOTHING_TO_CLAMP_RAD = 1e3
+
+
 class Contact(Struct, kw_only=True):
     """Where the pads touch."""
 
@@ -135,6 +140,11 @@ class Contact(Struct, kw_only=True):
     clearance_sigma_rad: Positive
     #: Random walk of the contact angle, by wear and heat.
     walk_rad_per_sqrt_s: Annotated[NonNegative, usual(1e-4)]
+
+    @property
+    def is_in_reach(self) -> bool:
+        """Whether the motor can reach pads at all; else the load on the spindle is no function of its angle."""
+        return self.clearance_rad < _NOTHING_TO_CLAMP_RAD
 
 
 class Noise(Struct, kw_only=True):

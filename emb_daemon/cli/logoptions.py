@@ -6,7 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 #: What a command that opens logs says of them.
-LOG_HELP = ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .txt, .tsv, .parquet and measurements (.mf4)"
+LOG_HELP = (
+    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .txt, .tsv, .parquet, .mat, .npz "
+    "and measurements (.mf4)"
+)
 
 
 def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False) -> None:

@@ -55,6 +55,13 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
         calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
+    if not calibration.contact.is_in_reach:
+        clearance = calibration.contact.clearance_rad
+        print(
+            f"{arguments.calibration}: nothing to clamp within {clearance:g} rad (contact.clearance_rad): estimates are "
+            "clamp forces, never negative; `diagnose` judges a load of either sign",
+            file=sys.stderr,
+        )
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
     sign = np.asarray
     if arguments.keys:

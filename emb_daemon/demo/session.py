@@ -116,12 +116,13 @@ class Session:
 
 
 def _summary(session: Session) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
     recorder = session.recorder
-    table = Table(title="Estimate from the bus against the simulated truth", title_justify="left")
-    for heading in ("corner", "RMSE", "bias", "95 %", "largest", "within 2 σ", "answered", "response 50 / 99 %"):
+    table = Table(title="Estimate from the bus against the simulated truth", title_justify="left", box=SIMPLE_HEAD)
+    for heading in ("corner", "RMSE", "bias", "95 %", "largest", "within 2 σ", "answered", "response 50/99 %"):
         table.add_column(heading, justify="right")
     for row, corner in enumerate(recorder.corners):
         comparison = recorder.compare(row)
@@ -133,8 +134,8 @@ def _summary(session: Session) -> None:
             corner,
             *(f"{figures[name]:.0f} N" for name in ("rmse", "bias", "p95", "max")),
             f"{100.0 * figures['within_2_sigma']:.1f} %",
-            f"{len(comparison.time_s)} of {comparison.samples}",
-            f"{median:.2f} / {tail:.2f} ms",
+            f"{len(comparison.time_s)}/{comparison.samples}",
+            f"{median:.2f}/{tail:.2f} ms",
         )
     console = Console() if sys.stdout.isatty() else Console(width=110)
     console.print(table)
@@ -166,7 +167,8 @@ def run_demo(corners: int, seconds: float, picture: Path) -> int:
         with Live(console=console, auto_refresh=False) as view:
 
             def show() -> None:
-                view.update(render(session.recorder, session.daemon, session.live, seconds, handler.lines), refresh=True)
+                shown = render(session.recorder, session.daemon, session.live, seconds, handler.lines, console.width)
+                view.update(shown, refresh=True)
 
             session.run(show, _VIEW_S)
     else:

@@ -1,5 +1,7 @@
 """Live view of the demonstration."""
 
+from itertools import compress
+
 import numpy as np
 from rich.console import Group
 from rich.panel import Panel
@@ -11,6 +13,13 @@ from emb_daemon.monitor.view import STATUS_COLOURS, number
 from emb_daemon.wire.contract import PARK_RELEASED
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
+#: Columns of a corner: heading, how it is set, and whether a terminal of 80 characters has room for it; width for all.
+_COLUMNS = (
+    ("", "left", True), ("clamp force", "right", True), ("", "left", False), ("± 2σ", "right", True), ("true*", "right", True),
+    ("source", "left", True), ("status", "left", True), ("mode", "left", False), ("surface", "right", False),
+    ("mean", "right", True), ("true*", "right", False), ("remark", "left", True),
+)  # fmt: skip
+_WIDE = 120
 
 
 def phase(truth: np.void) -> str:
@@ -65,17 +74,17 @@ def _remark(state: dict) -> str:
     return ", ".join(state["reasons"])
 
 
-def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
-    """The view for a terminal."""
+def render(recorder: Recorder, daemon, live, seconds: float, messages, width: int) -> Panel:
+    """The view for a terminal of ``width`` characters."""
     if not recorder.cycles:
         return Panel("starting", title="emb-daemon demo")
     truth = recorder.truth[recorder.cycles - 1]
     table = Table(box=None, header_style="bold", padding=(0, 1))
-    for heading in ("", "clamp force", "", "± 2σ", "true*", "source", "status", "mode", "surface", "mean", "true*", "remark"):
-        justify = "left" if heading in ("", "source", "status", "mode", "remark") else "right"
-        table.add_column(heading, justify=justify, no_wrap=True)
+    shown = [width >= _WIDE or narrow for _, _, narrow in _COLUMNS]
+    for heading, justify, _ in compress(_COLUMNS, shown):
+        table.add_column(heading, justify=justify, no_wrap=heading != "remark")
     for corner, state, true in zip(recorder.corners, recorder.states(), truth, strict=True):
-        table.add_row(
+        cells = (
             Text(corner, style="bold"),
             f"{number(state['clamp_force_kN'], 2)} kN",
             _bar(state["clamp_force_kN"]),
@@ -89,6 +98,7 @@ def render(recorder: Recorder, daemon, live, seconds: float, messages) -> Panel:
             Text(f"{true['mean'][0]:.0f}", style="dim"),
             _remark(state),
         )
+        table.add_row(*compress(cells, shown))
     time = 1e-9 * (truth[0]["time_ns"] - recorder.truth[0, 0]["time_ns"])
     head = Text(f"{time:5.1f} of {seconds:.0f} s   {phase(truth[0])}   {truth[0]['vehicle_speed']:.1f} m/s", style="bold")
     foot = Text(health(recorder, daemon, live), style="dim")

@@ -56,10 +56,11 @@ class Coordinate:
 
 Values = Mapping[Coordinate, float]
 
+TORQUE_CONSTANT = "motor.torque_constant_Nm_per_A"
 #: Base parameters, the channel that shows them, and how well they are known: standard deviation over their size.
 _BASE = (
     ("stiffness.relaxation_time_s", "stiffness", 0.5),
-    ("motor.torque_constant_Nm_per_A", "torque", 0.03),
+    (TORQUE_CONSTANT, "torque", 0.03),
     ("motor.inertia_kg_m2", "torque", 0.5),
     ("friction.load_m_per_rad", "torque", 0.5),
     ("friction.offset_Nm", "torque", 1.0),
@@ -74,6 +75,9 @@ _BASE = (
     ("thermal.disc.cooling_W_per_K", "temperature", 0.5),
     ("thermal.disc.cooling_per_speed_J_per_rad_K", "temperature", 0.5),
 )
+#: The same of a torque constant that nobody has measured: a gear's loss takes up to a fifth of it, and suppliers count
+#: amperes by their peak, RMS or d/q amplitude, which differ by up to a root of two.
+_STATED = 0.3
 #: The same over the usual size of a parameter that is zero or below this share of it: of its size nothing else is known.
 _OF_USUAL, _NEXT_TO_NOTHING = 3.0, 0.3
 #: A parameter that cannot be zero does not fall below this share of itself.
@@ -93,8 +97,9 @@ _ORDER_STEP, _ORDER = 1e-4, 0.1
 _SHAPE = 0.5
 
 
-def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float]) -> list[Coordinate]:
-    """Coordinates of the base calibration; the contact angle has one for each log, about its clearance."""
+def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], stated: bool = False) -> list[Coordinate]:
+    """Coordinates of the base calibration; the contact angle has one for each log, about its clearance. ``stated``: the torque
+    constant is a supplier's, and a measured load tells it."""
     clearance = parameter(calibration, "contact.clearance_rad")
     moves = (Move(clearance.key, 1.0, 0.0, np.inf),)
     result = [
@@ -119,7 +124,8 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float]) 
     if not calibration.thermal.softening.history_per_K:
         # No log has shown it yet.
         result.append(_scale(calibration, [HISTORY_TIME], "stiffness", 1.0))
-    result += [_scale(calibration, [key], channel, prior) for key, channel, prior in _BASE]
+    for key, channel, prior in _BASE:
+        result.append(_scale(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior))
     return result + _friction(calibration)
 
 

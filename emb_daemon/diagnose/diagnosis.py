@@ -135,9 +135,16 @@ def diagnose(
     progress("cutting the logs into episodes", 0.02)
     bench = Bench(fit_logs, calibration)
     if bench.episodes < EPISODES:
-        told = f"only {bench.episodes} episodes, expected at least {EPISODES} to tell effect from chance"
+        count = "one episode" if bench.episodes == 1 else f"{bench.episodes} episodes"
+        told = (
+            f"only {count} (stops, strokes or holds, between which the motor turns), expected at least {EPISODES} to tell "
+            "effect from chance"
+        )
         raise InputError(f"{fit_logs[0].path}: {told}")
-    result = diagnose_bench(bench, Bench(validate, calibration) if validate else None, progress)
+    judges = Bench(validate, calibration) if validate else None
+    for judging in filter(None, (bench, judges)):
+        _refuse_silent(judging)
+    result = diagnose_bench(bench, judges, progress)
     return replace(result, seconds=time.monotonic() - begin)
 
 
@@ -187,6 +194,17 @@ def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:
         for log in fit_logs:
             if len(judge.samples) == len(log.samples) and judge.samples.tobytes() == log.samples.tobytes():
                 raise InputError(f"{judge.path}: is {log.path}, which chooses; expected another log to judge")
+
+
+def _refuse_silent(bench: Bench) -> None:
+    if any(np.any(residual) for residual in bench.residuals({}).values()):
+        return
+    log = bench.trials[0].log
+    apart = 1e3 * float(np.median(log.samples["dt"]))
+    raise InputError(
+        f"{log.path}: no sample of it can be judged; expected motor, current and reference at 100 Hz or more, or slower "
+        f"motion: its samples are {apart:.3g} ms apart"
+    )
 
 
 # -- findings ---------------------------------------------------------------------------------------------------------
@@ -326,7 +344,7 @@ def _rms(residual: np.ndarray) -> float:
 
 def undecided(selection: Selection) -> dict[str, float]:
     """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it."""
-    size, result = rmse(selection.screening.signals["clamp_force"]), {}
+    size, result = selection.screening.force_N, {}
     for candidate in map(selection.candidates.__getitem__, selection.accepted):
         key = f"noise.{candidate.channel}_relative"
         if candidate.channel in ("stiffness", "torque") and candidate.undecided_N > 0.0:

@@ -49,7 +49,8 @@ class Model:
         """The calibration as it is: its base parameters and its effects free, nothing moved."""
         coordinates = []
         clearances = [bench.on(trial).contact.clearance_rad for trial in bench.trials]
-        for coordinate in base_coordinates(bench.calibration, clearances):
+        stated = bench.load_follows and bench.calibration.provenance is None
+        for coordinate in base_coordinates(bench.calibration, clearances, stated):
             if channel := bench.channel_of(coordinate.channel):
                 coordinates.append(replace(coordinate, channel=channel))
         for effect in REGISTRY:

@@ -32,9 +32,10 @@ HEAT_CHANNELS = ("temperature", "brake_torque")
 _SLIDING, _TOUCHING_N = 1.0, 300.0
 #: Brake torque (N m) below which a sensor shows nothing but its noise.
 _BRAKING_NM = 20.0
-#: Clearance (rad) from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is
-#: some ten, and a screw of this many turns longer than a caliper.
-_NOTHING_TO_CLAMP_RAD = 1e3
+#: Squared partial correlation of current and load from which, where nothing is clamped, the current is there for the load.
+#: Below it most of the current turns the machine itself, and a constant fitted to the load would be less than half of the
+#: motor's (regression dilution).
+_FOR_THE_LOAD = 0.5
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -109,6 +110,26 @@ def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:
     return rows, measured
 
 
+def _explained(trials: Sequence[Trial]) -> float:
+    """Squared partial correlation of current and reference load, beside the motor's direction, speed and acceleration."""
+    tables = []
+    for trial in trials:
+        samples = trial.log.samples
+        speed, current = samples["speed"], samples["current_q"]
+        known = samples["has_current"] & np.isfinite(trial.force_N)
+        own = np.column_stack(
+            [np.ones(len(speed)), np.sign(speed), speed, np.diff(speed, prepend=speed[:1]), current, trial.force_N]
+        )
+        tables.append(own[known])
+    table = np.concatenate(tables)
+    if len(table) < table.shape[1] or not np.ptp(table[:, 4]) or not np.ptp(table[:, 5]):
+        return 0.0
+    rest = table[:, 4:] - table[:, :4] @ np.linalg.lstsq(table[:, :4], table[:, 4:], rcond=None)[0]
+    products = rest.T @ rest
+    size = products[0, 0] * products[1, 1]
+    return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
+
+
 class Bench:
     """Logs on which a calibration's parameters are tried: runs the estimator and returns residuals, channel by channel.
 
@@ -138,11 +159,12 @@ class Bench:
 
         self.trials = list(self._map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
-        #: Whether the motor can reach pads at all; else the load on the spindle is no function of its angle.
-        self.clamps = calibration.contact.clearance_rad < _NOTHING_TO_CLAMP_RAD
+        self.clamps = calibration.contact.is_in_reach
         self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
         self.channels = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
+        #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
+        self.load_follows = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
         offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
@@ -154,6 +176,12 @@ class Bench:
             channel: np.concatenate(by_temperature) if channel == "temperature" else self.sample_episode
             for channel in self.channels
         }
+
+    @property
+    def load_N(self) -> np.ndarray:
+        """The reference force where it is known, N, shape (n,)."""
+        force = np.concatenate([trial.force_N for trial in self.trials])
+        return force[np.isfinite(force)]
 
     def _channels(self) -> list[str]:
         if self.has_reference and (self.clamps or self.has_current):
@@ -226,10 +254,14 @@ class Bench:
         mean[1:] = 0.5 * (judged[1:] + judged[:-1])
         if not self.has_reference:
             mean[0] *= 0.5
-        # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
-        current = (trace["torque"] - trace["leverage"] * mean) / trace["torque_constant"]
+        left = trace["torque"] - trace["leverage"] * mean
+        if self.load_follows:
+            load = left / trace["leverage"]
+        else:
+            # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
+            load = left / trace["torque_constant"] * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
-        torque = np.where(samples["dt"] <= ONE_CYCLE_S, np.nan_to_num(current * self.newton_per_ampere, nan=0.0), 0.0)
+        torque = np.where(samples["dt"] <= ONE_CYCLE_S, np.nan_to_num(load, nan=0.0), 0.0)
         result = {"stiffness": np.nan_to_num(force - trace["force"]), "torque": torque, "innovation": torque}
         if "temperature" in self.channels:
             temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]

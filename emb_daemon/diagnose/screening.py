@@ -107,7 +107,9 @@ class Screening:
             if channels[effect.name] and not model.of_effect(effect.name)
         }
         braking = self.signals["brake_torque"][self.signals["brake_torque"] > 0.0]
-        self._size = dict.fromkeys(bench.channels, rmse(self.signals["clamp_force"]))
+        #: RMS of the clamp force, or of the load where nothing is clamped, N.
+        self.force_N = rmse(self.signals["clamp_force"]) if bench.clamps else rmse(bench.load_N)
+        self._size = dict.fromkeys(bench.channels, self.force_N)
         self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
 
     def floor(self, model: Model, channel: str) -> float:

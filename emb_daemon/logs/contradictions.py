@@ -22,6 +22,15 @@ _FOLLOWS = 0.2
 _AGAINST = 0.5
 #: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
 _LEAST_CLAMP_N = 100.0
+#: Fastest change of an angle that our message of the motor's speed carries, rad/s: 6 000 rpm; share of the time in which it
+#: may be faster, and steps over which it is told.
+_FASTEST, _SELDOM, _STEPS = 655.0, 0.01, 5
+#: An angle in rad as other units would have it, by what one of them is in rad.
+_DEGREE, _TURN = np.pi / 180.0, 2.0 * np.pi
+#: Fewest counts that an encoder has in a turn, if a power of two.
+_LEAST_COUNTS = 256
+#: Relative deviation by which a jump is still that of a whole turn.
+_ABOUT = 0.1
 #: Share of the range that one step takes where a value starts anew, and how often it has to.
 _ANEW, _LEAST_JUMPS = 0.5, 3
 
@@ -39,22 +48,56 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
+    if angle is not None:
+        if not angle.is_sparse and np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := _starts_anew(angle.values)):
+            text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
+            return [*lines, text + _turn_as(jump)]
+        lines += _find_too_fast(angle)
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # The travel tells nothing of directions; current and force do.
         speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
         if not (speed is None or current is None or force is None or (angle or speed.integral()).way_is_unknown):
             lines += _find_opposed(speed, current, force)
         return lines
-    if jump := _starts_anew(angle.values):
-        return [
-            *lines,
-            f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`",
-        ]
     if current is not None and np.ptp(current.values):
         lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force)
     return lines
+
+
+def _find_too_fast(angle: Series) -> list[str]:
+    """A line on an angle that no motor turns by, and what its values may be instead."""
+    # Over some samples: stamps of a busy computer make any single step fast.
+    way, took = (column[_STEPS:] - column[:-_STEPS] for column in (angle.values, 1e-9 * angle.time_ns))
+    fastest = float(np.quantile(np.abs(way / took), 1.0 - _SELDOM))
+    if fastest <= _FASTEST:
+        return []
+    if _are_whole(angle.values):
+        what = "its values are whole numbers: counts of an encoder? Then `unit: rev`, and one over those of a turn as `scale`"
+    elif fastest * _DEGREE <= _FASTEST:
+        what = f"if its values are degrees, `unit: deg` makes {fastest * _DEGREE:.3g} rad/s of it"
+    else:
+        what = "are its values counts of an encoder, or is the unit of time wrong?"
+    return [f"MotorAngle changes by {fastest:.4g} rad/s ({fastest * 30.0 / np.pi:.3g} rpm), which no motor does: {what}"]
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    """Whether values are whole numbers, as mapped or of the unit that they were mapped from."""
+    return any(bool(np.all(np.abs(values / unit - np.rint(values / unit)) < 1e-6)) for unit in (1.0, _DEGREE, _TURN))
+
+
+def _turn_as(jump: float) -> str:
+    """In which unit a jump would be a whole turn, in words; nothing if it is one in rad."""
+    if abs(jump / _TURN - 1.0) < _ABOUT:
+        return f": {_TURN:.6g} rad in the rig's unit"
+    for size, unit in ((360.0, "deg"), (1.0, "rev")):
+        if abs(jump / size - 1.0) < _ABOUT:
+            return f": {size:g}, with `unit: {unit}`, of which that is a turn"
+    counts = 2.0 ** np.rint(np.log2(jump)) if jump > 0.0 else 0.0
+    if counts >= _LEAST_COUNTS and abs(jump / counts - 1.0) < _ABOUT:
+        return f": {counts:g} counts in a turn? `unit: rev`, `scale: {1.0 / counts:.9g}`, `period: {counts:g}`"
+    return ""
 
 
 def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:

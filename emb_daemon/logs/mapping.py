@@ -22,7 +22,7 @@ from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
-from emb_daemon.wire.units import UNITS
+from emb_daemon.wire.units import TRAVELS, UNITS
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
@@ -69,14 +69,18 @@ class Mapped(Struct, kw_only=True):
 
 
 class Time(Struct, kw_only=True):
-    """The column of times of a table."""
+    """The column of times of a table, or how often a row was written."""
 
     #: Name of the column.
-    signal: str
+    signal: str | None = None
     #: s, ms, us or ns.
     unit: str = "s"
+    #: Of a table without such a column: rows per second.
+    rate_Hz: Positive | None = None
 
     def __post_init__(self):
+        if (self.signal is None) == (self.rate_Hz is None):
+            raise ValueError("expected either signal (a column) or rate_Hz (rows per second)")
         if UNITS.get(self.unit, ("",))[0] != "s":
             raise ValueError(f"unit: expected s, ms, us or ns, found {self.unit!r}")
 
@@ -99,7 +103,7 @@ class MappingFile(Struct, kw_only=True):
     dbc: str | None = None
     #: Instead of `dbc`, of a rig with several buses: by a name of yours.
     buses: dict[str, Bus] = field(default_factory=dict)
-    #: Of a table (.csv, .txt, .tsv, .dat, .parquet); channels of a measurement have times of their own.
+    #: Of a table (.csv, .txt, .tsv, .dat, .parquet, .mat, .npz); channels of a measurement have times of their own.
     time: Time | None = None
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
@@ -185,8 +189,15 @@ class Mapping:
         except KeyError:
             return self._fault(name, f"{mapped.signal}: the rig's DBC has no such message and signal")
         unit = (stated if mapped.unit is None else mapped.unit).strip()
+        if unit in TRAVELS and ours.unit in ("rad", "rad/s"):
+            return self._fault(
+                name,
+                f"{mapped.signal} is a travel in {unit}, not the motor's angle; state `unit: {ours.unit}`, and as `scale` the "
+                "radians that the motor turns for one of them: 6.283 over the travel in a turn (a screw's lead)",
+            )
         if unit not in UNITS:
-            return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {', '.join(UNITS)[:-2]}")
+            fitting = ", ".join(known for known, (target, *_) in UNITS.items() if known and target == (ours.unit or ""))
+            return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {fitting}")
         target, factor, shift = UNITS[unit]
         if target != (ours.unit or ""):
             hint = "" if unit else "; state `unit:`"
@@ -216,7 +227,10 @@ class Mapping:
             self._faults.append(
                 f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner"
             )
-        for name, signals in self.messages.items():
+        # Of a message with a fault nobody knows yet what will be missing.
+        whole = [name for name in self.messages if not any(f"signals.{name}." in fault for fault in self._faults)]
+        for name in whole:
+            signals = self.messages[name]
             substitutes = SUBSTITUTES.get(name.rpartition("_")[2], {})
             for signal in self._ours[name][0].signals:
                 optional = signal.name in (*_UNUSED, *HEADER) or name.startswith("RIG_")
@@ -311,9 +325,11 @@ class Mapping:
         names = {}
         for source in filter(None, clocks):
             message, _, _ = source.name.rpartition(".")
-            frame_id = self.databases[source.bus].get_message_by_name(message).frame_id if self.databases else None
-            channel = self.channels.get(source.bus)
-            place = [f"{frame_id:#x}"] * bool(self.databases) + [f"channel {channel}"] * (channel is not None)
+            place, channel = [], self.channels.get(source.bus)
+            if self.databases:
+                place.append(f"{self.databases[source.bus].get_message_by_name(message).frame_id:#x}")
+            if channel is not None:
+                place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
         return ", ".join(names)
 

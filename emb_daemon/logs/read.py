@@ -129,7 +129,9 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
-        raise InputError(f"{path}: not readable by python-can's {reader_name}: {str(error) or type(error).__name__}") from None
+        hint = "; a table of signals needs --mapping" if log_ending(path) == ".csv" else ""
+        text = str(error) or type(error).__name__
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {text}{hint}") from None
     return frames, octets, lambda: channels
 
 
@@ -164,7 +166,8 @@ def read_log(path: str | Path) -> Recorded:
     path = Path(path)
     ending = log_ending(path)
     if ending not in LOG_ENDINGS:
-        raise InputError(f"{path}: unknown log format, expected .log, .log.gz, .asc, .blf, .trc or .mf4")
+        known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
+        raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns")
     raw = read_file(path)
     content = unpack_gzip(path, raw)
     parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])

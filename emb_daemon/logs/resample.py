@@ -47,6 +47,8 @@ _WAY_RAD, _CORRELATED, _OTHER_SCALE = 1.0, 0.8, 0.1
 #: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
 #: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
 _RESOLVED = 0.95
+#: Share of itself by which a steady value varies in the last digits of a number.
+_STEADY = 1e-6
 #: Ratios of units that are taken for one another.
 _RATIOS = {
     30.0 / np.pi: "rpm taken for rad/s, or the reverse",
@@ -251,8 +253,8 @@ def _another_motion(angle: Series, speed: Series) -> str:
         min(moved, explained) > _WAY_RAD
         and abs(ratio := float(way[known] @ turned[known] / (turned[known] @ turned[known]))) > 0.0
     ):
-        correlation = float(np.corrcoef(way[known], turned[known])[0, 1])
-        resolved = np.corrcoef(at[1:][known], at[:-1][known])[0, 1] > _RESOLVED
+        correlation = _correlation(way[known], turned[known])
+        resolved = _correlation(at[1:][known], at[:-1][known]) > _RESOLVED
         if resolved and abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
@@ -262,6 +264,13 @@ def _another_motion(angle: Series, speed: Series) -> str:
     return (
         f"is another motion than the change of MotorAngle in {100.0 * share:.1f} % of the samples (stamps of a busy computer?)"
     )
+
+
+def _correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """Of two columns that are not zero throughout; about zero where one of them does not vary, as of a steady speed."""
+    if all(np.ptp(column) > _STEADY * np.max(np.abs(column)) for column in (one, other)):
+        one, other = one - np.mean(one), other - np.mean(other)
+    return float(one @ other / np.sqrt((one @ one) * (other @ other)))
 
 
 def _meaning(ratio: float) -> str:
@@ -399,6 +408,8 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
             raw = absent
         else:
             column = np.broadcast_to(np.asarray(source, float), times.shape)
+            if name == "MotorAngle":
+                column = _within(message.name, column, layout["low"], layout["high"])
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
                 print(
@@ -420,6 +431,20 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
         for frame, counter in zip(frames, counters.tolist(), strict=True):
             frame["data"] = protect(message.frame_id, frame["data"], counter, 0)
     return frames
+
+
+def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndarray:
+    """An angle (rad) that starts anew by whole turns where our message no longer carries it: of a motor that turns on and on,
+    the load is a function of its current, not of how far it has come."""
+    if not np.any((angle < low) | (angle > high)):
+        return angle
+    period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
+    print(
+        f"{message}: MotorAngle covers {np.nanmax(angle) - np.nanmin(angle):.4g} rad, more than our message carries and than "
+        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?",
+        file=sys.stderr,
+    )
+    return low + np.mod(angle - low, period)
 
 
 def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.ndarray | float | None:

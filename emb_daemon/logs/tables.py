@@ -6,17 +6,20 @@ import io
 import re
 import sys
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
 from emb_daemon.errors import InputError
+from emb_daemon.logs import arrays
 from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
+_TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
 #: What a measurement file begins with, one that was not closed included.
 _MDF = (b"MDF     ", b"UnFinMF ")
 #: What parts cells; last, any run of blanks.
@@ -27,9 +30,13 @@ _PREAMBLE, _UNITS = 60, 3
 _MOST_ODD = 0.01
 #: A time of day with parts of a second, or minutes and seconds, after a German date or none; others are pyarrow's to read.
 _CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)")
+#: What calls a column by its place.
+_BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
+#: Column names listed where one was not found.
+_LISTED = 20
 #: Cells that say that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -49,40 +56,87 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     # `.dat` is what INCA calls a measurement, and what others call a text.
     if ending in _MEASUREMENTS and (ending != ".dat" or content.startswith(_MDF)):
         return _channels(path, content, names), digest
-    if ending not in (*_TEXTS, ".parquet"):
-        raise InputError(
-            f"{path}: expected a table ({', '.join(_TEXTS)}, .parquet) or a measurement ({', '.join(_MEASUREMENTS)}): no dbc"
-        )
+    if ending not in _TABLES:
+        tables, measurements = ", ".join(_TABLES), ", ".join(_MEASUREMENTS)
+        raise InputError(f"{path}: expected a table ({tables}) or a measurement ({measurements}): no dbc")
     if time is None:
-        raise InputError(f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`")
-    table = _table(path, content, ending, [time.signal, *names])
-    columns = {name: _numbers(path, table, name) for name in names}
-    # Of a clock, seconds already.
-    seconds = _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
-    known = np.isfinite(seconds)
-    if np.any(np.abs(seconds[known]) > LATEST_S):
         raise InputError(
-            f"{path}: {time.signal}: {np.max(np.abs(seconds[known])):g} s are no time; is `time.unit`, {time.unit}, right?"
+            f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`, or "
+            "`time: {rate_Hz: 100}` where it has none"
         )
+    table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
+    columns = {name: _numbers(path, table, name) for name in names}
+    seconds = _seconds(path, table, time)
+    known = np.isfinite(seconds)
+    if len(seconds[known]) and (largest := float(np.max(np.abs(seconds[known])))) > LATEST_S:
+        hint = _other_unit(largest, time)
+        raise InputError(f"{path}: {time.signal}: {largest:g} s are no time; is `time.unit`, {time.unit}, right?{hint}")
     columns = {name: values[known] for name, values in columns.items()}
     stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
     return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
 
 
+def _seconds(path: Path, table, time) -> np.ndarray:
+    """When each row was written, s."""
+    if time.signal is None:
+        return np.arange(table.num_rows) / time.rate_Hz
+    # Of a clock, seconds already.
+    return _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
+
+
+def _other_unit(largest_s: float, time) -> str:
+    """What the largest time would be in the largest smaller unit that makes a time of it, in words."""
+    for unit in ("ms", "us", "ns"):
+        seconds = largest_s * UNITS[unit][1] / UNITS[time.unit][1]
+        if seconds <= LATEST_S:
+            return f" As {unit} it is {seconds:.10g} s"
+    return ""
+
+
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
-    """The table in a file (pyarrow.Table), which has each of ``names`` once."""
+    """The table in a file (pyarrow.Table), with ``names`` as its columns."""
     import pyarrow
     import pyarrow.parquet
 
+    if ending in arrays.ENDINGS:
+        return _of_arrays(path, arrays.read_arrays(path, content, ending), names)
     try:
         table = pyarrow.parquet.read_table(io.BytesIO(content)) if ending == ".parquet" else _text_table(path, content, names)
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
+    found = {name: _place(name, table.column_names) for name in names}
+    for name, place in found.items():
+        if place is None:
+            count = table.column_names.count(name)
+            there = f"{count} such columns, of which `column N` is one by its place" if count else "no such column"
+            raise InputError(f"{path}: {name}: {there}; the table has {_some(name, table.column_names)}")
+    return pyarrow.table({name: table.column(place) for name, place in found.items()})
+
+
+def _of_arrays(path: Path, found: dict[str, np.ndarray], names: list[str]):
+    import pyarrow
+
     for name in names:
-        if (count := table.column_names.count(name)) != 1:
-            there = "no such column" if count == 0 else f"{count} such columns"
-            raise InputError(f"{path}: {name}: {there}; the table has {', '.join(table.column_names)}")
-    return table
+        if name not in found:
+            raise InputError(f"{path}: {name}: no such variable of numbers; it has {_some(name, list(found))}")
+    lengths = {name: len(found[name]) for name in names}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"{path}: variables of one length expected, found {told}")
+    return pyarrow.table({name: found[name] for name in names})
+
+
+def _place(name: str, names: list[str]) -> int | None:
+    """Place of a column among a table's ``names``, also of one that is called by it; None if there is none, or several."""
+    if names.count(name) == 1:
+        return names.index(name)
+    place = _BY_PLACE.fullmatch(name)
+    return int(place[1]) - 1 if place and not names.count(name) and int(place[1]) <= len(names) else None
+
+
+def _some(wanted: str, names: list[str]) -> str:
+    """Names to tell someone who misspelt one: all, or of many those most like it."""
+    return ", ".join(names if len(names) <= _LISTED else [*get_close_matches(wanted, names, _LISTED, 0.0), "…"])
 
 
 def _is_clock(column) -> bool:
@@ -157,7 +211,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         key=lambda at: (len({*names} & {*_cells(lines[at[0]], at[1])}), -at[0], lines[at[0]].count(at[1])),
     )
     cells = _cells(lines[header], delimiter)
-    if not {*names} & {*cells} and (found := _without_header(lines)):
+    by_place = all(map(_BY_PLACE.fullmatch, names))
+    if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
         header, delimiter = found
         cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
     if delimiter == " ":
@@ -167,8 +222,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     first = rows[units] if rows else cells
     if len(cells) - len(first) == 1 and not cells[-1]:
         cells.pop()
-    elif len(first) - len(cells) == 1 and not first[-1]:
-        cells.append("")
+    elif len(first) > len(cells):
+        cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units : header + 2 + units])
     odd = []
 
     def leave_out(row) -> str:
@@ -186,14 +241,34 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         )
 
     table = read(".")
-    wanted = [table[name] for name in names if table.column_names.count(name) == 1]
+    wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
     texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
     # Where a comma does not separate, it is a decimal one; a number may have it for the first time after many rows.
     if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
         table = read(",")
+    if len(odd) > table.num_rows:
+        raise InputError(
+            f"{path}: {len(odd)} of {len(odd) + table.num_rows} rows have another number of cells than {len(cells)}, the "
+            f"first of them {odd[0].actual_columns}; expected a table with the columns {_some('', cells)}"
+        )
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
     return table
+
+
+def _with_nameless(path: Path, names: list[str], rows: list[list[str]], lines: list[str]) -> list[str]:
+    """Names of a table whose rows have more cells than its header: a first column that counts or names the rows, as R and
+    pandas write it, has none; else the last ones have none."""
+    more = len(rows[0]) - len(names)
+    if more == 1 and not rows[0][-1]:
+        return [*names, ""]
+    counts = [row[0] for row in rows if row]
+    numbered = len(counts) > 1 and counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
+    if more == 1 and (numbered or lines[0].lstrip().startswith('"')):
+        return ["", *names]
+    last = ", ".join(f"column {len(names) + n + 1}" for n in range(more))
+    print(f"{path}: rows have {len(rows[0])} cells, the header names {len(names)}; the last are {last}", file=sys.stderr)
+    return [*names, *[""] * more]
 
 
 def _as_utf8(content: bytes) -> bytes:
@@ -216,19 +291,23 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 
-def _without_header(lines: list[str]) -> tuple[int, str] | None:
-    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them."""
+def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
+    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them, unless
+    ``words`` may."""
     for row, line in enumerate(lines):
         if not line.strip() or line.lstrip().startswith(("#", "%")):
             continue
         # A comma last but for blanks: it may be a decimal one.
         mark = next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ",")
-        return (row - 1, mark) if all(map(_is_number, filter(None, _cells(line, mark)))) else None
+        if all(map(_is_number, filter(None, _cells(line, mark)))):
+            return row - 1, mark
+        if not words:
+            return None
     return None
 
 
 def _is_number(cell: str) -> bool:
-    return cell.lstrip("+-.,")[:1].isdigit()
+    return cell.lstrip("+-.,")[:1].isdigit() or cell.lstrip("+-").lower() in ("inf", "nan")
 
 
 def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

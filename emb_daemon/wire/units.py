@@ -5,21 +5,32 @@ import math
 from emb_daemon.errors import InputError
 
 _DEGREE = math.pi / 180.0
+#: Standard gravity, m/s2; weight of a pound, N.
+_GRAVITY, _POUND = 9.80665, 4.4482216152605
 #: Unit: (unit of the same quantity that others are converted over, factor, offset); that = factor * this + offset.
 UNITS = {
     "rad": ("rad", 1.0, 0.0), "deg": ("rad", _DEGREE, 0.0), "°": ("rad", _DEGREE, 0.0), "mrad": ("rad", 1e-3, 0.0),
     "rev": ("rad", 2.0 * math.pi, 0.0), "turn": ("rad", 2.0 * math.pi, 0.0),
     "rad/s": ("rad/s", 1.0, 0.0), "deg/s": ("rad/s", _DEGREE, 0.0), "°/s": ("rad/s", _DEGREE, 0.0),
-    "rpm": ("rad/s", math.pi / 30.0, 0.0), "1/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
+    "rpm": ("rad/s", math.pi / 30.0, 0.0), "RPM": ("rad/s", math.pi / 30.0, 0.0), "1/min": ("rad/s", math.pi / 30.0, 0.0),
+    "r/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
     "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
     "degC": ("degC", 1.0, 0.0), "°C": ("degC", 1.0, 0.0), "C": ("degC", 1.0, 0.0), "deg C": ("degC", 1.0, 0.0),
     "K": ("degC", 1.0, -273.15), "degF": ("degC", 5.0 / 9.0, -160.0 / 9.0), "°F": ("degC", 5.0 / 9.0, -160.0 / 9.0),
     "m/s": ("m/s", 1.0, 0.0), "km/h": ("m/s", 1.0 / 3.6, 0.0), "kph": ("m/s", 1.0 / 3.6, 0.0), "mph": ("m/s", 0.44704, 0.0),
-    "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "kNm": ("Nm", 1e3, 0.0),
-    "Hz": ("Hz", 1.0, 0.0), "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "us": ("s", 1e-6, 0.0), "ns": ("s", 1e-9, 0.0),
+    "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "daN": ("N", 10.0, 0.0), "lbf": ("N", _POUND, 0.0), "lb": ("N", _POUND, 0.0),
+    # What a load cell calls the mass that would weigh so much.
+    "kgf": ("N", _GRAVITY, 0.0), "kg": ("N", _GRAVITY, 0.0), "g": ("N", 1e-3 * _GRAVITY, 0.0),
+    "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "N·m": ("Nm", 1.0, 0.0), "N.m": ("Nm", 1.0, 0.0),
+    "kNm": ("Nm", 1e3, 0.0), "mNm": ("Nm", 1e-3, 0.0), "Nmm": ("Nm", 1e-3, 0.0), "N mm": ("Nm", 1e-3, 0.0),
+    "Hz": ("Hz", 1.0, 0.0),
+    "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "us": ("s", 1e-6, 0.0), "µs": ("s", 1e-6, 0.0), "ns": ("s", 1e-9, 0.0),
     "%": ("%", 1.0, 0.0),
     "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
 }  # fmt: skip
+
+#: Of an axis whose travel is measured, and not its motor.
+TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", "m/min", "in/s")
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
