@@ -165,6 +165,28 @@ def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
     assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
 
 
+def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():
+    """A gear whose gain follows what the brake has done shows it on no cold log: the filter would trust the torque."""
+    found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
+    rng, rows = np.random.default_rng(9), np.arange(20_000)
+
+    def left(sigma_A, stays_A):
+        stays = np.repeat(rng.normal(0.0, stays_A, len(rows) // 250), 250)
+        current = rng.normal(0.0, sigma_A, len(rows)) + stays
+        return Unexplained(found, rows, current, np.ones(len(rows)), np.full(len(rows), 1e4))
+
+    cold, as_cold, hot, silent = left(0.2, 0.0), left(0.19, 0.0), left(0.2, 1.0), Unexplained(found, *[np.empty(0)] * 4)
+    assert noise._more_current([cold], (as_cold, silent)) == []
+    assert noise._more_current([silent], (hot,)) == []
+    [counted] = noise._more_current([cold], (as_cold, hot))
+    assert counted is hot
+    levels = noise.torque_levels([cold, counted], 1e-5, 0.0)
+    # Between what both logs together and the hot one alone leave.
+    assert np.hypot(0.2, np.sqrt(0.5)) < levels["current_A"] < np.hypot(0.2, 1.0)
+    density = levels["current_A"] ** 2 * levels["current_correlation_s"]
+    assert density == pytest.approx(0.5 * 1.0, rel=0.3)
+
+
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
     found = SimpleNamespace(fit=SimpleNamespace(curves=[SimpleNamespace(travel_rad=20.0)]))
     campaign = SimpleNamespace(datasheet=SimpleNamespace(actuator=SimpleNamespace(max_motor_speed_rad_per_s=200.0)))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from msgspec.structs import replace
 
-from emb_daemon.calibration.parameters import CLEARANCE, moved
+from emb_daemon.calibration.parameters import CLEARANCE, moved, value_of
 from emb_daemon.calibration.types import Calibration, Contact
 from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
@@ -23,7 +23,7 @@ from emb_daemon.estimator.heat import TOUCHING_N
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import KEYS
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, unexplained_current
 from emb_daemon.offline import Log
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
@@ -40,6 +40,7 @@ class AttributionStep(Step):
         calibration: with what was accepted.
         diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
+        hot_current: current that stays unexplained there.
         fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
         undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
     """
@@ -47,6 +48,7 @@ class AttributionStep(Step):
     calibration: Calibration
     diagnosis: Diagnosis | None = None
     hot: tuple[Errors, ...] = ()
+    hot_current: tuple[Unexplained, ...] = ()
     fastest_rad_per_s: float = 0.0
     undecided: Mapping[str, float] = field(default_factory=dict)
 
@@ -102,6 +104,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
         calibration=calibration,
         diagnosis=found,
         hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
+        hot_current=_unexplained(hot, calibration),
         fastest_rad_per_s=_fastest(hot),
         undecided=undecided(found.selection),
     )
@@ -123,7 +126,13 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
     bench = Bench(hot, known, own_data=True)
     residual = bench.residuals({})["stiffness"]
     left = tuple(_errors(bench, residual, index) for index in range(len(hot)))
-    return AttributionStep(calibration=known, hot=left, fastest_rad_per_s=_fastest(hot))
+    return AttributionStep(calibration=known, hot=left, hot_current=_unexplained(hot, known), fastest_rad_per_s=_fastest(hot))
+
+
+def _unexplained(logs: Sequence[Log], calibration: Calibration) -> tuple[Unexplained, ...]:
+    """Current that a calibration leaves on each of the logs."""
+    exact = TorqueFit({key: value_of(calibration, key) for key in KEYS}, np.zeros((len(KEYS), len(KEYS))), {})
+    return tuple(unexplained_current(log, exact, calibration) for log in logs)
 
 
 def _fastest(logs: Sequence[Log]) -> float:

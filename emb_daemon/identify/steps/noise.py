@@ -53,6 +53,7 @@ def identify(
     folds: list[Fold],
     interpolation: float,
     hot: tuple[Errors, ...] = (),
+    hot_current: tuple[Unexplained, ...] = (),
     undecided: Mapping[str, float] = NOTHING,
     fastest_rad_per_s: float = 0.0,
 ) -> Step:
@@ -61,6 +62,7 @@ def identify(
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
         hot: errors that the whole model leaves on logs of hot pads; where they are more than what cold ones show, they count.
+        hot_current: current that it leaves unexplained there; the same.
         undecided: shares of the force by which a model might be another, by key.
         fastest_rad_per_s: speed of the motor in the hardest clamp of the ``hot`` logs.
     """
@@ -89,7 +91,7 @@ def identify(
         "stiffness_N": floor,
         "stiffness_relative": float(np.hypot(relative, interpolation)),
         "stiffness_correlation_s": integral_time([error for error, _ in errors]),
-        **torque_levels(held_out, gear_gain, speed),
+        **torque_levels(held_out + _more_current(held_out, hot_current), gear_gain, speed),
     }
     if not any(pads.random for pads in stiffness.pads):
         levels["stiffness_relative"] = float(
@@ -206,6 +208,12 @@ def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float)
     slow = max(rmse(np.array(means)) ** 2 - sigma_A**2 * 2.0 * time_s / lasts, 0.0)
     total = sigma_A**2 + slow
     return float(np.sqrt(total)), (sigma_A**2 * time_s + slow * lasts) / total
+
+
+def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> list[Unexplained]:
+    """The ``hot`` logs that leave more current unexplained than any that is ``held_out``."""
+    most = max((rmse(left.current_A) for left in held_out if len(left.rows)), default=np.inf)
+    return [left for left in hot if len(left.rows) and rmse(left.current_A) > most]
 
 
 def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
