@@ -132,7 +132,7 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
 def _unexplained(logs: Sequence[Log], calibration: Calibration) -> tuple[Unexplained, ...]:
     """Current that a calibration leaves on each of the logs."""
     exact = TorqueFit({key: value_of(calibration, key) for key in KEYS}, np.zeros((len(KEYS), len(KEYS))), {})
-    return tuple(unexplained_current(log, exact, calibration) for log in logs)
+    return tuple(unexplained_current(log, exact, calibration, hot=True) for log in logs)
 
 
 def _fastest(logs: Sequence[Log]) -> float:
