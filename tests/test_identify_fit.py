@@ -6,17 +6,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, value_of
+from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
 from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
-from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
+from emb_daemon.offline import log_of
+from emb_daemon.offline.score import rmse
+from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import rest, rig_stop, simulate_log
 from emb_daemon.resources import resource
 
 
@@ -185,6 +192,26 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
     assert np.hypot(0.2, np.sqrt(0.5)) < levels["current_A"] < np.hypot(0.2, 1.0)
     density = levels["current_A"] ** 2 * levels["current_correlation_s"]
     assert density == pytest.approx(0.5 * 1.0, rel=0.3)
+
+
+def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
+    """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
+
+    def drive(effects):
+        plant = plant_from_calibration(calibration, seed=3, effects=effects)
+        return log_of(simulate_log(plant, rest(1.0) + rig_stop(15e3, 50.0), seed=3)[0])
+
+    term = Term(
+        name="term:gear_gain:brake_torque", port="gear_gain", signal="brake_torque", shape="odd_power", coefficient=0.2,
+        scale=1000.0, low=0.0, high=3e3,
+    )  # fmt: skip
+    found = TorqueFit({key: value_of(calibration, key) for key in KEYS}, np.eye(len(KEYS)), {})
+    log, known = drive({"drawn_gear_gain": hidden}), replace(calibration, terms=(term,))
+    cold, hot = (rmse(unexplained_current(log, found, known, hot=hot).current_A) for hot in (False, True))
+    plain = rmse(unexplained_current(drive({}), found, calibration).current_A)
+    assert cold > 3.0 * plain and hot < 1.3 * plain
 
 
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
