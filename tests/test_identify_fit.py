@@ -182,7 +182,7 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
         current = rng.normal(0.0, sigma_A, len(rows)) + stays
         return Unexplained(found, rows, current, np.ones(len(rows)), np.full(len(rows), 1e4))
 
-    cold, as_cold, hot, silent = left(0.2, 0.0), left(0.19, 0.0), left(0.2, 1.0), Unexplained(found, *[np.empty(0)] * 4)
+    cold, as_cold, hot, silent = left(0.2, 0.0), left(0.15, 0.0), left(0.2, 1.0), Unexplained(found, *[np.empty(0)] * 4)
     assert noise._more_current([cold], (as_cold, silent)) == []
     assert noise._more_current([silent], (hot,)) == []
     [counted] = noise._more_current([cold], (as_cold, hot))
