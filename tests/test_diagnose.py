@@ -513,6 +513,16 @@ def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(ca
     assert best.form.memory_scale == pytest.approx(2.5, rel=0.3)
 
 
+def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_follows_it(calibration):
+    """A gear whose gain follows the square of the brake torque for seconds beyond each stop."""
+    hidden = {"size": 1.0, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 2.3, "other": -1.0, "lag_s": 7.0}
+    frames = next(_logs(calibration, 35, {"drawn_gear_gain": hidden}, stops=6))
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
+    best = Search(model, "torque", grammar._signals(model)).prospects()[0]
+    assert best.means == ("gear_gain", "brake_torque") and best.form.memory == "response"
+    assert best.form.memory_scale == pytest.approx(7.0, rel=0.4)
+
+
 @pytest.fixture(scope="module")
 def coupled(calibration):
     """(search, fit log, validation log) of a brake that clamps harder as it brakes, which no catalogue holds."""

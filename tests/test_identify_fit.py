@@ -6,17 +6,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, value_of
+from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
 from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
-from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
+from emb_daemon.offline import log_of
+from emb_daemon.offline.score import rmse
+from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import rest, rig_stop, simulate_log
 from emb_daemon.resources import resource
 
 
@@ -163,6 +170,48 @@ def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
     current = np.random.default_rng(7).normal(0.0, 0.2, len(rows))
     left = Unexplained(found, rows, current, np.ones(len(rows)), np.linspace(1e3, 2e3, len(rows)))
     assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
+
+
+def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():
+    """A gear whose gain follows what the brake has done shows it on no cold log: the filter would trust the torque."""
+    found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
+    rng, rows = np.random.default_rng(9), np.arange(20_000)
+
+    def left(sigma_A, stays_A):
+        stays = np.repeat(rng.normal(0.0, stays_A, len(rows) // 250), 250)
+        current = rng.normal(0.0, sigma_A, len(rows)) + stays
+        return Unexplained(found, rows, current, np.ones(len(rows)), np.full(len(rows), 1e4))
+
+    cold, as_cold, hot, silent = left(0.2, 0.0), left(0.15, 0.0), left(0.2, 1.0), Unexplained(found, *[np.empty(0)] * 4)
+    assert noise._more_current([cold], (as_cold, silent)) == []
+    assert noise._more_current([silent], (hot,)) == []
+    [counted] = noise._more_current([cold], (as_cold, hot))
+    assert counted is hot
+    levels = noise.torque_levels([cold, counted], 1e-5, 0.0)
+    # Between what both logs together and the hot one alone leave.
+    assert np.hypot(0.2, np.sqrt(0.5)) < levels["current_A"] < np.hypot(0.2, 1.0)
+    density = levels["current_A"] ** 2 * levels["current_correlation_s"]
+    assert density == pytest.approx(0.5 * 1.0, rel=0.3)
+
+
+def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
+    """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
+
+    def drive(effects):
+        plant = plant_from_calibration(calibration, seed=3, effects=effects)
+        return log_of(simulate_log(plant, rest(1.0) + rig_stop(15e3, 50.0), seed=3)[0])
+
+    term = Term(
+        name="term:gear_gain:brake_torque", port="gear_gain", signal="brake_torque", shape="odd_power", coefficient=0.2,
+        scale=1000.0, low=0.0, high=3e3,
+    )  # fmt: skip
+    found = TorqueFit({key: value_of(calibration, key) for key in KEYS}, np.eye(len(KEYS)), {})
+    log, known = drive({"drawn_gear_gain": hidden}), replace(calibration, terms=(term,))
+    cold, hot = (rmse(unexplained_current(log, found, known, hot=hot).current_A) for hot in (False, True))
+    plain = rmse(unexplained_current(drive({}), found, calibration).current_A)
+    assert cold > 3.0 * plain and hot < 1.3 * plain
 
 
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():

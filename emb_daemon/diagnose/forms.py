@@ -192,11 +192,14 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", farthest, centre, 1.0, time
+    if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):
+        # Of the power one a response is the lag of above.
+        yield from _responses(reach, (2.0,))
 
 
-def _responses(reach: float) -> Iterator[_Shape]:
-    """What follows slowly on a signal that has either sign: heat, or a film, is driven by a power of its size."""
-    for exponent in _EXPONENTS:
+def _responses(reach: float, exponents: tuple[float, ...] = _EXPONENTS) -> Iterator[_Shape]:
+    """What follows slowly on a signal, whatever its sign: heat, or a film, is driven by a power of its size."""
+    for exponent in exponents:
         for time in _TIMES_S:
             yield "response", "even_power", reach, 0.0, exponent, time
 

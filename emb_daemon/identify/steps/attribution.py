@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from msgspec.structs import replace
 
-from emb_daemon.calibration.parameters import CLEARANCE, moved
+from emb_daemon.calibration.parameters import CLEARANCE, moved, value_of
 from emb_daemon.calibration.types import Calibration, Contact
 from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
@@ -24,7 +24,7 @@ from emb_daemon.identify.dynamics import Errors
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
-from emb_daemon.identify.steps.torque import KEYS
+from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, unexplained_current
 from emb_daemon.offline import Log
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
@@ -41,6 +41,7 @@ class AttributionStep(Step):
         calibration: with what was accepted.
         diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
+        hot_current: current that stays unexplained there.
         fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
         undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
     """
@@ -48,6 +49,7 @@ class AttributionStep(Step):
     calibration: Calibration
     diagnosis: Diagnosis | None = None
     hot: tuple[Errors, ...] = ()
+    hot_current: tuple[Unexplained, ...] = ()
     fastest_rad_per_s: float = 0.0
     undecided: Mapping[str, float] = field(default_factory=dict)
 
@@ -103,6 +105,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
         calibration=calibration,
         diagnosis=found,
         hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
+        hot_current=_unexplained(hot, calibration),
         fastest_rad_per_s=_fastest(hot),
         undecided=undecided(found.selection),
     )
@@ -124,7 +127,13 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
     bench = Bench(hot, known, own_data=True)
     residual = bench.residuals({})["stiffness"]
     left = tuple(_errors(bench, residual, index) for index in range(len(hot)))
-    return AttributionStep(calibration=known, hot=left, fastest_rad_per_s=_fastest(hot))
+    return AttributionStep(calibration=known, hot=left, hot_current=_unexplained(hot, known), fastest_rad_per_s=_fastest(hot))
+
+
+def _unexplained(logs: Sequence[Log], calibration: Calibration) -> tuple[Unexplained, ...]:
+    """Current that a calibration leaves on each of the logs."""
+    exact = TorqueFit({key: value_of(calibration, key) for key in KEYS}, np.zeros((len(KEYS), len(KEYS))), {})
+    return tuple(unexplained_current(log, exact, calibration, hot=True) for log in logs)
 
 
 def _fastest(logs: Sequence[Log]) -> float:

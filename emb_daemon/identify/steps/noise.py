@@ -53,6 +53,7 @@ def identify(
     folds: list[Fold],
     interpolation: float,
     hot: tuple[Errors, ...] = (),
+    hot_current: tuple[Unexplained, ...] = (),
     undecided: Mapping[str, float] = NOTHING,
     fastest_rad_per_s: float = 0.0,
 ) -> Step:
@@ -61,6 +62,7 @@ def identify(
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
         hot: errors that the whole model leaves on logs of hot pads; where they are more than what cold ones show, they count.
+        hot_current: current that it leaves unexplained there; the same.
         undecided: shares of the force by which a model might be another, by key.
         fastest_rad_per_s: speed of the motor in the hardest clamp of the ``hot`` logs.
     """
@@ -90,7 +92,7 @@ def identify(
         "stiffness_N": floor,
         "stiffness_relative": float(np.hypot(relative, interpolation)),
         "stiffness_correlation_s": integral_time([error for error, _ in errors]),
-        **torque_levels(held_out, gear_gain, speed),
+        **torque_levels(held_out + _more_current(held_out, hot_current), gear_gain, speed),
     }
     if not any(pads.random for pads in stiffness.pads):
         levels["stiffness_relative"] = float(
@@ -200,13 +202,29 @@ def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float)
     Likelihood asks a thousand samples a second, most of which tell of the noise alone. What stays for a second the filter
     would take for an error of the contact angle."""
     lasts = CYCLE_S * EPISODE
-    means = [s[row : row + EPISODE].mean() for s in residuals for row in range(0, len(s) - EPISODE + 1, EPISODE)]
-    if not means:
+    means = _means(residuals)
+    if not len(means):
         return sigma_A, time_s
     # A mean of first-order noise over much longer than its time has this variance.
-    slow = max(rmse(np.array(means)) ** 2 - sigma_A**2 * 2.0 * time_s / lasts, 0.0)
+    slow = max(rmse(means) ** 2 - sigma_A**2 * 2.0 * time_s / lasts, 0.0)
     total = sigma_A**2 + slow
     return float(np.sqrt(total)), (sigma_A**2 * time_s + slow * lasts) / total
+
+
+def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> list[Unexplained]:
+    """The ``hot`` logs that leave more current for a manoeuvre and longer than any that is ``held_out``."""
+    most = max((rmse(means) for left in held_out if len(means := _means(_stretches(left)))), default=np.inf)
+    return [left for left in hot if len(means := _means(_stretches(left))) and rmse(means) > most]
+
+
+def _stretches(left: Unexplained) -> list[np.ndarray]:
+    """Unexplained current, A, without gaps."""
+    return np.split(left.current_A, np.flatnonzero(np.diff(left.rows) != 1) + 1)
+
+
+def _means(series: list[np.ndarray]) -> np.ndarray:
+    """Of what is as long as a manoeuvre."""
+    return np.array([s[row : row + EPISODE].mean() for s in series for row in range(0, len(s) - EPISODE + 1, EPISODE)])
 
 
 def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
@@ -228,9 +246,9 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
     difference = np.sqrt(2.0) * first.values[INERTIA] * speed_sigma / CYCLE_S / constant
     for left in held_out:
         values = left.found.values
-        rows, current, mean, force = left.rows, left.current_A, left.friction_mean, left.force_N
+        current, mean, force = left.current_A, left.friction_mean, left.force_N
         torque = values[TORQUE_CONSTANT] * current
-        series += np.split(current, np.flatnonzero(np.diff(rows) != 1) + 1)
+        series += _stretches(left)
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))

@@ -25,7 +25,7 @@ from emb_daemon.identify.text import stem, with_sigma
 from emb_daemon.models.gear import all_through_gear
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife, valley
-from emb_daemon.offline.run import run_paths
+from emb_daemon.offline.run import held, run_paths, run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import MODEL, REFERENCE, Panel, Trace, time_figure
 from emb_daemon.report.page import Page
@@ -264,12 +264,14 @@ class Unexplained:
     force_N: np.ndarray
 
 
-def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration) -> Unexplained:
-    """Current of a log that the estimator's torque path leaves: a fit's parameters, the calibration's gear and effects."""
-    part, known = _Regression(log, calibration), moved(calibration, found.physical())
-    paths = run_paths(log.samples, to_parameters(known))[part.rows]
-    use = paths["friction_variance"] < _KNOWN
-    residual = (paths["torque"] - paths["leverage"] * part.force) / found.values[TORQUE_CONSTANT]
+def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration, hot: bool = False) -> Unexplained:
+    """Current of a log that the estimator's torque path leaves: a fit's parameters, the calibration's gear and effects; of
+    ``hot`` pads, whose heat and brake torque effects may follow, by the whole step."""
+    part, parameters = _Regression(log, calibration), to_parameters(moved(calibration, found.physical()))
+    paths = run_paths(log.samples, parameters)[part.rows]
+    balance = run_step(log.samples, held(parameters))[part.rows] if hot else paths
+    residual = (balance["torque"] - balance["leverage"] * part.force) / found.values[TORQUE_CONSTANT]
+    use = (paths["friction_variance"] < _KNOWN) & np.isfinite(residual)
     return Unexplained(found, part.rows[use], residual[use], paths["friction_mean"][use], part.load[use])
 
 
