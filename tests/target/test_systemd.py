@@ -28,7 +28,12 @@ CACHE, STATE = Path("/var/cache/emb_daemon"), Path("/var/lib/emb_daemon")
 LOG = RIG / "static" / "random_6p5mm.log.gz"
 CURRENT = 0x110
 FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
+STATUS = 0x220  # EMB_c_EstimatorStatus of the first corner
+DEADLINE_MISSED = 0x2000
 PERIOD_S = 0.004
+# Of broadcasts. The loop counts from wake to wake, and one that is held up between the two says so at the next.
+CLEARLY_MISSED_S = 4 * PERIOD_S
+STATUS_WITHIN_S = 0.3  # it comes every 0.1 s
 PAIRING_S = 0.002
 
 COLD_START_S = 780  # all kernels compiled: 290 to 410 s seen, by what other guests left of the CPU
@@ -164,22 +169,28 @@ def test_compiled_kernels_are_kept(service: None) -> None:
 
 def test_forces_come_250_times_a_second(inputs: None, record: Callable[..., Recording]) -> None:
     wait_for_forces(record, timeout_s=10)
-    with record(FORCES + ",100:7FF") as recording:
+    with record(f"{FORCES},{STATUS:X}:7FC,{RESOLVER:X}:7FF") as recording:
         time.sleep(10)
+    end_s = recording.frames[-1].time_s
     heard = sum(frame.can_id == RESOLVER for frame in recording.frames)
     answered = len(answers(recording.frames))
-    print(
-        f"{answered} answers to {heard} resolver samples in {recording.frames[-1].time_s - recording.frames[0].time_s:.2f} s"
-    )
+    print(f"{answered} answers to {heard} resolver samples in {end_s - recording.frames[0].time_s:.2f} s")
     assert heard > 0.9 * 10 / PERIOD_S
     assert abs(answered - heard) <= 2, "of the samples at the edges of the recording, one half may be outside"
-    # A corner without input says so once a tick, and a tick that comes late says it once.
+    # A corner without input says so once a tick. How many ticks come late is the machine's affair; that fewer are met than
+    # missed is not well by the daemon's own judgement, and every clear delay is to be said.
+    said = [f.time_s for f in recording.frames if f.can_id == STATUS + 1 and f.data[6] + (f.data[7] << 8) & DEADLINE_MISSED]
     for corner in range(1, 4):
-        times = [frame.time_s for frame in recording.frames if frame.can_id == CLAMP_FORCE + corner]
+        times = [f.time_s for f in recording.frames if f.can_id == CLAMP_FORCE + corner]
         mean = (times[-1] - times[0]) / (len(times) - 1)
         late = sum(b - a > 1.5 * PERIOD_S for a, b in itertools.pairwise(times)) / len(times)
         print(f"corner {corner}: mean period {mean * 1e3:.4f} ms, {late:.2%} of the gaps above {1.5 * PERIOD_S * 1e3:.0f} ms")
-        assert mean == pytest.approx(PERIOD_S, rel=0.1)
+        assert PERIOD_S * 0.98 < mean < 2.0 * PERIOD_S
+        for before, after in itertools.pairwise(times):
+            if after - before > CLEARLY_MISSED_S and after + STATUS_WITHIN_S < end_s:
+                assert any(after <= time_s <= after + STATUS_WITHIN_S for time_s in said), (
+                    f"nothing at {before}, and no word of it"
+                )
 
 
 def test_reload_is_heard_and_changes_nothing_else(inputs: None, record: Callable[..., Recording]) -> None:
