@@ -290,11 +290,13 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     if held.cost < free.cost:
         # What has more freedom explains no less: it began too far off and ended at a curve that does not rise at contact.
         free = _fit(training, held.x, steps, with_curve)
-    if not _as_good(held, free):
-        # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
-        kept = np.concatenate([free.x[:_CURVE], curve])
-        kept[_GAIN] = 0.0
-        held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
+    if _as_good(held, free):
+        # The rotor's inertia tells the torque constant from the pads' stiffness no better than it is known itself.
+        return _fit(training, held.x, steps, np.arange(_CURVE), inertia_sigma=INERTIA_SIGMA), True
+    # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+    kept = np.concatenate([free.x[:_CURVE], curve])
+    kept[_GAIN] = 0.0
+    held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
     if _as_good(held, free):
         return held, True
     # Magnets that lost as much, or the rotor of another unit: what inertia and torque constant contradict each other by is
