@@ -23,10 +23,11 @@ from emb_daemon.adapt.training import apply_learned
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
+from emb_daemon.estimator.hypotheses import DRIFT, open_all
 from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
 from emb_daemon.estimator.unknown import INERTIA_SIGMA, set_priors
 from emb_daemon.logs.read import read_frames
-from emb_daemon.models.fusion import GAIN, INERTIA
+from emb_daemon.models.fusion import CONTACT, GAIN, INERTIA, LOAD
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.scenarios import park, random_angle, rest, training
@@ -644,6 +645,31 @@ def test_with_a_new_curve_the_strokes_torque_constant_and_inertia_are_believed(i
         state["covariance"][0, GAIN, INERTIA] = state["covariance"][0, INERTIA, GAIN] = 3e-5
         apply_learned(state[0], ideal, np.zeros(1, STATE), rows, learned, a)
         assert (*state["error"][0, [GAIN, INERTIA]], state["covariance"][0, GAIN, INERTIA]) == pytest.approx(expected)
+
+
+def test_an_old_curve_keeps_what_driving_said_of_a_drift(ideal):
+    """A new one leaves no more of that than of any other hypothesis."""
+    rows, a = trained_rows(ideal, seconds=4.0), np.zeros(1, r.ADAPTER)[0]
+    a["contact_angle"], a["contact_sigma"] = ideal["clearance"] + 0.05, 0.1
+    changed = ideal.copy()
+    changed["curve"] *= 1.1
+    for learned in (ideal, changed):
+        state = new_state(1)
+        s, drift = state[0], state[0]["alternatives"][DRIFT]
+        s["contact_angle"] = ideal["clearance"]
+        set_priors(s["covariance"], ideal)
+        open_all(s, ideal)
+        drift["log_odds"], drift["error"][CONTACT], drift["error"][GAIN], drift["error"][LOAD] = 0.0, 0.2, 0.01, 1e-6
+        known = float(drift["covariance"][CONTACT, CONTACT])
+        apply_learned(s, ideal, np.zeros(1, STATE), rows, learned, a)
+        if learned is ideal:
+            weight = known / (known + 0.1**2)
+            where = s["contact_angle"] + drift["error"][CONTACT]
+            assert where == pytest.approx(ideal["clearance"] + (1.0 - weight) * 0.2 + weight * 0.05)
+            assert drift["covariance"][CONTACT, CONTACT] == pytest.approx((1.0 - weight) * known)
+            assert (drift["log_odds"], drift["error"][GAIN], drift["error"][LOAD]) == (0.0, 0.01, 0.0)
+        else:
+            assert drift["log_odds"] == drift["least"] and drift["error"][CONTACT] == 0.0
 
 
 def test_a_torque_constant_that_no_magnet_has_is_rejected(ideal):

@@ -11,12 +11,12 @@ import numpy as np
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
-from emb_daemon.estimator.hypotheses import open_all
+from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
-from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OFFSET, SCALE
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, GROWTH, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 #: Wheel speed up to which a wheel stands, rad/s: some 3 cm/s at the rim.
@@ -34,6 +34,8 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
 #: Rows over which the path models are run up to the moment at which learned values take effect: many time constants.
 _RUN_UP = 700
+#: States of the motor and its current sensor.
+_OF_THE_MOTOR = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
 _BAD = (
     e.RESOLVER_LOST | e.CURRENT_LOST | e.THERMOCOUPLE_LOST | e.VEHICLE_STATUS_LOST | e.E2E_ERROR | e.OUT_OF_RANGE
     | e.STUCK | e.TEMPERATURE_UNCERTAIN
@@ -152,12 +154,26 @@ def _replace(s, state, error, sigma):
 
 
 @njit
+def _forget_friction(x, P):
+    """Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
+    what may still differ for this very curve. What concerns the motor and its current sensor is no part of them."""
+    for i in range(len(x)):
+        if i not in _OF_THE_MOTOR:
+            if i not in (CONTACT, SCALE, GROWTH):
+                x[i] = 0.0
+            for j in range(len(x)):
+                if i != j:
+                    P[i, j] = P[j, i] = 0.0
+    P[FAST, FAST] = 1.0
+
+
+@njit
 def apply_learned(s, p, scratch, rows, learned, a):
     """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
     path models to the last of ``rows``.
 
     Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that, unless the pads have moved."""
+    angle is weighed against that, unless the pads have moved; and that the brake may drift is as likely as driving made it."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
     kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
@@ -175,17 +191,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
     s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
     s.effects = t.effects
-    # Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
-    # what may still differ for this very curve.
-    # Stiffness, contact and friction are new; what concerns the motor and its current sensor is no part of them.
-    motor = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
-    for i in range(len(s.error)):
-        if i not in motor:
-            s.error[i] = 0.0
-        for j in range(len(s.error)):
-            if i != j and (i not in motor or j not in motor):
-                s.covariance[i, j] = 0.0
-    s.covariance[FAST, FAST] = 1.0
+    _forget_friction(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
     if not kept:
         # A new curve rests on the torque constant and the inertia of the stroke.
@@ -196,9 +202,17 @@ def apply_learned(s, p, scratch, rows, learned, a):
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
     s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
-    if not kept:
+    drift = s.alternatives[DRIFT]
+    if kept:
+        _forget_friction(drift.error, drift.covariance)
+        known = drift.covariance[CONTACT, CONTACT]
+        share = known / (known + a.contact_sigma**2)
+        drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - weight * moved
+        drift.covariance[CONTACT, CONTACT] = (1.0 - share) * known
+        open_changes(s, learned)
+    else:
         s.contact_anchor = s.contact_angle
-    open_all(s, learned)
+        open_all(s, learned)
 
 
 @njit

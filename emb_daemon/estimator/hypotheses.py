@@ -175,9 +175,15 @@ def _succeed(s, p, kind, released):
 @njit
 def open_all(s, p):
     """After a start, or when another hypothesis has become the first."""
+    open_changes(s, p)
+    _open(s, p, DRIFT)
+
+
+@njit
+def open_changes(s, p):
+    """All but a brake that drifts."""
     open_again(s, p)
     _open(s, p, DISC_GROWTH)
-    _open(s, p, DRIFT)
 
 
 @njit
