@@ -19,6 +19,7 @@ from emb_daemon.estimator.hypotheses import (
     mix,
     open_again,
     open_all,
+    open_others,
     settle,
     stay_finite,
     suspected,
@@ -306,6 +307,8 @@ def opened(p):
     state = new_state()
     set_priors(state["covariance"][0], p)
     state["scale"] = 1.0
+    # Seen before: none that comes from a workshop.
+    state["resumed"] = True
     open_all(state[0], p)
     return state
 
@@ -411,6 +414,30 @@ def test_what_is_not_suspected_is_looked_for_anew(p, opened):
     assert not suspected(s)
 
 
+@pytest.mark.parametrize("since", [None, "resumed", "braked"])
+def test_a_brake_that_was_never_seen_may_come_from_a_workshop(p, since):
+    """With other pads: more likely than that they changed between two stops, until it was seen to brake."""
+    s = new_state()[0]
+    set_priors(s["covariance"], p)
+    s["scale"] = 1.0
+    if since:
+        s[since] = True
+    open_all(s, p)
+    odds = s["alternatives"]["log_odds"]
+    assert odds[TORQUE_JUMP] == PRIOR_ODDS
+    assert odds[STIFFNESS_JUMP] == PRIOR_ODDS if since else odds[STIFFNESS_JUMP] > PRIOR_ODDS
+    assert not suspected(s) and s["alternatives"]["least"][STIFFNESS_JUMP] == PRIOR_ODDS
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_first_stroke_with_softer_pads_is_covered(p, seed):
+    other = p.copy()
+    other["curve"] *= 0.9
+    rows, force = brake.samples(other, brake.stops(p, 1, seed))
+    estimates = estimate(brake.noisy(rows, p), p)
+    assert np.mean(np.abs(estimates["force"] - force) < 2.0 * estimates["sigma"]) > 0.95
+
+
 def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):
     s = opened[0]
     s["alternatives"]["log_odds"][STIFFNESS_JUMP], s["alternatives"]["age_s"] = 1.0, 20.1
@@ -465,6 +492,27 @@ def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):
     before = float(s["force"])
     assert settle(s, p, True, 0.004)
     assert s["jumps"] == 1.0 and s["force"] == before + 500.0
+
+
+@pytest.mark.parametrize(("before", "stiffness", "kept"), [(-np.inf, 10.0, 10.0), (-np.inf, 7.0, None), (12.0, 10.0, 12.0)])
+def test_the_likeliest_of_the_other_kind_is_kept_beside_a_proven_jump(p, opened, before, stiffness, kept):
+    """As far behind as it is, unless that is beyond what it may fall to; what comes next may speak for it."""
+    s = opened[0]
+    a = s["alternatives"]
+    a["log_odds"][[STIFFNESS_JUMP, TORQUE_JUMP, KEPT_JUMP]] = stiffness, 14.0, before
+    a["age_s"], a["kind"][KEPT_JUMP], a["least"][KEPT_JUMP] = 21.0, STIFFNESS_JUMP, PRIOR_ODDS
+    a["error"][[STIFFNESS_JUMP, KEPT_JUMP], SCALE] = stiffness, before
+    a["shift"][[STIFFNESS_JUMP, KEPT_JUMP, TORQUE_JUMP]] = 100.0, 120.0, 30.0
+    assert settle(s, p, True, 0.004)
+    k = a[KEPT_JUMP]
+    if kept is None:
+        assert k["log_odds"] == -np.inf
+    else:
+        shift = 100.0 if kept == stiffness else 120.0
+        assert (k["kind"], k["error"][SCALE], k["log_odds"]) == (STIFFNESS_JUMP, kept, kept - 14.0)
+        assert (s["force"], k["shift"]) == (30.0, shift - 30.0)
+    open_others(s, p)
+    assert a["log_odds"][TORQUE_JUMP] == PRIOR_ODDS and (k["log_odds"] > -np.inf) == (kept is not None)
 
 
 @pytest.mark.parametrize("stiffness", [0.9, 0.94, 1.1])

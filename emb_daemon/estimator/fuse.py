@@ -18,6 +18,7 @@ from emb_daemon.estimator.hypotheses import (
     mix,
     open_again,
     open_all,
+    open_others,
     place,
     settle,
     stay_finite,
@@ -251,7 +252,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
         fold(s, warmth, True)
         if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
             fold(s, warmth, False)
-            open_all(s, p)
+            open_others(s, p)
             forget(s.consistency)
             forget_level(s.contact)
     else:
