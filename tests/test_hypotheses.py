@@ -158,6 +158,32 @@ def test_an_offset_that_closes_is_the_currents_too(p, seed):
     assert rmse < 100.0
 
 
+@pytest.mark.parametrize(("ampere_per_s", "seed"), [(0.09, 1), (0.09, 2), (-0.09, 2)])
+def test_a_current_sensor_that_drifts_takes_no_force_with_it(p, ampere_per_s, seed):
+    """What each clearance shows of its offset it may have drifted by again at the next."""
+    rows, force = brake.samples(p, brake.stops(p, 8, seed))
+    rows = brake.noisy(rows, p)
+    rows["current_q"] += ampere_per_s * np.maximum(np.cumsum(rows["dt"]) - 5.0, 0.0)
+    estimates = estimate(rows, p)
+    error, clamped = estimates["force"] - force, force > 500.0
+    assert np.sqrt(np.mean(error[clamped] ** 2)) < 60.0
+    assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.95
+
+
+def test_an_offset_that_moved_by_more_than_its_sigma_may_again(p, opened):
+    """By as much in as long; one that did not is no reason."""
+    s = opened[0]
+    s["contact"]["engaged"], s["covariance"][OFFSET, OFFSET] = True, 1e-6
+    for seconds, offset, walk in ((0.0, 0.5, 0.0), (10.0, 0.502, 0.0), (10.0, 0.402, 0.5 * (0.01 - 9e-6) / 10.0)):
+        if s["offset_age_s"] > 0.0:
+            s["offset_age_s"] = seconds
+        s["braked"], s["error"][OFFSET] = False, offset
+        settle(s, p, False, 0.004)
+        assert s["offset_walk"] == pytest.approx(walk) and s["offset_before"] == offset and s["braked"]
+        settle(s, p, False, 0.004)
+        assert s["offset_walk"] == pytest.approx(walk), "one stroke tells once"
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_motor_that_fades_with_heat_takes_no_stiffness_with_it(p, seed):
     """The torque constant loses a fifth over four minutes of stops: the torque path's gain follows."""

@@ -129,6 +129,47 @@ def test_without_torque_only_offset_and_friction_can_hold_a_force(p):
     assert low == 0.0 and 0.0 < high < 0.35 * p["maximum_force"]
 
 
+@given(
+    force=st.floats(0.0, 1.0),
+    gain=st.floats(LEAST_GAIN, MOST_GAIN),
+    beyond=st.floats(0.01, 0.5),
+    released=st.floats(-MOST_FRICTION, MOST_FRICTION),
+    holding=st.floats(-MOST_FRICTION, MOST_FRICTION),
+)
+def test_a_sensor_that_shows_less_torque_than_an_open_brake_leaves_rules_no_force_out(
+    p, force, gain, beyond, released, holding
+):
+    """However the friction presses in the motor that stands released, and in the one that holds a force."""
+    watched, force = Watched(p), force * p["maximum_force"]
+    healthy, dry = OFFSET_SHARE * p["gear_gain"] * p["maximum_force"], MOST_FRICTION * p["offset_friction"]
+    offset = -(beyond + healthy + 2.0 * dry) / LEAST_GAIN
+    watched.hold(released * p["offset_friction"] / gain + offset, samples=500)
+    taken = holding * (p["offset_friction"] + p["load_friction"] * force)
+    low, high = watched.hold((p["gear_gain"] * force + taken) / gain + offset, samples=500)
+    assert low <= force <= high * (1.0 + 1e-6) + 1.0
+
+
+@pytest.mark.parametrize(
+    ("torque", "speed", "samples"),
+    [(-0.3, HOLDING, 240), (-0.3, OPENING, 500), (-0.3, CLOSING, 500), (-0.05, HOLDING, 500), (0.3, HOLDING, 500)],
+    ids=["against its stop", "opening", "closing", "friction", "clamped"],
+)
+def test_no_other_torque_says_that_the_sensor_is_off(p, torque, speed, samples):
+    watched, fresh = Watched(p), Watched(p)
+    watched.hold(torque, speed, samples)
+    assert watched.hold(0.2, samples=500) == pytest.approx(fresh.hold(0.2, samples=500)) and watched.w["missing"] == 0.0
+
+
+def test_what_the_sensor_was_once_off_by_it_may_still_be(p):
+    watched = Watched(p)
+    watched.hold(-0.3, samples=500)
+    _, once = watched.hold(0.2, samples=500)
+    watched.hold(-0.25, samples=500)
+    assert watched.hold(0.2, samples=500)[1] == pytest.approx(once)
+    watched.hold(-0.35, samples=500)
+    assert watched.hold(0.2, samples=500)[1] > once
+
+
 @pytest.mark.parametrize(("has_status", "park_brake"), [(True, 1.0), (False, 0.0)])
 def test_a_latched_brake_needs_no_current(p, has_status, park_brake):
     watched = Watched(p)

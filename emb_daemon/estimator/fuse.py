@@ -146,6 +146,9 @@ def _predict(s, p, m, spread, warmth, known):
     walked = s.sensitivity[1]
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
+    walked[OFFSET] += s.offset_walk * m.dt
+    if s.offset_age_s > 0.0:
+        s.offset_age_s += m.dt
     # What has just become uncertain of the pads' heat is uncertain of the stiffness from now on.
     walked[SCALE] += max(softening - s.softening, 0.0) * (softening + s.softening)
     s.softening = softening

@@ -83,6 +83,8 @@ _OPENED_S, _KEPT = 1.0, 1.0
 #: Time, that in the clearance apart, after which the stronger of two proven alternatives is taken though they are alike, and a
 #: merely suspected one given up at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
+#: Variances of its own by which an offset must have moved for its walk to be another: 3 standard deviations, squared.
+_SURELY = 9.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
 GATE = 5.0
 
@@ -403,12 +405,26 @@ def stay_finite(s):
 
 
 @njit
+def _follow_offset(s):
+    """The pads touch: the clearance has shown what there is of an offset. What it has moved by since the last stroke, beyond
+    what the filter made of it, it may do again."""
+    offset, known = s.error[OFFSET], s.covariance[OFFSET, OFFSET]
+    if s.offset_age_s > 0.0:
+        moved = offset - s.offset_before
+        walk = max(moved * moved - _SURELY * known, 0.0) / s.offset_age_s
+        s.offset_walk = 0.5 * (s.offset_walk + walk)
+    s.offset_before, s.offset_age_s = offset, 1e-9
+
+
+@njit
 def settle(s, p, released, dt):
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
     While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
     them apart, so nothing is proven before. The mixture does not wait."""
     if s.contact.engaged:
+        if not s.braked:
+            _follow_offset(s)
         s.braked = True
     elif released and s.braked:
         s.braked = False

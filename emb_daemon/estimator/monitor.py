@@ -10,13 +10,16 @@ where friction counts against the motion if the motor turns and either way if it
 largest gain stands on the left and the least on the right, since no angle is believed here,
 and a release spring counts in full on the left and not at all on the right. A force that stays outside for
 `TOLERATED_S` is contradicted. A latched brake needs no current, so with the park brake on there is no upper bound.
+
+Pads only push. A standing motor that shows less torque than an open brake leaves to it has a current sensor that is further
+off than any healthy one, and by how much it shows itself: from then on that much may be missing on the right.
 """
 
 from math import exp
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import fields, njit
 from emb_daemon.models.gear import most_of_spring, steepest
 
 #: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
@@ -30,13 +33,14 @@ MOST_FRICTION = 2.0
 OFFSET_SHARE = 0.05
 #: Gear gain that must be left over friction for a torque to bound the force from above: below it the gear holds by itself.
 _NOT_LOCKED = 0.2
+#: Time for which a standing motor must show too little torque for that, s: longer than it is pressed against its stop.
+_SHOWN_S = 1.0
 #: Motor speed from which the motor turns, rad/s.
 _TURNING_RAD_PER_S = 2.0
 
-MONITOR = np.dtype(
-    [("started", "?"), ("torque", "f8"), ("speed", "f8"), ("low", "f8"), ("high", "f8"), ("force", "f8"), ("outside_s", "f8")],
-    align=True,
-)
+#: ``missing``: torque by which the sensor may show too little beyond a healthy one's offset, N m; ``short_s``: for how long it
+#: has shown less than that one could.
+MONITOR = np.dtype([("started", "?"), *fields("f8", "torque speed low high force outside_s missing short_s")], align=True)
 
 
 @njit
@@ -56,13 +60,18 @@ def bound(w, p, m):
     closing, opening = m.speed > _TURNING_RAD_PER_S, m.speed < -_TURNING_RAD_PER_S
     taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
     held, held_by_load = (0.0, 0.0) if closing else (dry, load)
+    # Friction of a motor that stands may press either way: by the most that this leaves the sensor is off from now on.
+    unhealthy = LEAST_GAIN * -w.torque > offset + dry and not closing and not opening
+    w.short_s = w.short_s + m.dt if unhealthy else 0.0
+    if w.short_s > _SHOWN_S:
+        w.missing = max(w.missing, MOST_GAIN * -w.torque + dry - offset)
     flat, steep = steepest(p.gear)
     w.low = max((least * w.torque - offset - taken) / ((p.gear_gain + taken_by_load) * steep) - most_of_spring(p), 0.0)
     leverage = p.gear_gain - held_by_load
     latched = not m.has_status or m.park_brake != 0.0
     w.high = p.maximum_force
     if not latched and leverage > _NOT_LOCKED * p.gear_gain:
-        w.high = min(max((most * w.torque + offset + held) / (leverage * flat), 0.0), p.maximum_force)
+        w.high = min(max((most * w.torque + offset + w.missing + held) / (leverage * flat), 0.0), p.maximum_force)
     w.low = min(w.low, w.high)
 
 
