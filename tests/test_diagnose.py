@@ -33,7 +33,7 @@ from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
-from emb_daemon.diagnose.selection import Selection, revise
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection, revise
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.diagnose.unexplained import Left, achieved
@@ -593,6 +593,34 @@ def test_a_term_is_taken_where_its_port_is_sure_though_its_signal_is_not(coupled
     after = diagnosis._with_noise(before, found).noise.stiffness_relative
     assert (undecided.get("noise.stiffness_relative", 0.0) > 0.0) == taken
     assert not taken or after >= undecided["noise.stiffness_relative"]
+
+
+def test_what_is_too_large_in_one_shape_is_tried_in_another(coupled, monkeypatch):
+    [name] = coupled[0].accepted
+    bare, enter, tried = coupled[0].without(name, "to be made again"), grammar._enter, []
+    enumerated = prospects.enumerate_forms
+    monkeypatch.setattr(
+        prospects, "enumerate_forms", lambda *of: [f for f in enumerated(*of) if f.signal in ("brake_torque", "disc_speed")]
+    )
+
+    def refuse_first(selection, candidate, form):
+        tried.append(form)
+        if len(tried) == 1:
+            return selection.noted([dataclasses.replace(candidate, reason=TOO_LARGE)])
+        return enter(selection, candidate, form)
+
+    monkeypatch.setattr(grammar, "_enter", refuse_first)
+    found = grammar._one_more(bare, "stiffness")
+    assert len(found.accepted) == 1 and len(tried) == 2
+    first, second = tried
+    assert (first.port, first.signal) == (second.port, second.signal) and first != second
+
+
+def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(coupled, monkeypatch):
+    """What is proven over the whole grammar owes no chance of its own, but in the end it must still gain what matters."""
+    assert revise(coupled[0]).accepted == coupled[0].accepted
+    monkeypatch.setattr(Screening, "floor", lambda *_: 1e4)
+    assert revise(coupled[0]).accepted == []
 
 
 def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):

@@ -166,7 +166,15 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         return _enter_lobe(
             selection, candidate, [p for p in prospects if p.form.shape == "harmonic" and p.means == best.means]
         )
-    return _enter(selection, candidate, best.form)
+    found, name = _enter(selection, candidate, best.form), candidate.effect.name
+    for other in others:
+        if found.candidates[name].reason != TOO_LARGE:
+            break
+        # What is more in one shape than its port may bear need not be so in another that gains as much.
+        if other.means == best.means and other.evidence.gain >= _AS_GOOD * best.evidence.gain:
+            same = replace(candidate, effect=made_effect(other.form, name), evidence=other.evidence)
+            found = _enter(selection, same, other.form)
+    return found
 
 
 def _enter_lobe(selection: Selection, candidate: Candidate, lobes: Sequence[Prospect]) -> Selection:

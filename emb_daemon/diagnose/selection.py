@@ -272,7 +272,11 @@ def revise(selection: Selection) -> Selection:
         for group in groups(candidate.effect, amplitudes):
             over_grammar = candidate.made or candidate.names
             evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
-            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not over_grammar):
+            # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter.
+            little = over_grammar and model.rms(evidence.gain, candidate.channel) < selection.screening.floor(
+                model, candidate.channel
+            )
+            if little or evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not over_grammar):
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
