@@ -153,6 +153,10 @@ class Search:
         """That of the best among all forms; a ripple's is that of its order among as many."""
         if best.form.shape == "harmonic":
             return min(1.0, best.evidence.p_value * len(self.forms))
+        return self._chance
+
+    @cached_property
+    def _chance(self) -> float:
         return _chance(self)
 
     def at_another_time(self, form: Form) -> float:
@@ -340,7 +344,7 @@ def _order(search: Search, port: str, order: float) -> float:
 def _stays_in_bounds(prospect: Prospect) -> bool:
     """Whether a calibration may hold the term at the size found."""
     try:
-        prospect.form.term(coefficient=float(np.hypot.reduce(prospect.evidence.values)))
+        prospect.form.term("term:tried", *map(float, prospect.evidence.values))
     except InvalidValue:
         return False
     return True
