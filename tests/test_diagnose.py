@@ -629,6 +629,20 @@ def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(couple
     assert revise(coupled[0]).accepted == []
 
 
+def test_what_only_its_prior_sizes_is_not_applied_unless_it_gains_what_matters(viscous, monkeypatch):
+    """Evidence over episodes knows nothing of how much a prior adds to what is not known."""
+    selection = viscous[0]
+    channel = selection.candidates["viscous_friction"].channel
+    fit = selection.model.fits[channel]
+    unsure = dataclasses.replace(fit, covariance=1e6 * fit.covariance)
+    model = dataclasses.replace(selection.model, fits={**selection.model.fits, channel: unsure})
+    unsure = dataclasses.replace(selection, model=model)
+    assert revise(unsure).accepted == ["viscous_friction"]
+    monkeypatch.setattr(Screening, "floor", lambda *_: 1e4)
+    assert revise(selection).accepted == ["viscous_friction"]
+    assert revise(unsure).accepted == []
+
+
 def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):
     selection, fit_log, _ = coupled
     monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
