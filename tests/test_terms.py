@@ -248,6 +248,49 @@ def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed
     assert said in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("port", "coefficient", "said"),
+    [
+        ("gear_friction", 1.9, None),
+        ("gear_friction", 2.1, "reaches 2.1 1, expected 2 at most"),
+        ("gear_friction", -0.95, "reaches -0.95 1, expected -0.9 at least"),
+        ("gear_gain", 1.9, "expected 0.9 at most"),
+    ],
+)
+def test_friction_may_grow_by_more_than_it_may_fall(port, coefficient, said):
+    """No friction is negative, but of three times as much a machine does not become another one."""
+    with pytest.raises(InvalidValue, match=said) if said else contextlib.nullcontext():
+        constant(port, coefficient)
+
+
+@given(
+    shape=st.sampled_from(terms.SHAPES),
+    coefficient=st.floats(-1e3, 1e3),
+    centre=st.floats(-3.0, 3.0),
+    scale=st.floats(0.1, 10.0),
+    exponent=st.floats(0.1, 4.0),
+)
+def test_a_term_adds_nothing_beyond_its_reach(shape, coefficient, centre, scale, exponent):
+    """What is held against the limits of its port is what the kernel does, at most, and reached for a power."""
+    sine = 0.5 * coefficient if shape == "harmonic" else 0.0
+    term = Term(
+        name="term:x", port="force", signal="motor_speed", shape=shape, coefficient=coefficient, sine=sine, centre=centre,
+        scale=scale, exponent=exponent, low=-2.0, high=5.0,
+    )  # fmt: skip
+    record = np.zeros(1, terms.PARAMETERS)[0]
+    fill_terms(record, (term,))
+    signals = np.zeros((101, len(terms.SIGNALS)))
+    signals[:, list(terms.SIGNALS).index("motor_speed")] = np.linspace(-4.0, 7.0, 101)
+    added = terms.evaluate(record["term"][0], signals, np.full(101, DT), 3e4)
+    least, most = term.reach
+    slack = 1e-9 * abs(coefficient)
+    assert least - slack <= added.min() and added.max() <= most + slack
+    if shape in ("odd_power", "onset"):
+        assert min(added.min(), 0.0) == pytest.approx(least, abs=slack) and max(added.max(), 0.0) == pytest.approx(
+            most, abs=slack
+        )
+
+
 def test_terms_are_few_and_have_names_of_their_own(calibration):
     term = Term(**_GOOD)
     many = tuple(msgspec.structs.replace(term, name=f"term:{n}") for n in range(terms.MOST + 1))

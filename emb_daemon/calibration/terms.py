@@ -15,6 +15,10 @@ from emb_daemon.errors import InvalidValue
 #: `Calibration` says of the largest.
 _MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0}
 _FACTOR = 0.9
+#: ... and most that may come to a factor. Friction and times change severalfold with load and warmth, but of three times as
+#: much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor constant
+#: twice as large is another machine's.
+_GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
 
 
 class Term(Struct, kw_only=True):
@@ -63,9 +67,9 @@ class Term(Struct, kw_only=True):
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
         if not self.is_bounded:
-            raise InvalidValue(
-                f"coefficient: the term reaches {self.largest:.3g} {self.unit}, expected {self.limit:g} at most"
-            )
+            least, most = self.reach
+            beyond, kind = (most, f"{self.growth:g} at most") if most > self.growth else (least, f"{-self.limit:g} at least")
+            raise InvalidValue(f"coefficient: the term reaches {beyond:.3g} {self.unit}, expected {kind}")
 
     @property
     def unit(self) -> str:
@@ -74,26 +78,41 @@ class Term(Struct, kw_only=True):
 
     @property
     def limit(self) -> float:
-        """Most that it may add, in the port's unit."""
+        """Most that it may take away, and a response may add, in the port's unit."""
         return _MOST_AT.get(self.port, _FACTOR)
 
     @property
-    def is_bounded(self) -> bool:
-        """Whether it stays within its limit. What a response reaches, the time for which its signal stays says: the kernel
-        holds it there."""
-        return self.memory == "response" or self.largest <= self.limit
+    def growth(self) -> float:
+        """Most that it may add, in the port's unit."""
+        return _GROWS.get(self.port, self.limit)
 
     @property
-    def largest(self) -> float:
-        """Bound of what it adds inside its range, in the port's unit."""
-        ends = [self.low, self.high]
+    def is_bounded(self) -> bool:
+        """Whether it stays within its limits. What a response reaches, the time for which its signal stays says: the kernel
+        holds it there."""
+        least, most = self.reach
+        return self.memory == "response" or (least >= -self.limit and most <= self.growth)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Least and most that it adds inside its range, in the port's unit; nothing is among it."""
+        ends = (self.low, self.high)
         if self.memory == "slip":
-            ends = [-1.0, 1.0]
+            ends = (-1.0, 1.0)
         elif self.memory == "deficit":
-            ends = [self.low - self.high, self.high - self.low]
-        reach = max(abs(end - self.centre) for end in ends) / self.scale
-        grows = {"odd_power": reach**self.exponent, "even_power": reach**self.exponent, "onset": reach}
-        return float(np.hypot(self.coefficient, self.sine) * grows.get(self.shape, 1.0))
+            ends = (self.low - self.high, self.high - self.low)
+        first, last = ((end - self.centre) / self.scale for end in ends)
+        if self.shape == "harmonic":
+            size = float(np.hypot(self.coefficient, self.sine))
+            return -size, size
+        shaped = {
+            "odd_power": tuple(float(np.copysign(abs(u) ** self.exponent, u)) for u in (first, last)),
+            "even_power": (0.0, max(abs(first), abs(last)) ** self.exponent),
+            "onset": (0.0, max(last, 0.0)),
+            "saturation": (-1.0 if first < 0.0 else 0.0, 1.0 if last > 0.0 else 0.0),
+        }.get(self.shape, (0.0, 1.0))
+        added = [0.0, *(self.coefficient * value for value in shaped)]
+        return min(added), max(added)
 
 
 def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:

@@ -47,9 +47,9 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
         elif (worse := harm(before, after, main)) and selection.suspects:
             rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
             selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
-        elif (ruined := _ruined(bench, before, after, main)) and selection.suspects:
+        elif (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
             own, told = ruined
-            rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in selection.suspects}
+            rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
             selection = selection.without(min(rest, key=rest.__getitem__), told)
         elif veto := judges and _veto(selection, judges):
             selection = selection.without(*veto)
@@ -70,6 +70,23 @@ def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str
     first, last = pairs[worst]
     name = bench.trials[worst].log.path.name
     return own[worst], f"the estimator's {main} error on {name} goes from {first:.4g} to {last:.4g} N on left-out episodes"
+
+
+def _guilty(selection: Selection, there: np.ndarray) -> list[str]:
+    """Suspects that may have ruined episodes, ``there`` as weights, shape (episodes,).
+
+    Logs that the calibration was fitted to will have its noise stated anew, and with it how the paths are weighed. Until then
+    what makes its own path better there has not ruined it."""
+    if not selection.model.bench.own_data:
+        return selection.suspects
+    weight = np.sqrt(there)[selection.model.bench.sample_episode]
+
+    def left(without: str) -> dict[str, float]:
+        return _sizes({c: r * weight for c, r in _left_out_residuals(selection, without).items() if c in FORCE_CHANNELS})
+
+    with_all = left("")
+    channel = {suspect: selection.channel_of(suspect) for suspect in selection.suspects}
+    return [suspect for suspect, c in channel.items() if c not in with_all or left(suspect)[c] < with_all[c]]
 
 
 def _beyond_bounds(selection: Selection) -> list[str]:

@@ -123,7 +123,8 @@ def _wanted(selection: Selection, channel: str) -> bool:
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
-    """With the best term for one channel, accepted if it is proven, else with what speaks against it."""
+    """With the best term for one channel, accepted if it is proven, else with what speaks against it; where that is that it is
+    too large, with the best that is as good."""
     model, screening = selection.model, selection.screening
     signals = _signals(model)
     if signals is None:
@@ -132,9 +133,27 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     prospects = search.prospects()
     if not prospects or model.rms(prospects[0].evidence.gain, channel) < screening.floor(model, channel):
         return selection
-    best, *others = prospects
     shares = _shares(search.screen, prospects)
-    rivals = _as_good(best, others, shares)
+    for prospect in prospects:
+        # Where these logs cannot tell forms apart, one that is more than its port may bear is not the one.
+        if prospect.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain:
+            name = _name(prospect.form, selection)
+            selection = _with(selection, search, prospect, prospects, shares)
+            if selection.candidates[name].reason != TOO_LARGE:
+                break
+    return selection
+
+
+def _with(
+    selection: Selection,
+    search: Search,
+    best: Prospect,
+    prospects: Sequence[Prospect],
+    shares: Mapping[tuple[str, str], float],
+) -> Selection:
+    """With one of the ``prospects``, accepted if it is proven, else with what speaks against it; ``shares`` of bootstraps."""
+    model, screening, channel = selection.model, selection.screening, search.channel
+    rivals = _as_good(best, [p for p in prospects if p is not best], shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
     at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
     made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
@@ -158,7 +177,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
         undecided_N=search.undecided(best, rivals),
-        over=np.concatenate(signals)[:, list(SIGNALS).index(best.form.signal)],
+        over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)],
     )  # fmt: skip
     if against:
         return selection.noted([candidate])

@@ -153,6 +153,10 @@ class Search:
         """That of the best among all forms; a ripple's is that of its order among as many."""
         if best.form.shape == "harmonic":
             return min(1.0, best.evidence.p_value * len(self.forms))
+        return self._chance
+
+    @cached_property
+    def _chance(self) -> float:
         return _chance(self)
 
     def at_another_time(self, form: Form) -> float:
@@ -216,12 +220,14 @@ def _screen_forms(
     shapes: dict[Form, list[int]] = {}
     for index, form in enumerate(forms):
         shapes.setdefault(replace(form, port=""), []).append(index)
-    episodes = screen.model.bench.episodes
-    u, a = np.zeros((len(forms), episodes)), np.zeros((len(forms), episodes))
-    for members in shapes.values():
-        values = _values(screen.model.bench, forms[members[0]], signals)
-        columns = np.column_stack([sensitivities[forms[index].port] * values for index in members])
-        part = screen.scores(columns)
+    bench = screen.model.bench
+    u, a = np.zeros((len(forms), bench.episodes)), np.zeros((len(forms), bench.episodes))
+
+    def scored(members: list[int]) -> Scores:
+        values = _values(bench, forms[members[0]], signals)
+        return screen.scores(np.column_stack([sensitivities[forms[index].port] * values for index in members]))
+
+    for members, part in zip(shapes.values(), bench.map(scored, shapes.values()), strict=True):
         u[members], a[members] = part.u, part.a
     return Scores(u, a)
 
@@ -277,7 +283,8 @@ def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
 
 def _sharpen(search: Search) -> list[Form]:
     """The best forms with their sizes where left-out episodes gain most."""
-    found = [_fit_sizes(search, form) for form in _best_of(search.forms, search.scores.gain, _SHARPENED)]
+    best = _best_of(search.forms, search.scores.gain, _SHARPENED)
+    found = list(search.model.bench.map(lambda form: _fit_sizes(search, form), best))
     gains = np.array([gain for _, gain in found])
     return _best_of([form for form, _ in found], gains, _SHORTLIST)
 
@@ -337,7 +344,7 @@ def _order(search: Search, port: str, order: float) -> float:
 def _stays_in_bounds(prospect: Prospect) -> bool:
     """Whether a calibration may hold the term at the size found."""
     try:
-        prospect.form.term(coefficient=float(np.hypot.reduce(prospect.evidence.values)))
+        prospect.form.term("term:tried", *map(float, prospect.evidence.values))
     except InvalidValue:
         return False
     return True

@@ -151,13 +151,13 @@ class Bench:
         the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
         self.calibration, self.own_data = calibration, own_data
         # A thread that waits for one other costs more than what most of these tasks do.
-        self._map = ThreadPoolExecutor(workers).map if workers > 1 else map
+        self.map = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
 
         def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
             return make_trial(log, index, held(to_parameters(moved(calibration, here)))[0], here)
 
-        self.trials = list(self._map(trial, range(len(logs)), logs, mounted))
+        self.trials = list(self.map(trial, range(len(logs)), logs, mounted))
         self.has_reference = all(trial.has_force for trial in self.trials)
         self.clamps = calibration.contact.is_in_reach
         self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
@@ -240,7 +240,7 @@ class Bench:
             trace, heat = run_with_heat(trial.log.samples, self._parameters(trial, values))
             return self.compared(trial, trace), heat
 
-        parts, heat = zip(*self._map(one, self.trials), strict=True)
+        parts, heat = zip(*self.map(one, self.trials), strict=True)
         return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
 
     def _parameters(self, trial: Trial, values: Values) -> np.void:
@@ -293,12 +293,12 @@ class Bench:
             tried[coordinate] = now + step
             follows = coordinate.channel not in FORCE_CHANNELS or coordinate.name == HISTORY_TIME
             known = [None] * len(self.trials) if follows else heat
-            return (at[coordinate.channel] - self._probed(tried, coordinate.channel, known)) / step
+            return (at[coordinate.channel] - self.residual_held(tried, coordinate.channel, known)) / step
 
-        return list(self._map(answer, probes))
+        return list(self.map(answer, probes))
 
-    def _probed(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
-        """One channel's residual, with the heat of a log held where it is given."""
+    def residual_held(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
+        """One channel's residual, with the heat of a log held where it is given (`held_heat.run_held`)."""
         parts = []
         for trial, known in zip(self.trials, heat, strict=True):
             samples, parameters = trial.log.samples, self._parameters(trial, values)

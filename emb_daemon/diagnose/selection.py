@@ -5,7 +5,7 @@ channel is added and everything is refitted through the estimator; in the end ea
 presence of the others.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,6 +27,9 @@ _EQUAL = 0.97
 #: residual, is fitted before it is judged. Not of all of it: what differs from sample to sample no effect explains, and in the
 #: current that is most.
 _UNSURE, _LARGE = 0.05, 0.25
+
+#: Standard deviations by which amplitudes must be clear of nothing where they gain too little to matter.
+_CARRIED = 2.0
 
 #: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
 #: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
@@ -272,13 +275,26 @@ def revise(selection: Selection) -> Selection:
         for group in groups(candidate.effect, amplitudes):
             over_grammar = candidate.made or candidate.names
             evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
-            if evidence.gain <= 0.0 or (evidence.p_value > Q_VALUE and not over_grammar):
+            little = model.rms(evidence.gain, candidate.channel) < selection.screening.floor(model, candidate.channel)
+            # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so
+            # must what is gained where a prior alone says how large it is.
+            chance = evidence.p_value > Q_VALUE and not over_grammar
+            if evidence.gain <= 0.0 or chance or (little and (over_grammar or not _is_carried(model, group))):
                 gone += group
         if len(gone) == len(amplitudes):
             selection = selection.without(name, "no longer holds beside the other effects")
         elif gone:
             selection = replace(selection, model=model.without(gone).refined({candidate.channel}))
     return selection
+
+
+def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:
+    """Whether amplitudes are clear of nothing by their standard deviations, their priors' share of which evidence over
+    episodes does not hold."""
+    values = np.array([model.values[c] for c in group])
+    covariance = model.fits[group[0].channel].block(group)
+    known = bool(np.isfinite(covariance).all())
+    return known and float(values @ np.linalg.pinv(covariance) @ values) > _CARRIED**2 * len(group)
 
 
 def find_changes(selection: Selection) -> Selection:
