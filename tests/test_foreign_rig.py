@@ -37,7 +37,7 @@ def bus(truth, tmp_path_factory):
     """The rig's CAN FD log at 500 Hz."""
     folder = tmp_path_factory.mktemp("foreign")
     foreignkit.write_rig(folder)
-    return foreignkit.write_log(folder / "stops.blf", foreignkit.sampled(truth, 500.0))
+    return foreignkit.write_log(folder / "stops.log", foreignkit.sampled(truth, 500.0))
 
 
 def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
