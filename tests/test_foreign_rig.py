@@ -401,7 +401,7 @@ def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, sa
             "x is a travel in mm, not the motor's angle; state `unit: rad`, and as `scale`",
         ),
         ("speed_rad_per_s, unit: rad/s", "v, unit: mm/s", "v is a travel in mm/s, not the motor's angle; state `unit: rad/s`"),
-        ("force_N, unit: N", "force_N, unit: stone", "unit 'stone' of force_N is unknown; state one of N, kN"),
+        ("force_N, unit: N", "force_N, unit: stone", "force_N is in 'stone'; expected N, kN"),
     ],
 )
 def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):

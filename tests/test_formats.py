@@ -139,10 +139,14 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("{signal: Actuator.Position}", "{signal: Inverter.Iq}", "mA, which cannot become rad"),
-        ("{signal: Actuator.Position}", "{signal: Climate.Nameless}", "no unit, which cannot become rad; state `unit:`"),
+        ("{signal: Actuator.Position}", "{signal: Inverter.Iq}", "Inverter.Iq is in 'mA'; expected rad, deg"),
+        (
+            "{signal: Actuator.Position}",
+            "{signal: Climate.Nameless}",
+            "is in no unit; expected rad, deg, °, mrad, rev, turn; state `unit:`",
+        ),
         ("{signal: Actuator.Position}", "{signal: Actuator.Place}", "no such message and signal"),
-        ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "unit 'furlong'"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "is in 'furlong'; expected rad"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, value: 3.0}", "either signal"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, factor: 3.0}", "unknown key"),
         ("EMB_FL_Resolver.MotorAngle", "EMB_FL_ClampForce.ClampForce", "expected Message.Signal of what the daemon receives"),
