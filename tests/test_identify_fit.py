@@ -4,18 +4,30 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
+import foreignkit
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
+import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
-from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
+from emb_daemon.identify.dynamics import (
+    DELAY,
+    OPTIONAL,
+    CurveFit,
+    DynamicsFit,
+    Pads,
+    errors_unseen,
+    fit_dynamics,
+    regress_free,
+    starting_point,
+)
 from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
@@ -170,6 +182,26 @@ def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
     current = np.random.default_rng(7).normal(0.0, 0.2, len(rows))
     left = Unexplained(found, rows, current, np.ones(len(rows)), np.linspace(1e3, 2e3, len(rows)))
     assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
+
+
+def test_errors_of_a_fit_are_of_what_it_has_not_seen():
+    """Of random logs the second halves, of slow ones all; with the delay of the reference instrument, here two samples."""
+    known = foreignkit.calibration()
+    clearance, logs = known.contact.clearance_rad, []
+    for angle in (foreignkit.slow(), foreignkit.random(seconds=8.0)):
+        truth = foreignkit.truth(angle)
+        time_s, angle, speed, force = (column[::8] for column in (truth.time_s, truth.angle, truth.speed, truth.force))
+        late = np.roll(force, 2)
+        late[: len(late) // 2] += 1000.0
+        late[-200:-100] = np.nan
+        logs.append(emb_daemon.log_of_arrays(time_s, angle, speed, force_N=late))
+    fit = SimpleNamespace(calibration=known, curves=[SimpleNamespace(clearances_rad=np.full(2, clearance))])
+    groups = [Pads(known.pad_thickness_mm, tuple(logs))]
+    (slow, _), (random, force) = errors_unseen(groups, fit, 0.008)
+    assert rmse(slow) == pytest.approx(1000.0 * np.sqrt(0.5), rel=0.02)
+    assert len(random) == len(force) == pytest.approx(1000 - 95, abs=8) and np.isfinite(random).all()
+    [(alone, _)] = errors_unseen(groups, fit, 0.008, slow=False)
+    assert np.array_equal(alone, random) and rmse(random) < 0.2 * rmse(errors_unseen(groups, fit)[1][0])
 
 
 def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():

@@ -131,7 +131,7 @@ def _place(name: str, names: list[str]) -> int | None:
     if names.count(name) == 1:
         return names.index(name)
     place = _BY_PLACE.fullmatch(name)
-    return int(place[1]) - 1 if place and not names.count(name) and int(place[1]) <= len(names) else None
+    return int(place[1]) - 1 if place and int(place[1]) <= len(names) else None
 
 
 def _some(wanted: str, names: list[str]) -> str:
@@ -263,7 +263,7 @@ def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: st
     if more == 1 and not rows[0][-1]:
         return [*names, ""]
     counts = [row[0] for row in rows if row]
-    numbered = len(counts) > 1 and counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
+    numbered = counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
     if more == 1 and (numbered or line.lstrip().startswith('"')):
         return ["", *names]
     last = ", ".join(f"column {len(names) + n + 1}" for n in range(more))
