@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
 
 import foreignkit
 import msgspec
@@ -10,8 +11,10 @@ import pytest
 
 import emb_daemon
 from emb_daemon.calibration.files import save_calibration
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
+from emb_daemon.calibration.types import Provenance
 from emb_daemon.cli.main import main
+from emb_daemon.diagnose import residuals
 from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
@@ -128,6 +131,35 @@ def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load()
     plain = np.linalg.lstsq(table, fit.force_N, rcond=None)[0]
     left = judge.force_N - np.column_stack([judge.samples["current_q"], np.sign(judge.samples["speed"])]) @ plain
     assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
+
+
+@pytest.mark.parametrize("own", ["direction", "speed", "acceleration"])
+def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(own):
+    """Though the load may follow the same: that of a mass does the acceleration."""
+    random = np.random.default_rng(1)
+    speed = np.convolve(random.normal(size=3000), np.ones(20), "same")
+    moved_by = {"direction": np.sign(speed), "speed": speed, "acceleration": np.diff(speed, prepend=speed[:1])}[own]
+    moved_by = moved_by / moved_by.std()
+
+    def explained(current, load):
+        samples = {"speed": speed, "current_q": current, "has_current": np.ones(len(current), bool)}
+        return residuals._explained([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
+
+    current, load = (moved_by + 0.1 * random.normal(size=len(speed)) for _ in range(2))
+    assert explained(current, load) < 0.01
+    assert explained(current, moved_by + 3.0 * current) > 0.99
+    assert explained(np.full(len(speed), 1.3), load) == 0.0
+
+
+def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measured():
+    """And where a measured load tells it."""
+    priors = []
+    for load, provenance in ((1.0, None), (1.0, Provenance(date="", tool="")), (0.1, None)):
+        stated, _, fit, _ = _on_a_dynamometer(scatter=0.9, load=load)
+        bench = Bench([fit], msgspec.structs.replace(stated, provenance=provenance))
+        priors += [c.prior for c in Model.of(bench).values if c.name == TORQUE_CONSTANT]
+    free, measured, untold = priors
+    assert free == pytest.approx(10.0 * measured) and untold == measured
 
 
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():

@@ -28,10 +28,11 @@ from emb_daemon.identify.dynamics import (
     regress_free,
     starting_point,
 )
-from emb_daemon.identify.steps import attribution, noise, stiffness
+from emb_daemon.identify.steps import attribution, noise, stiffness, torque
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import log_of
+from emb_daemon.offline.run import run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
@@ -226,7 +227,7 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
     assert density == pytest.approx(0.5 * 1.0, rel=0.3)
 
 
-def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
+def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monkeypatch):
     """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
@@ -244,6 +245,16 @@ def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
     cold, hot = (rmse(unexplained_current(log, found, known, hot=hot).current_A) for hot in (False, True))
     plain = rmse(unexplained_current(drive({}), found, calibration).current_A)
     assert cold > 3.0 * plain and hot < 1.3 * plain
+
+    def lost(samples, parameters):
+        trace = run_step(samples, parameters)
+        trace["torque"][::2] = np.nan
+        return trace
+
+    # As where the zero of the angle was lost.
+    monkeypatch.setattr(torque, "run_step", lost)
+    assert rmse(unexplained_current(log, found, known, hot=True).current_A) == pytest.approx(hot, rel=0.1)
+    assert np.isfinite(unexplained_current(log, found, known, hot=True).current_A).all()
 
 
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
