@@ -74,21 +74,22 @@ class ClosedLoop:
         first corner's or, of several, all corners' in a row each.
 
         ``spoil(frames)`` may return other frames in their place."""
-        # numpy asks of a list of records, one by one, whether they are alike.
-        most = 2 * len(schedule) * len(self.corners)
-        estimates, truths, total = np.empty(most, ESTIMATE), np.empty((most, len(self.corners)), TRUTH), 0
+        estimates, truths = [], np.empty((len(schedule), len(self.corners)), TRUTH)
         commands = commands_of(schedule, self.corners)
         for row in range(len(schedule)):
             frames = self.car.tick(commands[row], schedule.drives[row])
             _, count = self.pipeline.consume(frames if spoil is None else spoil(frames))
             answers = self.pipeline.broadcast(count)
             self.car.hear(answers)
-            estimates[total : total + count] = self.pipeline.estimates[:count]
-            truths[total : total + count] = self.car.truth
-            total += count
+            truths[row] = self.car.truth
+            estimates.append(self.pipeline.estimates[:count].copy())
             if until is not None and count and until(self.pipeline.estimates[count - 1]):
                 break
-        return estimates[:total], truths[:total] if len(self.corners) > 1 else truths[:total, 0]
+        counts = [len(part) for part in estimates]
+        # Of parts without a place to go numpy asks, one by one, whether their records are alike.
+        rows = np.concatenate(estimates, out=np.empty(sum(counts), ESTIMATE))
+        truths = np.repeat(truths[: len(counts)], counts, axis=0)
+        return rows, truths if len(self.corners) > 1 else truths[:, 0]
 
 
 def parked(seconds: float, force_N: float = 0.0):
