@@ -11,9 +11,9 @@ import numpy as np
 
 from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator.answer import answer
-from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.jit import Array, entry, fields, njit
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S

@@ -19,7 +19,7 @@ from emb_daemon.adapt.memory import Memory, entry_of, with_entry
 from emb_daemon.adapt.records import ACCEPTED
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
@@ -29,9 +29,12 @@ from emb_daemon.plant.scenarios import commands_of, park, rest
 ROOT = Path(__file__).parent.parent
 
 
+_SHIPPED = load_calibration(ROOT / "config" / "calibration.yaml")
+
+
 def shipped(**changes):
     """The shipped calibration, with changes."""
-    return msgspec.structs.replace(load_calibration(ROOT / "config" / "calibration.yaml"), **changes)
+    return msgspec.structs.replace(_SHIPPED, **changes)
 
 
 def accepted(store):
@@ -71,20 +74,22 @@ class ClosedLoop:
         first corner's or, of several, all corners' in a row each.
 
         ``spoil(frames)`` may return other frames in their place."""
-        estimates, truths = [], []
+        estimates, truths = [], np.empty((len(schedule), len(self.corners)), TRUTH)
         commands = commands_of(schedule, self.corners)
         for row in range(len(schedule)):
             frames = self.car.tick(commands[row], schedule.drives[row])
-            truth = self.car.truth.copy() if len(self.corners) > 1 else self.car.truth[0].copy()
             _, count = self.pipeline.consume(frames if spoil is None else spoil(frames))
             answers = self.pipeline.broadcast(count)
             self.car.hear(answers)
-            for estimate in self.pipeline.estimates[:count]:
-                estimates.append(estimate.copy())
-                truths.append(truth)
+            truths[row] = self.car.truth
+            estimates.append(self.pipeline.estimates[:count].copy())
             if until is not None and count and until(self.pipeline.estimates[count - 1]):
                 break
-        return np.array(estimates), np.array(truths, TRUTH)
+        counts = [len(part) for part in estimates]
+        # Of parts without a place to go numpy asks, one by one, whether their records are alike.
+        rows = np.concatenate(estimates, out=np.empty(sum(counts), ESTIMATE))
+        truths = np.repeat(truths[: len(counts)], counts, axis=0)
+        return rows, truths if len(self.corners) > 1 else truths[:, 0]
 
 
 def parked(seconds: float, force_N: float = 0.0):

@@ -21,13 +21,7 @@ def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.
     kept, before, now = (naive.first_order_lag(*ones, dt, p["relaxation_time"]) for ones in np.eye(3))
     force = lfilter([now, before], [1.0, -kept], static)
     mean = 0.5 * (force + np.concatenate([force[:1], force[:-1]]))
-    s = np.zeros_like(angle) if friction is None else np.broadcast_to(friction, angle.shape)
-    state = 0.0
-    for i in range(1, len(angle) if friction is None else 0):
-        ratio = (angle[i] - angle[i - 1]) / p["presliding_angle"]
-        after = np.sign(ratio) + (state - np.sign(ratio)) * np.exp(-abs(ratio))
-        s[i] = np.sign(ratio) + (state - after) / abs(ratio) if ratio else state
-        state = after
+    s = _friction_means(np.diff(angle, prepend=angle[:1]) / p["presliding_angle"]) if friction is None else friction
     acceleration = np.diff(speed, prepend=speed[0]) / dt
     torque = p["gear_gain"] * mean + p["inertia"] * acceleration + s * (p["load_friction"] * mean + p["offset_friction"])
     rows = np.zeros(len(angle), SAMPLE)
@@ -39,6 +33,17 @@ def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.
     for name in ("has_current", "has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
         rows[name] = True
     return rows, force
+
+
+def _friction_means(ratio: np.ndarray) -> np.ndarray:
+    """Mean of the friction state over each of the ways ``ratio``, in presliding angles, from 0 on."""
+    state, means = 0.0, np.empty(len(ratio))
+    ways = zip(ratio.tolist(), np.sign(ratio).tolist(), np.exp(-np.abs(ratio)).tolist(), strict=True)
+    for row, (way, direction, kept) in enumerate(ways):
+        after = direction + (state - direction) * kept
+        means[row] = direction + (state - after) / abs(way) if way else state
+        state = after
+    return means
 
 
 def clamp(p, to_rad: float, seconds: float, dt: float = 0.004) -> np.ndarray:

@@ -98,12 +98,18 @@ def counted_reads():
     return count
 
 
-@pytest.fixture
-def parameters():
-    """PARAMETERS array (4,) of the shipped calibration, for tests to change."""
+@pytest.fixture(scope="session")
+def shipped_setup():
+    """The shipped configuration, as it is read."""
     from emb_daemon.calibration.configuration import Setup
 
-    return Setup(_ROOT / "config" / "emb.yaml").parameters.copy()
+    return Setup(_ROOT / "config" / "emb.yaml")
+
+
+@pytest.fixture
+def parameters(shipped_setup):
+    """PARAMETERS array (4,) of the shipped calibration, for tests to change."""
+    return shipped_setup.parameters.copy()
 
 
 @pytest.fixture

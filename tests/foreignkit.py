@@ -23,7 +23,7 @@ import wirekit
 from scipy.signal import lfilter
 
 import emb_daemon
-from emb_daemon.calibration.files import save_calibration
+from emb_daemon.calibration.files import dump_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.example import FILES
 
@@ -75,6 +75,7 @@ class Truth:
         return FINE_S * np.arange(len(self.angle))
 
 
+@functools.cache
 def calibration() -> Calibration:
     """The shipped calibration without effects: this brake has none."""
     return msgspec.structs.replace(emb_daemon.shipped_calibration(), effects={})
@@ -130,8 +131,13 @@ def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
     """DBC, mapping and calibration of the rig in ``folder``; returns the mapping's path."""
     (folder / "rig.dbc").write_text(DBC)
     (folder / "mapping.yaml").write_text(mapping)
-    save_calibration(calibration(), folder / "calibration.yaml")
+    (folder / "calibration.yaml").write_text(_calibration_file())
     return folder / "mapping.yaml"
+
+
+@functools.cache
+def _calibration_file() -> str:
+    return dump_calibration(calibration())
 
 
 def write_campaign(folder: Path, **motions: np.ndarray) -> Path:

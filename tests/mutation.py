@@ -32,6 +32,8 @@ _RUNTIME = [
     "tests/test_faults_loop.py",
     "tests/test_daemon.py::TestPacer",
     "tests/test_daemon.py::test_the_service_manager_hears_ready_watchdog_and_stopping",
+    "tests/test_reload.py::test_corners_are_not_changed_by_a_reload",
+    "tests/test_reload.py::test_a_bad_calibration_is_named_and_the_old_one_stays",
 ]
 _SECOC = [
     f"tests/test_secoc.py::{name}"

@@ -7,7 +7,14 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import (
+    INERTIA,
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    TORQUE_CONSTANT,
+    moved,
+)
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import SAMPLE
@@ -15,7 +22,6 @@ from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.campaign_file import Actuator, Datasheet, Resolver
 from emb_daemon.identify.dynamics import RELAXATION, Pads, curve_keys, simulate
 from emb_daemon.identify.example import FILES
-from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, PRESLIDING, TORQUE_CONSTANT
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import Log
 from emb_daemon.wire.contract import CYCLE_S
@@ -62,9 +68,9 @@ def draw(rng: np.random.Generator, thicknesses=(4.0, 9.0)) -> Truth:
         torque={
             TORQUE_CONSTANT: rng.uniform(0.03, 0.08),
             INERTIA: rng.uniform(0.6e-4, 2e-4),
-            OFFSET: rng.uniform(0.015, 0.05),
-            LOAD: rng.uniform(0.05, 0.3) * GEAR_GAIN,
-            PRESLIDING: rng.uniform(0.015, 0.1),
+            OFFSET_FRICTION: rng.uniform(0.015, 0.05),
+            LOAD_FRICTION: rng.uniform(0.05, 0.3) * GEAR_GAIN,
+            PRESLIDING_ANGLE: rng.uniform(0.015, 0.1),
         },
         curves=curves,
         clearance=rng.uniform(3.0, 9.0),
@@ -127,11 +133,11 @@ def _log(truth: Truth, thickness: float, path: np.ndarray, name: str, rng: np.ra
     t = truth.torque
     mean, state = np.zeros(len(path)), 0.0
     for row, travel in enumerate(np.diff(path), 1):
-        state, mean[row], _ = friction_state(state, 0.0, travel, t[PRESLIDING], 0.0, CYCLE_S)
+        state, mean[row], _ = friction_state(state, 0.0, travel, t[PRESLIDING_ANGLE], 0.0, CYCLE_S)
     half = np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     # What the estimator sees of force: without the delay of the reference's clock, a detail of half a millisecond.
     torque = GEAR_GAIN * half + t[INERTIA] * np.r_[0.0, np.diff(speed)] / CYCLE_S
-    torque += (t[OFFSET] + t[LOAD] * half) * mean
+    torque += (t[OFFSET_FRICTION] + t[LOAD_FRICTION] * half) * mean
     coloured = np.zeros(len(path))
     drive = rng.normal(size=len(path))
     for row in range(1, len(path)):

@@ -463,9 +463,15 @@ def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monke
     assert not refused.accepted and "left of the torque path goes from" in refused.reason
 
 
-def test_validation_has_a_veto(calibration, judged):
+@pytest.fixture(scope="module")
+def nominal(calibration):
+    """A log of a brake that hides nothing."""
+    return log_of(next(_logs(calibration, 54, {}, stops=3)))
+
+
+def test_validation_has_a_veto(nominal, judged):
     """The fit log is of a brake with viscous friction, the validation log of one without: nothing carries over."""
-    result = judged(log_of(list(_logs(calibration, 54, {}, stops=3))[1]))
+    result = judged(nominal)
     finding = next(f for f in result.findings if f.effect.name == "viscous_friction")
     assert not finding.accepted and "validation" in finding.reason
     assert "viscous_friction" not in result.calibration.effects
@@ -643,10 +649,9 @@ def test_what_only_its_prior_sizes_is_not_applied_unless_it_gains_what_matters(v
     assert revise(unsure).accepted == []
 
 
-def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):
+def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, nominal, monkeypatch):
     selection, fit_log, _ = coupled
     monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
-    nominal = log_of(list(_logs(calibration, 54, {}, stops=3))[1])
     result = diagnose([fit_log], calibration, [nominal])
     [refused] = [f for f in result.findings if f.made]
     assert not refused.accepted and "validation" in refused.reason

@@ -37,7 +37,7 @@ def bus(truth, tmp_path_factory):
     """The rig's CAN FD log at 500 Hz."""
     folder = tmp_path_factory.mktemp("foreign")
     foreignkit.write_rig(folder)
-    return foreignkit.write_log(folder / "stops.blf", foreignkit.sampled(truth, 500.0))
+    return foreignkit.write_log(folder / "stops.log", foreignkit.sampled(truth, 500.0))
 
 
 def test_long_frames_with_long_ids_are_decoded_whole(bus, truth):
@@ -245,7 +245,14 @@ _HEAD = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n"
     ("name", "content", "expected"),
     [
         ("a.csv", "time_s,angle_rad\n0,0\n", "current_A: no such column; the table has time_s, angle_rad"),
+        ("a.csv", "t,angle\n0,0\n", "time_s: no such column; the table has t, angle"),
+        (
+            "a.csv",
+            ",".join(["time_s", *map("x{}".format, range(98)), "angle_deg"]) + "\n0" + 99 * ",0",
+            "angle_rad: no such column; the table has angle_deg, ",
+        ),
         ("a.csv", _HEAD + "0,x,0,0,0,0\n", "expected a column of numbers"),
+        ("a.csv", _HEAD + ",1,0,0,0,0\n" * 9, "no value of angle_rad"),
         ("a.csv", "", "not readable"),
         (
             "a.csv",
@@ -296,7 +303,7 @@ def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
-    path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A"})
+    path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A", "plate_C": columns["plate_C"].astype(int)})
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
     motion = np.column_stack([columns["angle_rad"], columns["speed_rad_per_s"]])
     rest = {name: values for name, values in columns.items() if name not in ("angle_rad", "speed_rad_per_s", "force_N")}
@@ -309,6 +316,22 @@ def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
     (tmp_path / "mapping.yaml").write_text(mapping)
     path = _written(tmp_path / f"b{ending}", rest | cell | {"motion": motion.T})
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+
+
+class _Hostile:
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_nothing_that_a_numpy_file_holds_is_executed(tmp_path):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    path = _written(tmp_path / "a.npz", {"angle_rad": np.array([_Hostile(tmp_path / "executed")], object)})
+    with pytest.raises(InputError, match=r"not readable: .*pickle"):
+        load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    assert not (tmp_path / "executed").exists()
 
 
 def test_variables_that_are_no_table_are_refused(tmp_path):
@@ -341,7 +364,7 @@ def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):
     rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
     tool = 'Timestamp,2020-03-16 17:04:51,Unit,"V"\nInterval,0.004\n'
     (tmp_path / "a.csv").write_text("\n".join([tool + ",".join([*names, "time_s"]), *rows]))
-    (tmp_path / "b.csv").write_text("\n".join([",".join(["nan"] * 5 + ["inf", "0"]), *rows]))
+    (tmp_path / "b.csv").write_text("\n".join([",".join(["nan"] * 5 + ["inf", "0", "nan"]), *(row + ",nan" for row in rows)]))
     for name, mapping in (
         ("a", foreignkit.COLUMNS.replace("signal: time_s", "signal: column 1")),
         ("a", _by_place(names)),
@@ -350,6 +373,9 @@ def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):
         (tmp_path / "mapping.yaml").write_text(mapping)
         log = load_log(tmp_path / f"{name}.csv", read=Mapping(tmp_path / "mapping.yaml").read)
         _assert_same(log.samples, plain.samples)
+    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: column 8"))
+    with pytest.raises(InputError, match="column 8: no such column; the table has time_s"):
+        load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
     (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS)
     with pytest.raises(InputError, match="time_s: 2 such columns, of which `column N` is one by its place"):
         load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
@@ -372,6 +398,7 @@ def _by_place(names: list[str]) -> str:
     [
         ("{cells},0", "rows have 7 cells, the header names 6; the last are column 7"),
         ('"{number}",{cells}', ""),
+        ('"run no. {number}",{cells}', ""),
         ("{number},{cells}", ""),
         ("{cells},", ""),
     ],
@@ -401,7 +428,7 @@ def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, sa
             "x is a travel in mm, not the motor's angle; state `unit: rad`, and as `scale`",
         ),
         ("speed_rad_per_s, unit: rad/s", "v, unit: mm/s", "v is a travel in mm/s, not the motor's angle; state `unit: rad/s`"),
-        ("force_N, unit: N", "force_N, unit: stone", "unit 'stone' of force_N is unknown; state one of N, kN"),
+        ("force_N, unit: N", "force_N, unit: stone", "force_N is in 'stone'; expected N, kN"),
     ],
 )
 def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):

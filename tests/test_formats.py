@@ -138,10 +138,14 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("{signal: Actuator.Position}", "{signal: Inverter.Iq}", "mA, which cannot become rad"),
-        ("{signal: Actuator.Position}", "{signal: Climate.Nameless}", "no unit, which cannot become rad; state `unit:`"),
+        ("{signal: Actuator.Position}", "{signal: Inverter.Iq}", "Inverter.Iq is in 'mA'; expected rad, deg"),
+        (
+            "{signal: Actuator.Position}",
+            "{signal: Climate.Nameless}",
+            "is in no unit; expected rad, deg, °, mrad, rev, turn; state `unit:`",
+        ),
         ("{signal: Actuator.Position}", "{signal: Actuator.Place}", "no such message and signal"),
-        ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "unit 'furlong'"),
+        ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "is in 'furlong'; expected rad"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, value: 3.0}", "either signal"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, factor: 3.0}", "unknown key"),
         ("EMB_FL_Resolver.MotorAngle", "EMB_FL_ClampForce.ClampForce", "expected Message.Signal of what the daemon receives"),
@@ -186,8 +190,7 @@ def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path):
     mine = frames[frames["can_id"] == 0x18F533F4]
     words = (mine["data"] >> np.uint64(32) & np.uint64(0xFFFF)) * 0.01 - 5.0
     assert len(mine) == 3992 and np.ptp(words) > 50.0
-    mapping = Mapping(tmp_path / "mapping.yaml")
-    samples = load_log(path, read=mapping.read).samples
+    samples = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples
     expected = np.interp(samples["time_ns"], mine["time_ns"], words)
     assert len(samples) >= len(mine) - 1 and np.abs(samples["angle"] - expected).max() < 2e-3
 

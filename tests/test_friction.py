@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.models.torque import friction_state
+from emb_daemon.estimator import paths
+from emb_daemon.estimator.records import new_state
+from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, turned_back
 from emb_daemon.offline import estimate
 
 _PRESLIDING = 0.028
@@ -77,3 +79,40 @@ def test_friction_at_standstill_does_not_move_the_estimate_beyond_its_sigma(para
     estimates = estimate(rows, p)
     error = np.abs(estimates["force"] - force)[len(up) :]
     assert np.all(error < 2.0 * estimates["sigma"][len(up) :])
+
+
+def _shares(travels, dt=0.004):
+    """`turned_back` after each of the ways, rad."""
+    shares, direction = [0.0], 0.0
+    for travel in travels:
+        shares.append(turned_back(shares[-1], direction, travel, dt))
+        direction = travel or direction
+    return np.array(shares)
+
+
+def test_an_angle_that_is_noise_is_told_by_its_turning_back():
+    """That of a resolver, and of a noisy speed added up; not of a motor that swings ten times a second, or stands."""
+    random, time = np.random.default_rng(1), 0.004 * np.arange(2000)
+    counted, added_up = np.diff(random.normal(size=2000)), random.normal(size=2000)
+    for noise, share in ((counted, 2.0 / 3.0), (added_up, 0.5)):
+        shares = _shares(noise)[25:]
+        assert np.mean(shares) == pytest.approx(share, abs=0.03) and np.mean(shares > NOISE_TURNS_BACK) > 0.99
+    assert _shares(np.diff(np.sin(2.0 * np.pi * 10.0 * time))).max() < NOISE_TURNS_BACK
+    assert _shares(np.zeros(100)).max() == 0.0
+    one = _shares([1.0, 0.0, 0.0, -1.0, -1.0])
+    assert one[3] == 0.0 and one[4] == pytest.approx(0.08) and one[5] < one[4]
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+def test_friction_follows_of_a_noisy_angle_what_is_more_than_its_presliding(parameters, noisy):
+    s, p = new_state()[0], parameters[0]
+    s["turned_back"] = noisy
+    way = 0.9 * p["presliding_angle"]
+    slid = paths._slid(s, p, way, way, 0.004)
+    assert slid == pytest.approx(0.0 if noisy else way - paths.FLICKER_RAD)
+    s["turned_back"] = noisy
+    after = paths._slid(s, p, 3.0 * way, 2.0 * way, 0.004)
+    assert after == pytest.approx(3.0 * way - p["presliding_angle"] if noisy else 2.0 * way)
+    # One that stands has not forgotten which way it came.
+    paths._slid(s, p, 3.0 * way, 0.0, 0.004)
+    assert s["direction"] == 2.0 * way

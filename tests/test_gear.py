@@ -10,7 +10,7 @@ import yaml
 from emb_daemon.adapt.fit import fit_training
 from emb_daemon.adapt.records import ACCEPTED, TRAINING
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Calibration, Travel, to_parameters
 from emb_daemon.errors import InvalidValue
 from emb_daemon.estimator.monitor import LEAST_GAIN, MONITOR, MOST_GAIN, bound
@@ -19,7 +19,7 @@ from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import Pads, fit_dynamics, starting_point
 from emb_daemon.identify.example import FILES
-from emb_daemon.identify.steps.torque import TORQUE_CONSTANT, fit_torque
+from emb_daemon.identify.steps.torque import fit_torque
 from emb_daemon.logs.write import write_frames
 from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_spring, steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve

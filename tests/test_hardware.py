@@ -1,7 +1,6 @@
 """Machines that nobody here built: an actuator without pads, sensors without noise, and the converters of measured sets."""
 
-import importlib.util
-from pathlib import Path
+from types import SimpleNamespace
 
 import foreignkit
 import msgspec
@@ -9,9 +8,11 @@ import numpy as np
 import pytest
 
 import emb_daemon
-from emb_daemon.calibration.files import save_calibration
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
+from emb_daemon.calibration.types import Provenance
 from emb_daemon.cli.main import main
+from emb_daemon.diagnose import residuals
 from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
@@ -19,16 +20,9 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.errors import InputError
 from emb_daemon.logs import resample
+from emb_daemon.offline import load_log
 from emb_daemon.wire.contract import reason_words
-
-_TOOLS = Path(__file__).parent.parent / "tools"
-
-
-def _tool(name: str):
-    spec = importlib.util.spec_from_file_location(name, _TOOLS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from studies import hardware as study
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +124,35 @@ def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load()
     assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
 
 
+@pytest.mark.parametrize("own", ["direction", "speed", "acceleration"])
+def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(own):
+    """Though the load may follow the same: that of a mass does the acceleration."""
+    random = np.random.default_rng(1)
+    speed = np.convolve(random.normal(size=3000), np.ones(20), "same")
+    moved_by = {"direction": np.sign(speed), "speed": speed, "acceleration": np.diff(speed, prepend=speed[:1])}[own]
+    moved_by = moved_by / moved_by.std()
+
+    def explained(current, load):
+        samples = {"speed": speed, "current_q": current, "has_current": np.ones(len(current), bool)}
+        return residuals._explained([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
+
+    current, load = (moved_by + 0.1 * random.normal(size=len(speed)) for _ in range(2))
+    assert explained(current, load) < 0.01
+    assert explained(current, moved_by + 3.0 * current) > 0.99
+    assert explained(np.full(len(speed), 1.3), load) == 0.0
+
+
+def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measured():
+    """And where a measured load tells it."""
+    priors = []
+    for load, provenance in ((1.0, None), (1.0, Provenance(date="", tool="")), (0.1, None)):
+        stated, _, fit, _ = _on_a_dynamometer(scatter=0.9, load=load)
+        bench = Bench([fit], msgspec.structs.replace(stated, provenance=provenance))
+        priors += [c.prior for c in Model.of(bench).values if c.name == TORQUE_CONSTANT]
+    free, measured, untold = priors
+    assert free == pytest.approx(10.0 * measured) and untold == measured
+
+
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
     stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
     found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A
@@ -172,7 +195,7 @@ def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():
 
 
 def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):
-    tool, rows = _tool("cranfield_to_log"), []
+    tool, rows = study.tool("cranfield_to_log"), []
     clock = np.arange(0.0, 16.0, 0.04)
     position = np.clip(np.where(clock < 8.0, 20.0 + 24.0 * clock, 140.0 - 24.0 * (clock - 8.0)), 20.0, 140.0)
     direction = np.sign(np.gradient(position))
@@ -182,10 +205,36 @@ def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_p
         rows += [f"{p},0.0,{i},trap,{load},1,0,1,{t}" for p, i, t in zip(position, current, clock, strict=True)]
     header = "set_point,position_error,current,profile,load,run,fault_type,group,time"
     (tmp_path / "normal.csv").write_text("\n".join([header, *rows]))
-    spec = importlib.util.spec_from_file_location("hardware", _TOOLS.parent / "studies" / "hardware.py")
-    study = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(study)
     found = {load: study.passes(part, load)[0] for (load, _), part in tool.read(tmp_path / "normal.csv").items()}
     force = {load: np.average(pairs[:, study.FORCE], weights=pairs[:, study.WEIGHT]) for load, pairs in found.items()}
     constant = tool.NOMINAL_CONSTANT / tool.GEAR_GAIN_M_PER_RAD
     assert force == pytest.approx({load: 0.005 * load * constant for load in (20, 40)}, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "sign", "constant"),
+    [
+        ("embir", "time [s],a1 velocity [rad/s],a1 q-axis [A],trd605-18 torque [Nm],a1 position [rad]", 1.0, 0.0575),
+        ("tmotor", "loop_time,motor_measured_speed,motor_measured_current,adc_measured_torque", -1.0, 0.945),
+    ],
+)
+def test_a_run_of_a_test_stand_is_written_whole_and_in_halves(tmp_path, capsys, name, columns, sign, constant):
+    tool, out = study.tool(f"{name}_to_log"), tmp_path / "out"
+    time_s = 0.01 * np.arange(400)
+    speed, current = 20.0 * np.sin(3.0 * time_s), 2.0 * np.cos(time_s)
+    table = np.column_stack([time_s, speed, current, 0.9 * current, 20.0 / 3.0 * (1.0 - np.cos(3.0 * time_s))])
+    rows = [",".join(map(str, row[: columns.count(",") + 1])) for row in table]
+    (tmp_path / "run.csv").write_text("\n".join(["# kt_1 = 0.0575", columns, *rows]))
+    assert tool.main([str(tmp_path / "run.csv"), "--output", str(out)]) == 0
+    run, first, second = (load_log(out / f"{part}.log") for part in ("run", "first_half", "second_half"))
+    assert len(first.samples) == pytest.approx(len(run.samples) / 2, abs=3) == pytest.approx(len(second.samples), abs=3)
+    assert first.time_ns[-1] < second.time_ns[0]
+    load = sign * 0.9 * 2.0 * np.cos(run.time_s) / tool.GEAR_GAIN_M_PER_RAD
+    assert np.nanmax(np.abs(run.force_N - load)[5:]) < 30.0
+    assert np.abs(run.samples["speed"] - 20.0 * np.sin(3.0 * run.time_s))[5:-5].max() < 0.5
+    started = load_calibration(out / "calibration.yaml")
+    assert started.motor.torque_constant_Nm_per_A == constant and started.provenance is None
+    assert not started.contact.is_in_reach and started.friction.load_m_per_rad == 0.0
+    (tmp_path / "other.csv").write_text("x,y\n0,0\n")
+    assert tool.main([str(tmp_path / "other.csv"), "--output", str(out)]) == 2
+    assert f"{tmp_path / 'other.csv'}: " in capsys.readouterr().err

@@ -4,22 +4,35 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
+import foreignkit
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
+import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
-from emb_daemon.identify.dynamics import DELAY, OPTIONAL, CurveFit, DynamicsFit, fit_dynamics, regress_free, starting_point
-from emb_daemon.identify.steps import attribution, noise, stiffness
+from emb_daemon.identify.dynamics import (
+    DELAY,
+    OPTIONAL,
+    CurveFit,
+    DynamicsFit,
+    Pads,
+    errors_unseen,
+    fit_dynamics,
+    regress_free,
+    starting_point,
+)
+from emb_daemon.identify.steps import attribution, noise, stiffness, torque
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import log_of
+from emb_daemon.offline.run import run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
@@ -172,6 +185,26 @@ def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
     assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
 
 
+def test_errors_of_a_fit_are_of_what_it_has_not_seen():
+    """Of random logs the second halves, of slow ones all; with the delay of the reference instrument, here two samples."""
+    known = foreignkit.calibration()
+    clearance, logs = known.contact.clearance_rad, []
+    for angle in (foreignkit.slow(), foreignkit.random(seconds=8.0)):
+        truth = foreignkit.truth(angle)
+        time_s, angle, speed, force = (column[::8] for column in (truth.time_s, truth.angle, truth.speed, truth.force))
+        late = np.roll(force, 2)
+        late[: len(late) // 2] += 1000.0
+        late[-200:-100] = np.nan
+        logs.append(emb_daemon.log_of_arrays(time_s, angle, speed, force_N=late))
+    fit = SimpleNamespace(calibration=known, curves=[SimpleNamespace(clearances_rad=np.full(2, clearance))])
+    groups = [Pads(known.pad_thickness_mm, tuple(logs))]
+    (slow, _), (random, force) = errors_unseen(groups, fit, 0.008)
+    assert rmse(slow) == pytest.approx(1000.0 * np.sqrt(0.5), rel=0.02)
+    assert len(random) == len(force) == pytest.approx(1000 - 95, abs=8) and np.isfinite(random).all()
+    [(alone, _)] = errors_unseen(groups, fit, 0.008, slow=False)
+    assert np.array_equal(alone, random) and rmse(random) < 0.2 * rmse(errors_unseen(groups, fit)[1][0])
+
+
 def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():
     """A gear whose gain follows what the brake has done shows it on no cold log: the filter would trust the torque."""
     found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
@@ -194,7 +227,7 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
     assert density == pytest.approx(0.5 * 1.0, rel=0.3)
 
 
-def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
+def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monkeypatch):
     """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
@@ -212,6 +245,16 @@ def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current():
     cold, hot = (rmse(unexplained_current(log, found, known, hot=hot).current_A) for hot in (False, True))
     plain = rmse(unexplained_current(drive({}), found, calibration).current_A)
     assert cold > 3.0 * plain and hot < 1.3 * plain
+
+    def lost(samples, parameters):
+        trace = run_step(samples, parameters)
+        trace["torque"][::2] = np.nan
+        return trace
+
+    # As where the zero of the angle was lost.
+    monkeypatch.setattr(torque, "run_step", lost)
+    assert rmse(unexplained_current(log, found, known, hot=True).current_A) == pytest.approx(hot, rel=0.1)
+    assert np.isfinite(unexplained_current(log, found, known, hot=True).current_A).all()
 
 
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():

@@ -20,12 +20,12 @@ def _strokes(seconds=3.0):
     return (lambda t: 10.0 * (1.0 - np.cos(9.0 * t)) * (t > 0.0)), (lambda t: 90.0 * np.sin(9.0 * t) * (t > 0.0))
 
 
-def _signals(late_s=0.0, gain=1.0, speed_late_s=0.0, seconds=3.0, seed=1):
-    """Angles (rad) and speeds (rad/s) as they are sampled."""
+def _signals(late_s=0.0, gain=1.0, speed_late_s=0.0, seconds=3.0, seed=1, size=1.0):
+    """Angles (rad) and speeds (rad/s) as they are sampled, of strokes ``size`` times as long."""
     angle, speed = _strokes()
     time, rng = np.arange(0.0, seconds, _DT), np.random.default_rng(seed)
-    angles = np.round(gain * angle(time - late_s) / _COUNT) * _COUNT
-    return angles, speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
+    angles = np.round(size * gain * angle(time - late_s) / _COUNT) * _COUNT
+    return angles, size * speed(time - speed_late_s) + 0.3 * rng.standard_normal(len(time))
 
 
 def _follow(a, angles, speeds):
@@ -58,8 +58,10 @@ def test_no_angle_is_older_than_the_oldest():
     assert _age(late_s=0.016) == 0.015
 
 
-def test_one_stroke_tells():
-    assert _age(late_s=0.004, seconds=0.8) == pytest.approx(0.004, rel=0.2)
+@pytest.mark.parametrize("size", [1.0, 0.25])
+def test_one_stroke_tells(size):
+    """Also a gentle one, of 5 rad at up to 22 rad/s."""
+    assert _age(late_s=0.004, seconds=0.8, size=size) == pytest.approx(0.004, rel=0.2)
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.02])

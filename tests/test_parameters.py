@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_daemon.adapt.records import to_limits
+from emb_daemon.calibration import parameters
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import keys, moved, parameter, value_of
+from emb_daemon.calibration.parameters import in_words, keys, moved, parameter, value_of
 from emb_daemon.calibration.types import Adaptation, Calibration, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
@@ -180,3 +181,16 @@ def test_what_is_no_number_is_declared():
     assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "terms", "provenance"}
     assert {field for field in Adaptation.__struct_fields__ if f"adaptation.{field}" not in _KEYS} == {
         "enabled", "samples_per_range", "high_force_N"}  # fmt: skip
+
+
+def test_a_key_ends_with_its_unit_and_is_told_without():
+    """Parameters of effects state theirs beside, too."""
+    stated = {p.name: p.unit for effect in REGISTRY for p in effect.parameters}
+    assert {name: parameters._unit(name) for name in stated} == stated
+    keys_in_words = {
+        "thermal.disc.cooling_per_speed_J_per_rad_K": "cooling per speed",
+        "thermal.softening.per_K": "softening",
+        "order_2_cosine_um": "order 2 cosine",
+        "share": "share",
+    }
+    assert {key: in_words(key) for key in keys_in_words} == keys_in_words

@@ -179,6 +179,7 @@ def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
         (360.0, "360, with `unit: deg`"),
         (1.0, "1, with `unit: rev`"),
         (4096.0, "4096 counts in a turn? `unit: rev`, `scale: 0.000244140625`, `period: 4096`"),
+        (64.0, "Then state its `period`\n"),
     ],
 )
 def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_turn, said):
@@ -186,6 +187,14 @@ def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_t
     turns = 3.0 * columns["angle_rad"] / (2.0 * np.pi)
     _read(tmp_path, columns | {"angle_rad": per_turn * (turns % 1.0)})
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("unit", ["deg", "rev"])
+def test_counts_that_were_mapped_as_another_unit_are_counts(tmp_path, capsys, unit):
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS).replace("angle_rad, unit: rad", f"angle_rad, unit: {unit}")
+    _read(tmp_path, columns | {"angle_rad": np.rint(5e4 * columns["angle_rad"])}, mapping)
+    assert "counts of an encoder? Then `unit: rev`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("rate_Hz", [50.0, 250.0])

@@ -309,10 +309,8 @@ extend(effect)
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.offline.run import held, run_step
-samples = np.load(sys.argv[2])
-for calibration in sys.argv[3:5]:
-    trace = run_step(samples, held(to_parameters(load_calibration(calibration))))
-    np.save(calibration + ".npy", np.stack([trace[name] for name in ("force", "torque", "leverage")]))
+trace = run_step(np.load(sys.argv[2]), held(to_parameters(load_calibration(sys.argv[3]))))
+np.save(sys.argv[3] + ".npy", np.stack([trace[name] for name in ("force", "torque", "leverage")]))
 """
 
 
@@ -332,24 +330,24 @@ for calibration in sys.argv[3:5]:
 )  # fmt: skip
 def test_an_exported_effect_is_the_term(term, calibration, tmp_path):
     """By the command, in the form of a file of one's own: the estimator with it gives what it gives with the term."""
-    shipped = tmp_path / "term.yaml"
-    own = tmp_path / "effect.yaml"
+    shipped, own = tmp_path / "term.yaml", tmp_path / "effect.yaml"
     plain = msgspec.structs.replace(calibration, provenance=None)
-    shipped.write_text(dump_calibration(msgspec.structs.replace(plain, terms=(term,))))
+    termed = msgspec.structs.replace(plain, terms=(term,))
+    shipped.write_text(dump_calibration(termed))
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
         assert main(["effect", "export", str(shipped), "term:x", "--output", str(tmp_path / "found.py")]) == 0
     own.write_text(dump_calibration(plain).replace("effects: {}\n", "") + out.getvalue().partition("\n")[2])
     np.save(tmp_path / "samples.npy", drive(1.5))
-    files = [tmp_path / "found.py", tmp_path / "samples.npy", shipped, own]
+    files = [tmp_path / "found.py", tmp_path / "samples.npy", own]
     # As plain Python: compiling the estimator anew for one effect more would take longer than everything else here.
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", _REPLAYED, *files], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    found, expected = (np.load(f"{file}.npy") for file in (own, shipped))
-    plainly = run_step(drive(1.5), held(to_parameters(plain)))
-    names = ("force", "torque", "leverage")
-    assert any(np.nanmax(np.abs(row - plainly[name])) > 1e-9 for row, name in zip(found, names, strict=True))
+    found = np.load(f"{own}.npy")
+    traces = (run_step(drive(1.5), held(to_parameters(one))) for one in (plain, termed))
+    without, expected = (np.stack([trace[name] for name in ("force", "torque", "leverage")]) for trace in traces)
+    assert any(np.nanmax(np.abs(rows)) > 1e-9 for rows in found - without)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 

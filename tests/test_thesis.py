@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from synthetic_rig import datasheet, draw, pads
 
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.steps.heat import thermal_parameters
-from emb_daemon.identify.steps.torque import INERTIA, LOAD, OFFSET, TORQUE_CONSTANT
 from studies.frequency import fit_first_order, phasor, steady_rows
 from studies.thesis import best_fit_line, moving_window, regress_damping, regress_torque
 from studies.thesis_pad import thesis_nodes, thesis_profiles
@@ -49,10 +49,10 @@ def test_friction_by_sign_is_found_where_friction_jumps():
     moved = np.maximum.accumulate(np.where(step != 0.0, np.arange(len(angle)), 0))
     sign, mean = np.sign(step[moved]), np.r_[0.0, 0.5 * (force[1:] + force[:-1])]
     second = np.r_[0.0, 0.0, angle[2:] - 2.0 * angle[1:-1] + angle[:-2]] / 0.004**2
-    torque = gear_gain * mean + t[INERTIA] * second + (t[OFFSET] + t[LOAD] * mean) * sign
+    torque = gear_gain * mean + t[INERTIA] * second + (t[OFFSET_FRICTION] + t[LOAD_FRICTION] * mean) * sign
     log.samples["current_q"] = torque / constant
     found = regress_torque([log], datasheet(constant, t[INERTIA])).values
-    expected = {key: t[key] for key in (TORQUE_CONSTANT, INERTIA, OFFSET, LOAD)}
+    expected = {key: t[key] for key in (TORQUE_CONSTANT, INERTIA, OFFSET_FRICTION, LOAD_FRICTION)}
     assert {key: found[key] for key in expected} == pytest.approx(expected, rel=1e-6)
 
 

@@ -5,8 +5,8 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import fuse, uneven
-from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator import fuse, step, uneven
+from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.status import DISC_UNEVEN
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE, PULSE_MODULO, PULSES_PER_TURN
@@ -256,16 +256,42 @@ def test_a_disc_is_told_while_it_is_not_sure(p, share, told):
     assert bool(fuse._facts_of_torque(s, p) & DISC_UNEVEN) == told
 
 
-@pytest.mark.parametrize("stands", ["", "motor", "wheel"])
-def test_only_a_motor_that_moves_on_a_turning_disc_teaches(p, stands):
-    rows, state = _stops(p, 12.0, 0.0)[0], new_state()
-    # To the top of the second stop, and what follows.
-    top = _STOP + 425
-    estimate(rows[:top], p.reshape(1), state)
-    before, rows = state["uneven"]["amplitude"].copy(), rows[top : top + 125].copy()
-    if stands == "motor":
-        rows["angle"] = state["angle"]
-    elif stands == "wheel":
-        rows["wheel_speed"] = 0.0
-    estimate(rows, p.reshape(1), state)
-    assert np.any(state["uneven"]["amplitude"] != before) == (not stands)
+def _touching(p):
+    """State of a brake whose pads are about to touch a disc that adds 100 N, and a sample of a motor that moves on it."""
+    state, row = new_state(), brake.samples(p, np.array([0.0, 0.1]))[0][1]
+    s = state[0]
+    step._start(s, p, row)
+    row["angle"], row["wheel_speed"] = 0.2, _TURNING
+    u = s["uneven"]
+    u["amplitude"][0], u["force"][0], u["shift"], u["share"], u["log_odds"] = 1e-5, 1e7, 100.0, 1.0, 20.0
+    u["covariance"] = np.diag([1e-12] * uneven.STATES)
+    return s, row
+
+
+def _take(s, p, m, torque, trusted=True):
+    """One torque (N m) at 1 kN; returns what of it nothing explains, N."""
+    out = np.zeros(1, ESTIMATE)[0]
+    fuse._take_torque(s, p, m, torque, p["gear_gain"], 1000.0, 0.0, 10.0, 0.0, trusted, False, out)
+    return float(out["innovation"])
+
+
+def test_what_an_uneven_disc_explains_is_asked_of_nothing_else(p):
+    s, m = _touching(p)
+    before = s["error"].copy(), s["uneven"]["amplitude"].copy()
+    assert _take(s, p, m, 1100.0 * p["gear_gain"]) == pytest.approx(0.0, abs=1e-6)
+    assert s["error"] == pytest.approx(before[0], abs=1e-9) and s["uneven"]["amplitude"] == pytest.approx(before[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("what", ["nothing", "motor stands", "wheel stands", "fault", "jump suspected"])
+def test_only_a_motor_that_moves_on_a_turning_disc_teaches(p, what):
+    """And a sound one: what a sensor's fault or a brake that has jumped does to the torque is no disc's."""
+    s, m = _touching(p)
+    if what == "motor stands":
+        m["angle"] = s["angle"]
+    elif what == "wheel stands":
+        m["wheel_speed"] = 0.0
+    elif what == "jump suspected":
+        s["alternatives"]["log_odds"][0] = 50.0
+    before = s["uneven"]["amplitude"].copy()
+    _take(s, p, m, 1200.0 * p["gear_gain"], trusted=what != "fault")
+    assert np.any(s["uneven"]["amplitude"] != before) == (what == "nothing")

@@ -250,6 +250,17 @@ def test_a_repeated_frame_is_refused_and_the_next_taken(heard):
     assert _receive(_resolver(2, 12 * MS), heard)[1] == ACCEPTED
 
 
+@pytest.mark.parametrize(
+    ("counter", "angle", "later_ms", "contested"),
+    [(1, 2.0, 0.1, True), (1, 1.0, 0.1, False), (2, 2.0, 0.1, False), (1, 2.0, 4.0, False)],
+)
+def test_who_says_something_else_with_the_last_counter_contests_it(heard, counter, angle, later_ms, contested):
+    """Within a cycle; a frame that comes twice, or comes when another is due, is no contradiction."""
+    later_ns = round((4.0 + later_ms) * MS)
+    _receive(_resolver(counter, later_ns, angle=angle), heard)
+    assert (heard[0]["contested_ns"] == later_ns) == contested
+
+
 def test_a_sender_that_repeats_itself_for_ever_is_never_believed(heard):
     for cycle in range(2, 200):
         assert _receive(_resolver(1, 4 * MS * cycle, angle=9.0), heard)[1] == BAD_COUNTER

@@ -41,6 +41,7 @@ from emb_daemon.adapt.pairs import (
     turned_angles,
 )
 from emb_daemon.calibration.parameters import (
+    INERTIA,
     LOAD_FRICTION,
     OFFSET_FRICTION,
     PRESLIDING_ANGLE,
@@ -60,7 +61,6 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
 _CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
-INERTIA = "motor.inertia_kg_m2"
 #: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
 #: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3

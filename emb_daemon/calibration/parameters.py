@@ -46,10 +46,16 @@ _UNITS = {
     "J_per_kgK": "J/(kg·K)",
     "J_per_rad_K": "J/(rad·K)",
     "J_per_rad_m2K": "J/(rad·m²·K)",
+    "um_per_MJ": "µm/MJ",
+    "um_per_K": "µm/K",
+    "Nms_per_rad": "N·m·s/rad",
+    "per_A2": "1/A²",
     "per_K": "1/K",
+    "per_turn": "1",
     "Nm": "N·m",
     "Hz": "Hz",
     "mm": "mm",
+    "um": "µm",
     "m2": "m²",
     "rad": "rad",
     "A": "A",
@@ -236,6 +242,14 @@ def _bounds(names: tuple[str, ...]) -> tuple[float, float, float]:
                 usual = max(usual, (meta.extra or {}).get("usual", 0.0))
         kind = typing.get_args(kind)[0]
     return low, high, usual
+
+
+def in_words(key: str) -> str:
+    """What a key is of, without its unit: of ``thermal.softening.per_K`` softening."""
+    *path, name = key.split(".")
+    while not (left := _UNIT.sub("", name)) and path:
+        name = path.pop()
+    return left.replace("_", " ")
 
 
 def _unit(key: str) -> str:

@@ -9,7 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import parameter, value_of
+from emb_daemon.calibration.parameters import (
+    CLEARANCE,
+    INERTIA,
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    TORQUE_CONSTANT,
+    parameter,
+    value_of,
+)
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
@@ -56,15 +65,14 @@ class Coordinate:
 
 Values = Mapping[Coordinate, float]
 
-TORQUE_CONSTANT = "motor.torque_constant_Nm_per_A"
 #: Base parameters, the channel that shows them, and how well they are known: standard deviation over their size.
 _BASE = (
     ("stiffness.relaxation_time_s", "stiffness", 0.5),
     (TORQUE_CONSTANT, "torque", 0.03),
-    ("motor.inertia_kg_m2", "torque", 0.5),
-    ("friction.load_m_per_rad", "torque", 0.5),
-    ("friction.offset_Nm", "torque", 1.0),
-    ("friction.presliding_angle_rad", "torque", 1.0),
+    (INERTIA, "torque", 0.5),
+    (LOAD_FRICTION, "torque", 0.5),
+    (OFFSET_FRICTION, "torque", 1.0),
+    (PRESLIDING_ANGLE, "torque", 1.0),
     ("thermal.pad.conductivity_W_per_mK", "temperature", 0.15),
     ("thermal.pad.contact_conductance_W_per_m2K", "temperature", 0.5),
     ("thermal.pad.gap_conductance_W_per_m2K", "temperature", 0.5),
@@ -100,7 +108,7 @@ _SHAPE = 0.5
 def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], stated: bool = False) -> list[Coordinate]:
     """Coordinates of the base calibration; the contact angle has one for each log, about its clearance. ``stated``: the torque
     constant is a supplier's, and a measured load tells it."""
-    clearance = parameter(calibration, "contact.clearance_rad")
+    clearance = parameter(calibration, CLEARANCE)
     moves = (Move(clearance.key, 1.0, 0.0, np.inf),)
     result = [
         Coordinate(clearance.key, "stiffness", start, clearance.step, _CLEARANCE_RAD, moves, unit="rad", log=log)

@@ -124,12 +124,8 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
         section.text(f"Placebo: with {text} the same term reaches {100 * share:.0f} % of this gain.")
     section.table(
         ["parameter", "value", "unit"],
-        [[n, number(v, finding.sigmas.get(n, 0.0)), _unit(finding, n)] for n, v in finding.values.items()],
+        [[n, number(v, finding.sigmas.get(n, 0.0)), finding.effect.parameter(n).unit] for n, v in finding.values.items()],
     )
-
-
-def _unit(finding: Candidate, name: str) -> str:
-    return next((p.unit for p in finding.effect.parameters if p.name == name), "")
 
 
 def _left(report: Page, diagnosis: Diagnosis) -> None:

@@ -1,5 +1,6 @@
 """The verdict in words, for terminal and page."""
 
+from emb_daemon.calibration.parameters import in_words
 from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
@@ -17,11 +18,6 @@ _PORTS = {
 _TOLD = 3
 #: Change of the curve's force from which other pads are a better guess than wear of these: units scatter by less.
 _OTHER_PADS = 0.1
-#: Units at the end of parameters' keys, longest first.
-_UNIT_ENDINGS = (
-    "_um_per_MJ", "_um_per_K", "_Nms_per_rad", "_Nm_per_A", "_m_per_rad", "_rad_per_s", "_per_turn", "_per_A2", "_kg_m2",
-    "_per_K", "_rad", "_um", "_Nm", "_m2", "_A", "_C", "_s",
-)  # fmt: skip
 NAMES = {
     "stiffness": "stiffness path",
     "torque": "torque path",
@@ -47,27 +43,19 @@ def title(finding: Candidate) -> str:
 def size(finding: Candidate) -> str:
     """The parameters that say how large an effect is, with units."""
     found = amplitudes(finding)
-    parts = [f"{_spoken(name)} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
+    parts = [f"{in_words(name)} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
     for parameter in finding.effect.parameters:
         name = parameter.name
         if "cosine" in name or "sine" in name or name not in finding.values:
             continue
         value = number(finding.values[name], finding.sigmas.get(name, 0.0))
         before = f"{finding.before[name]:.3g} → " if name in finding.before else ""
-        parts.append(f"{_spoken(name)} {before}{value} {_unit(parameter.unit)}")
+        parts.append(f"{in_words(name)} {before}{value} {_unit(parameter.unit)}")
     return ", ".join(part.strip() for part in parts)
 
 
 def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
-
-
-def _spoken(name: str) -> str:
-    """A parameter's key without the unit at its end."""
-    for ending in _UNIT_ENDINGS:
-        if name.endswith(ending):
-            return name.removesuffix(ending).replace("_", " ")
-    return name.replace("_", " ")
 
 
 def verdict(diagnosis: Diagnosis) -> str:
@@ -101,9 +89,7 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
         parts.append((max(r.gain for r in curve), f"stiffness scale {100.0 * change:+.1f} %{guess}"))
     for key, r in diagnosis.recalibrated.items():
         if UNITS[r.channel] == "N" and not key.startswith("stiffness.curves"):
-            parts.append(
-                (r.gain, f"{_spoken(key.rpartition('.')[2])} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}")
-            )
+            parts.append((r.gain, f"{in_words(key)} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}"))
     if not parts:
         return []
     told = [f"{text.strip()} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]

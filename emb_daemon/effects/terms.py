@@ -10,6 +10,7 @@ from math import cos, exp, hypot, sin, sqrt
 import numpy as np
 
 from emb_daemon.jit import fields, njit
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Most terms of one calibration.
 MOST = 4
@@ -56,8 +57,8 @@ _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(le
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 _THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE = range(4)
 
-#: Clamp force (N) from which the brake counts as clamped, and disc speed (rad/s) from which the disc turns.
-CLAMPED_N, TURNING_RAD_PER_S = 150.0, 0.5
+#: Clamp force from which the brake counts as clamped, N.
+CLAMPED_N = 150.0
 
 TERM = np.dtype(
     [

@@ -53,7 +53,6 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
     torque_offset,
 )
-from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
@@ -82,6 +81,7 @@ from emb_daemon.models.plausibility import (
     force_of_torque_alone,
     hold,
 )
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Motor torque over what the calibration's torque constant makes of the current, at least: half of what the monitor grants;
 #: and age of the torque path's last word, s, from which the force rests on stiffness alone: half of `SILENCE_S`.

@@ -7,9 +7,10 @@ import numpy as np
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
-from emb_daemon.estimator.wheel import TURNING_RAD_PER_S, disc_speed
+from emb_daemon.estimator.wheel import disc_speed
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Clamp force from which pads and disc exchange heat by contact, N.

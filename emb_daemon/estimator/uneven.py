@@ -12,10 +12,9 @@ from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.wheel import TURNING_RAD_PER_S
 from emb_daemon.jit import njit
 from emb_daemon.models.stiffness import first_order_lag
-from emb_daemon.models.wheel import WHEEL, track
+from emb_daemon.models.wheel import TURNING_RAD_PER_S, WHEEL, track
 
 #: Orders that discs commonly have, and cosine and sine of each.
 ORDERS = 2

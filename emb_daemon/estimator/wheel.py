@@ -5,10 +5,11 @@ from math import exp, pi
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
-#: Speed above which a wheel turns, rad/s, and a vehicle moves, m/s: sensors' noise at standstill stays below.
-TURNING_RAD_PER_S, _MOVING_M_PER_S = 0.5, 0.5
+#: Speed above which a vehicle moves, m/s, as of a wheel.
+_MOVING_M_PER_S = 0.5
 #: Time over which pulses are counted into a speed, s.
 _COUNTED_S = 0.25
 #: Pulses that a wheel which is said to stand may still give: it comes to rest.

@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.calibration.fields import NonNegative, Positive, Struct
+from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT
 from emb_daemon.calibration.types import CONSTANT_GEAR, Travel
 from emb_daemon.wire.contract import PULSES_PER_TURN
 
@@ -201,9 +202,6 @@ class Datasheet(Struct, kw_only=True):
         """Value that the supplier states for a key of the calibration, and its relative tolerance."""
         actuator = self.actuator
         return {
-            "motor.torque_constant_Nm_per_A": (
-                actuator.motor_torque_constant_Nm_per_A,
-                actuator.motor_torque_constant_tolerance,
-            ),
-            "motor.inertia_kg_m2": (actuator.lumped_inertia_kg_m2, actuator.lumped_inertia_tolerance),
+            TORQUE_CONSTANT: (actuator.motor_torque_constant_Nm_per_A, actuator.motor_torque_constant_tolerance),
+            INERTIA: (actuator.lumped_inertia_kg_m2, actuator.lumped_inertia_tolerance),
         }[key]

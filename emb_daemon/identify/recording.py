@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.heat import TOUCHING_N, TURNING_RAD_PER_S
+from emb_daemon.estimator.heat import TOUCHING_N
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, friction_power, heat_step, mean_temperature
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import Log
 
 #: Step of the grid by what a log is shorter than, both s: fine enough for what a log of that length does.

@@ -32,8 +32,7 @@ def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray
         raise InputError(f"{path}: not readable: {text}") from None
     columns: dict[str, np.ndarray] = {}
     for name, variable in variables.items():
-        if not name.startswith("__"):
-            _add(columns, name, np.asarray(variable))
+        _add(columns, name, np.asarray(variable))
     return columns
 
 

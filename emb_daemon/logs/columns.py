@@ -44,8 +44,8 @@ def crc_is_right(frames):
 
 
 @cache
-def _database(dbc: str):
-    """Parsing a DBC takes as long as replaying half a minute."""
+def shipped_database(dbc: str):
+    """A cantools database; parsing one takes as long as replaying half a minute."""
     return load_database(resource(dbc))
 
 
@@ -53,7 +53,7 @@ class Decoder:
     """Whole columns out of FRAME arrays, by message and signal name of a DBC."""
 
     def __init__(self, dbc: str = "dbc/emb.dbc"):
-        self._database = _database(dbc)
+        self._database = shipped_database(dbc)
 
     def can_id(self, message: str) -> int:
         return self._database.get_message_by_name(message).frame_id

@@ -22,7 +22,7 @@ from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
-from emb_daemon.wire.units import TRAVELS, UNITS
+from emb_daemon.wire.units import TRAVELS, UNITS, conversion
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
@@ -195,15 +195,10 @@ class Mapping:
                 f"{mapped.signal} is a travel in {unit}, not the motor's angle; state `unit: {ours.unit}`, and as `scale` the "
                 "radians that the motor turns for one of them: 6.283 over the travel in a turn (a screw's lead)",
             )
-        if unit not in UNITS:
-            fitting = ", ".join(known for known, (target, *_) in UNITS.items() if known and target == (ours.unit or ""))
-            return self._fault(name, f"unit {unit!r} of {mapped.signal} is unknown; state one of {fitting}")
-        target, factor, shift = UNITS[unit]
-        if target != (ours.unit or ""):
-            hint = "" if unit else "; state `unit:`"
-            return self._fault(
-                name, f"{mapped.signal} is in {unit or 'no unit'}, which cannot become {ours.unit or 'a number'}{hint}"
-            )
+        try:
+            factor, shift = conversion(unit, ours.unit or "")
+        except InputError as error:
+            return self._fault(name, f"{mapped.signal} {error}{'' if unit else '; state `unit:`'}")
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)

@@ -7,16 +7,15 @@ stays the only way into the estimator.
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
-from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest
-from emb_daemon.resources import resource
+from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest, shipped_database
 from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import CORNERS, load_database, signal_columns
+from emb_daemon.wire.layout import CORNERS, signal_columns
 
 #: Deviation of a rig's sampling period from ours up to which its samples are taken as they are.
 _SAME_PERIOD = 0.05
@@ -293,9 +292,10 @@ def _mean(first: Series | float, second: Series | float) -> Series | float:
     return 0.5 * (first + second)
 
 
+@cache
 def our_messages() -> dict[str, tuple]:
     """cantools message and its database by name, of what the daemon receives and sends and what rigs add."""
-    databases = (load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc")))
+    databases = (shipped_database("dbc/emb.dbc"), shipped_database("dbc/rig.dbc"))
     return {message.name: (message, database) for database in databases for message in database.messages}
 
 

@@ -131,7 +131,7 @@ def _place(name: str, names: list[str]) -> int | None:
     if names.count(name) == 1:
         return names.index(name)
     place = _BY_PLACE.fullmatch(name)
-    return int(place[1]) - 1 if place and not names.count(name) and int(place[1]) <= len(names) else None
+    return int(place[1]) - 1 if place and int(place[1]) <= len(names) else None
 
 
 def _some(wanted: str, names: list[str]) -> str:
@@ -223,7 +223,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     if len(cells) - len(first) == 1 and not cells[-1]:
         cells.pop()
     elif len(first) > len(cells):
-        cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units : header + 2 + units])
+        cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units])
     odd = []
 
     def leave_out(row) -> str:
@@ -256,15 +256,15 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     return table
 
 
-def _with_nameless(path: Path, names: list[str], rows: list[list[str]], lines: list[str]) -> list[str]:
-    """Names of a table whose rows have more cells than its header: a first column that counts or names the rows, as R and
-    pandas write it, has none; else the last ones have none."""
+def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: str) -> list[str]:
+    """Names of a table whose rows, ``line`` the first of them, have more cells than its header: a first column that counts or
+    names the rows, as R and pandas write it, has none; else the last ones have none."""
     more = len(rows[0]) - len(names)
     if more == 1 and not rows[0][-1]:
         return [*names, ""]
     counts = [row[0] for row in rows if row]
-    numbered = len(counts) > 1 and counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
-    if more == 1 and (numbered or lines[0].lstrip().startswith('"')):
+    numbered = counts in ([str(n) for n in range(first, first + len(counts))] for first in (0, 1))
+    if more == 1 and (numbered or line.lstrip().startswith('"')):
         return ["", *names]
     last = ", ".join(f"column {len(names) + n + 1}" for n in range(more))
     print(f"{path}: rows have {len(rows[0])} cells, the header names {len(names)}; the last are {last}", file=sys.stderr)

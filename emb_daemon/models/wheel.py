@@ -7,6 +7,8 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
+#: Speed above which a wheel turns, rad/s: sensors' noise at standstill stays below.
+TURNING_RAD_PER_S = 0.5
 #: Share of the difference between count and carried angle that a new count corrects: the count is coarse, the speed drifts.
 _CORRECTION = 0.2
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.logs.columns import References, latest
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
 _MOVING = 5.0
 #: Reference force (N) below which the pads hang in the clearance.
 _CLEARANCE_N = 100.0
-#: Wheel speed (rad/s) above which the disc turns, and surface temperature (degC) above which the pads are hot.
-_TURNING = 0.5
+#: Surface temperature (degC) above which the pads are hot.
 _HOT_C = 100.0
 
 #: Force path: its column of ESTIMATE.
@@ -67,7 +67,7 @@ def conditions(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarr
 
 def is_turning(samples: np.ndarray) -> np.ndarray:
     """Where the disc turns."""
-    return samples["has_wheel_speed"] & (samples["wheel_speed"] > _TURNING)
+    return samples["has_wheel_speed"] & (samples["wheel_speed"] > TURNING_RAD_PER_S)
 
 
 def first_known(estimates: np.ndarray) -> int:

@@ -41,9 +41,9 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     """
     if unit == target:
         return 1.0, 0.0
-    if unit not in UNITS:
-        raise InputError(f"unit {unit!r} is unknown; expected {target or 'none'}")
-    (base, factor, offset), (target_base, target_factor, target_offset) = UNITS[unit], UNITS[target]
+    target_base, target_factor, target_offset = UNITS[target]
+    base, factor, offset = UNITS.get(unit, (None, 1.0, 0.0))
     if base != target_base:
-        raise InputError(f"is in {unit or 'no unit'}; expected {target or 'none'}, or what can become that")
+        others = (known for known, (of, *_) in UNITS.items() if of == target_base and known not in ("", target))
+        raise InputError(f"is in {repr(unit) if unit else 'no unit'}; expected {', '.join([target or 'none', *others])}")
     return factor / target_factor, (offset - target_offset) / target_factor

@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from emb_daemon.calibration.curves import rising_force
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
@@ -17,10 +18,6 @@ from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
 from emb_daemon.identify.steps.torque import (
-    INERTIA,
-    LOAD,
-    OFFSET,
-    TORQUE_CONSTANT,
     UNKNOWN_CURRENT_A,
     TorqueStep,
     Unexplained,
@@ -234,7 +231,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
     constant = first.values[TORQUE_CONSTANT]
     if not any(len(left.rows) for left in held_out):
         # No current was measured: the fit's own prior, and friction that may be as large as what it rubs against.
-        relative = np.hypot(first.sigmas[TORQUE_CONSTANT] / constant, first.sigmas[LOAD] / gear_gain)
+        relative = np.hypot(first.sigmas[TORQUE_CONSTANT] / constant, first.sigmas[LOAD_FRICTION] / gear_gain)
         return {
             "current_A": UNKNOWN_CURRENT_A,
             "current_correlation_s": CYCLE_S,
@@ -250,9 +247,9 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         torque = values[TORQUE_CONSTANT] * current
         series += _stretches(left)
         sliding = 1.0 - mean**2
-        turning.append((sliding * (values[OFFSET] + values[LOAD] * np.maximum(force, 0.0))) ** 2)
+        turning.append((sliding * (values[OFFSET_FRICTION] + values[LOAD_FRICTION] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))
-        load = (gear_gain + values[LOAD] * mean) * force
+        load = (gear_gain + values[LOAD_FRICTION] * mean) * force
         # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)

@@ -8,9 +8,9 @@ from scipy.signal import lfilter
 
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.heat import TURNING_RAD_PER_S
 from emb_daemon.identify.dynamics import TERMS
 from emb_daemon.identify.recording import Recording, simulate
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import left_out_covariance, valley
 from emb_daemon.offline.run import stiffness_force

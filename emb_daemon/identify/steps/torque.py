@@ -12,10 +12,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, moved
-from emb_daemon.calibration.parameters import LOAD_FRICTION as LOAD
-from emb_daemon.calibration.parameters import OFFSET_FRICTION as OFFSET
-from emb_daemon.calibration.parameters import PRESLIDING_ANGLE as PRESLIDING
+from emb_daemon.calibration.parameters import (
+    INERTIA,
+    LOAD_FRICTION,
+    OFFSET_FRICTION,
+    PRESLIDING_ANGLE,
+    TORQUE_CONSTANT,
+    moved,
+)
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
 from emb_daemon.identify.campaign_file import Datasheet
@@ -32,7 +36,7 @@ from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Parameters in the order of every covariance, with their least value that is physical.
-KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET: 0.0, LOAD: 0.0, PRESLIDING: 1e-6}
+KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET_FRICTION: 0.0, LOAD_FRICTION: 0.0, PRESLIDING_ANGLE: 1e-6}
 #: Variance of the friction state up to which it counts as known.
 _KNOWN = 0.01
 #: Step of the derivative by the logarithm of the presliding angle.
@@ -76,7 +80,9 @@ class TorqueFit:
 
     def friction(self) -> dict[str, float]:
         """Those of them that wear changes."""
-        return {key: value for key, value in self.physical().items() if key in (OFFSET, LOAD, PRESLIDING)}
+        return {
+            key: value for key, value in self.physical().items() if key in (OFFSET_FRICTION, LOAD_FRICTION, PRESLIDING_ANGLE)
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +101,7 @@ class TorqueStep(Step):
 
     def gear_wear(self) -> float:
         """Spread of the load friction over the states of wear that were measured, m/rad."""
-        worn = [fit.values[LOAD] for _, fit in self.gears]
+        worn = [fit.values[LOAD_FRICTION] for _, fit in self.gears]
         return float(np.std(worn, ddof=1)) if len(worn) > 1 else 0.0
 
 
@@ -150,7 +156,7 @@ class _Regression:
     def matrices(self, presliding_angle: float):
         """Regressors (n, 4) and instruments (n, 4) by the estimator's own model, and rows where the friction state is known;
         in others it is the state's mean, none where nothing is known."""
-        parameters = to_parameters(moved(self.calibration, {PRESLIDING: presliding_angle}))
+        parameters = to_parameters(moved(self.calibration, {PRESLIDING_ANGLE: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
         regressors = np.column_stack([self.load, self.acceleration, s, s * self.load])
