@@ -216,6 +216,22 @@ def test_sigma_grows_outside_of_the_range(calibration):
     assert sigma[1] < 1.1 * sigma[0] and sigma[2] > 3.0 * sigma[0]
 
 
+@pytest.mark.parametrize(
+    ("port", "coefficient"),
+    [("torque", 0.05), ("gear_gain", 0.2), ("gear_friction", 0.8), ("torque_constant", 0.2), ("current", 2.0)],
+)
+def test_torque_is_doubted_where_a_term_of_it_is_outside_of_its_range(calibration, port, coefficient):
+    """And teaches the stiffness path as much less."""
+    term = Term(name="term:x", port=port, signal="clamp_force", shape="constant", coefficient=coefficient, low=0.0, high=2e4)
+    runs = [
+        estimate(drive(), to_parameters(msgspec.structs.replace(calibration, terms=own)))
+        for own in ((), (term,), (msgspec.structs.replace(term, high=1000.0),))
+    ]
+    none, inside, outside = (np.nanmedian(run["torque_sigma"][run["stiffness_force"] > 3000.0]) for run in runs)
+    assert inside < 1.2 * none and outside > 1.5 * inside
+    assert runs[2]["innovation_sigma"][-1] > runs[1]["innovation_sigma"][-1]
+
+
 # -- what a calibration may say ---------------------------------------------------------------------------------------
 
 _GOOD = {

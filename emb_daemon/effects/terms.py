@@ -55,7 +55,8 @@ GATES = ("always", "load", "closing", "opening", "turning", "standing")
 _NONE, _LAG, _DEFICIT, _SLIP, _RESPONSE = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
-_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE = range(4)
+(_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE, _TORQUE_CONSTANT, _TORQUE, _GEAR_GAIN, _GEAR_FRICTION, _PAD_FRICTION,
+ _AMPERE, _RELAXATION) = range(len(PORTS))  # fmt: skip
 
 #: Clamp force from which the brake counts as clamped, N.
 CLAMPED_N = 150.0
@@ -68,12 +69,13 @@ TERM = np.dtype(
     align=True,
 )
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` by port; ``sigma``: standard deviation (N) of the static force by what terms add outside their range.
+#: ``added`` by port; ``sigma`` and ``torque_sigma``: standard deviations of the static force (N) and of the torque (N m) by
+#: what terms add outside their range.
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
         ("added", "f8", (len(PORTS),)),
-        ("sigma", "f8"),
+        *fields("f8", "sigma torque_sigma"),
         ("begun", "i8", (MOST,)),
         ("memory", "f8", (MOST,)),
         ("before", "f8", (MOST,)),
@@ -174,18 +176,35 @@ def _value(q, t, k, dt, maximum_force):
 
 
 @njit
-def _outside_sigma(q, x, added, s):
-    """Standard deviation (N) of the static force: of the coefficient, and the term's own size for each width of its range that
-    the signal is outside."""
+def _outside_sigma(q, x, added):
+    """Standard deviation in the port's unit: of the coefficient, and the term's own size for each width of its range that the
+    signal is outside."""
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
     if not outside > 0.0:
         return 0.0
-    size = hypot(q.sigma, outside * max(abs(added), q.sigma))
-    if q.port == _STIFFNESS:
-        return size * s.force
-    if q.port == _STATIC_FORCE:
-        return size
-    return size * s.slope
+    return hypot(q.sigma, outside * max(abs(added), q.sigma))
+
+
+@njit
+def _of_force(port, s):
+    """Static force (N) by what comes to a port, per its unit."""
+    if port == _STIFFNESS:
+        return s.force
+    return 1.0 if port == _STATIC_FORCE else s.slope
+
+
+@njit
+def _of_torque(port, s, p, m):
+    """Torque (N m) by what comes to a port, per its unit."""
+    if port == _TORQUE:
+        return 1.0
+    if port == _GEAR_GAIN:
+        return p.gear_gain * s.force
+    if port == _GEAR_FRICTION:
+        return p.offset_friction + p.load_friction * s.force
+    if port == _TORQUE_CONSTANT:
+        return p.torque_constant * abs(m.current_q) if m.has_current else 0.0
+    return p.torque_constant if port == _AMPERE else 0.0
 
 
 @njit
@@ -195,15 +214,17 @@ def look(e, s, p, m):
     _follow(t.signal, s, m)
     for port in range(len(t.added)):
         t.added[port] = 0.0
-    variance = 0.0
+    of_force = of_torque = 0.0
     for k in range(e.count):
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
-        if q.port <= _STATIC_FORCE:
-            sigma = _outside_sigma(q, t.signal[q.signal], value, s)
-            variance += sigma * sigma
-    t.sigma = sqrt(variance)
+        sigma = _outside_sigma(q, t.signal[q.signal], value)
+        if sigma > 0.0 and q.port <= _STATIC_FORCE:
+            of_force += (sigma * _of_force(q.port, s)) ** 2
+        elif sigma > 0.0:
+            of_torque += (sigma * _of_torque(q.port, s, p, m)) ** 2
+    t.sigma, t.torque_sigma = sqrt(of_force), sqrt(of_torque)
 
 
 @njit

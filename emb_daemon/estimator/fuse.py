@@ -189,10 +189,12 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     h, speed, s_mean = s.sensitivity[0], 0.5 * (m.speed + s.speed), s.friction_mean
     moving = _moving_variance(s, p, m)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force + s.spring_force, 0.0) * s.gear_slope
-    white = moving + friction_torque * friction_torque * friction_variance
+    doubted = s.effects.terms.torque_sigma
+    white = moving + friction_torque * friction_torque * friction_variance + doubted * doubted
     out.torque_sigma = sqrt(white) / leverage
-    # At standstill the friction state's error stays what it is: however many samples repeat it, they say it once.
-    white += (friction_torque * s.friction_variance) ** 2 / (DISSOLVING_PER_S * m.dt)
+    # At standstill the friction state's error stays what it is, and what a term outside its range is off by does: however many
+    # samples repeat them, they say it once.
+    white += ((friction_torque * s.friction_variance) ** 2 + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     to_force(h, spread, s.slope, s.force, warmth)
     slope = s.gear_slope

@@ -189,7 +189,8 @@ def open_again(s, p):
 def _keep(s, a):
     kept = s.alternatives[KEPT_JUMP]
     copy_errors(kept.error, kept.covariance, a.error, a.covariance)
-    kept.kind, kept.age_s, kept.log_odds, kept.least, kept.shift = a.kind, a.age_s, a.log_odds, a.least, a.shift
+    kept.kind, kept.age_s, kept.log_odds, kept.least = a.kind, a.age_s, a.log_odds, a.least
+    kept.shift, kept.slope = a.shift, a.slope
 
 
 @njit
