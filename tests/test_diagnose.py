@@ -34,9 +34,9 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection, revise
-from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
 from emb_daemon.diagnose.text import verdict
-from emb_daemon.diagnose.unexplained import Left, achieved
+from emb_daemon.diagnose.unexplained import Dependence, Left, achieved
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
@@ -168,6 +168,16 @@ def test_a_hold_is_one_episode_however_long():
     number = episodes(time, np.full(len(time), 3000.0), angle)
     assert len(set(number[time < 59.9])) == 1
     assert len(set(number[time > 60.1])) >= 4
+
+
+def test_holds_whose_way_was_not_recorded_are_several_episodes():
+    """A bench that keeps the settled part of each load step alone: between two parts the gear was wound up."""
+    hold = np.arange(0.0, 8.0, 0.004)
+    time = np.concatenate([hold + 80.0 * part for part in range(8)])
+    wound = np.repeat(2.0 + 0.1 * np.arange(8), len(hold))
+    force = np.full(len(time), 3000.0)
+    assert len(set(episodes(time, force, wound))) == 8
+    assert len(set(episodes(time, force, np.full(len(time), 2.0)))) == 1
 
 
 # -- coordinates ------------------------------------------------------------------------------------------------------
@@ -812,6 +822,21 @@ def test_a_log_with_nothing_to_judge_by_is_refused(calibration):
     samples["has_current"] = False
     with pytest.raises(InputError, match="neither a clamp force reference nor motor current"):
         diagnose([dataclasses.replace(log, samples=samples)], calibration)
+
+
+def test_a_signal_that_stands_explains_nothing():
+    """A disc that never turned has one angle: its cosine is an offset, which is something else's."""
+    force = np.linspace(0.0, 5000.0, 100)
+    for name in ("disc_angle", "pad_temperature"):
+        assert smooth_basis(name, np.full(100, 0.3), force).shape == (100, 0)
+        assert smooth_basis(name, np.linspace(0.0, 0.3, 100), force).shape[1]
+
+
+@pytest.mark.parametrize(("share", "named"), [(1e-17, None), (0.2, "disc_angle")])
+def test_what_is_left_names_a_signal_only_for_a_share_worth_a_word(share, named):
+    left = Left("torque", 315.0, 145.0, 0.6, (Dependence("torque", "disc_angle", share, 100.0, 0.3, matters=False),))
+    assert left.present
+    assert (left.strongest.signal if left.strongest else None) == named
 
 
 @pytest.mark.parametrize(("rms", "present"), [(50.0, False), (70.0, True)])

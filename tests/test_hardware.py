@@ -86,6 +86,19 @@ def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
     assert errors(bench, moved(without_load, {"motor.torque_constant_Nm_per_A": 0.06})).rmse("torque") > 500.0
 
 
+@pytest.mark.parametrize(("lacking", "told"), [("force_N", "no load reference .*value: 0"), ("current_A", "no motor current")])
+def test_a_motor_with_nothing_to_judge_by_is_told_what_lacks(lacking, told):
+    """A motor that turns free has no load sensor, and knows its load: none."""
+    base = foreignkit.calibration()
+    alone = msgspec.structs.replace(base, contact=msgspec.structs.replace(base.contact, clearance_rad=1e4))
+    time_s = 0.004 * np.arange(3000)
+    known = {"current_A": np.sin(time_s), "force_N": np.zeros(3000)}
+    del known[lacking]
+    log = emb_daemon.log_of_arrays(time_s, 20.0 * np.sin(2.0 * time_s), wheel_speed_rad_per_s=0.0, **known)
+    with pytest.raises(InputError, match=told):
+        Bench([log], alone)
+
+
 def _on_a_dynamometer(scatter: float, load: float):
     """A motor of 0.85 of its stated constant that turns to and fro against a load: calibration, the true constant, and logs
     to fit and to judge. ``load``: share of its current that it gets from the load and does not draw from its own speed;

@@ -65,8 +65,11 @@ def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:
 
 
 def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Where the motor stands."""
+    """Where the motor stands, shape (N,). A gap in which it was turned ends with a motion that nobody recorded."""
     before = np.searchsorted(time_s, time_s - _HOLDING_S)
     after = np.minimum(np.searchsorted(time_s, time_s + _HOLDING_S), len(time_s) - 1)
     back, on = np.abs(angle_rad - angle_rad[before]), np.abs(angle_rad[after] - angle_rad)
-    return np.minimum(back, on) < _HOLDING_RAD
+    turned_unseen = (np.diff(time_s, prepend=time_s[0]) > _HOLDING_S) & (
+        np.abs(np.diff(angle_rad, prepend=angle_rad[0])) >= _HOLDING_RAD
+    )
+    return (np.minimum(back, on) < _HOLDING_RAD) & ~turned_unseen

@@ -189,10 +189,11 @@ class Bench:
         elif self.has_current and self.clamps:
             channels = ["innovation"]
         else:
-            both = (
-                "neither a clamp force reference nor motor current" if self.clamps else "no motor current or no load reference"
-            )
-            raise InputError(f"{self.trials[0].log.path}: {both} to judge by")
+            lacking = "neither a clamp force reference nor motor current"
+            if not self.clamps:
+                lacking = "no motor current" if self.has_reference else "no load reference"
+            free = "" if self.clamps or self.has_reference else "; of a motor that turns free, map ClampForceRef to `value: 0`"
+            raise InputError(f"{self.trials[0].log.path}: {lacking} to judge by{free}")
         if any(np.isfinite(trial.temperature_C).any() for trial in self.trials):
             channels.append("temperature")
         if any(np.nanmax(np.append(trial.brake_torque_Nm, 0.0)) > _BRAKING_NM for trial in self.trials):

@@ -94,14 +94,14 @@ def _time_since(time: np.ndarray, active: np.ndarray) -> np.ndarray:
 
 def smooth_basis(name: str, signal: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Columns that span smooth functions of a signal, alone and in proportion to the force; none for a constant one."""
+    if np.ptp(signal) <= 1e-9 * max(np.abs(signal).max(), 1.0):
+        return np.zeros((len(signal), 0))
     if name == "disc_angle":
         shape = np.column_stack([part(order * signal) for order in (1, 2, 3) for part in (np.cos, np.sin)])
     else:
         knots = np.unique(np.quantile(signal, np.linspace(0.0, 1.0, _KNOTS)))
         wide = np.linspace(signal.min(), signal.max(), 4)
         knots = np.unique(np.concatenate([knots, wide]))
-        if len(knots) < 2 or knots[-1] - knots[0] <= 1e-9 * max(abs(knots[-1]), 1.0):
-            return np.zeros((len(signal), 0))
         # Knots that nearly coincide would leave a column to a handful of samples.
         apart = np.concatenate([[True], np.diff(knots) > 0.02 * (knots[-1] - knots[0])])
         knots = knots[apart]

@@ -108,7 +108,7 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     if strongest is None:
-        return [f"{text}."]
+        return [f"{text}, which depend on no signal that was recorded."]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
     return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}."]
 

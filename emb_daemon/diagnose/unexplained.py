@@ -87,7 +87,9 @@ class Left:
 
     @property
     def strongest(self) -> Dependence | None:
-        return next(iter([*(d for d in self.dependences if d.matters), *self.dependences]), None)
+        """What the residual depends on most: surely, or else by a share that is worth a word; none where no signal tells."""
+        worth = (d for d in self.dependences if d.share >= _LEAST_SHARE)
+        return next(iter([*(d for d in self.dependences if d.matters), *worth]), None)
 
 
 def is_beyond(rms: float, known: float) -> bool:
