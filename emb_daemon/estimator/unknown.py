@@ -59,8 +59,7 @@ _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
 _SLOW, _SLOW_JUMP, SLOW_RAD_PER_S = 0.05, 0.5, 5.0
 #: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
 #: 20 degC: it doubles in ten), K; the speed torque of a warm gear at full speed over its Coulomb torque, and what another
-#: lubricant makes of that (viscosity grades for gears reach from 32 to 460 mm2/s: ISO 3448). With half the Coulomb torque
-#: instead `studies.silent grid` has 62 instead of 58 failing phases of 799 (seed 11) and 96 instead of 87 of 805 (seed 12).
+#: lubricant makes of that (viscosity grades for gears reach from 32 to 460 mm2/s: ISO 3448).
 _THICKENS_K, _WARM_C, _VISCOUS, _VISCOUS_JUMP = 15.0, 15.0, 0.3, 2.0
 #: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1
 #: %/K (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
