@@ -170,17 +170,6 @@ def test_a_current_sensor_that_drifts_takes_no_force_with_it(p, ampere_per_s, se
     assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.95
 
 
-@pytest.mark.parametrize("times", [4.0, 6.0])
-@pytest.mark.parametrize("seed", [2, 3])
-def test_a_lubricant_of_another_grade_is_not_taken_for_other_pads(p, times, seed):
-    """Whose torque at full speed is several times the Coulomb friction: sigma covers from the first stop on."""
-    rows, force = brake.samples(p, brake.stops(p, 2, seed))
-    viscous = times * p["offset_friction"] / p["maximum_speed"]
-    rows["current_q"] += viscous * 0.5 * (rows["speed"] + np.roll(rows["speed"], 1)) / p["torque_constant"]
-    estimates = estimate(brake.noisy(rows, p), p)
-    assert np.mean(np.abs(estimates["force"] - force) < 2.0 * estimates["sigma"]) > 0.95
-
-
 def test_an_offset_that_moved_by_more_than_its_sigma_may_again(p, opened):
     """By as much in as long; one that did not is no reason."""
     s = opened[0]

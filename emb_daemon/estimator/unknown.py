@@ -58,9 +58,8 @@ _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
 #: rad/s.
 _SLOW, _SLOW_JUMP, SLOW_RAD_PER_S = 0.05, 0.5, 5.0
 #: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
-#: 20 degC: it doubles in ten), K; the speed torque of a warm gear at full speed over its Coulomb torque, and what another
-#: lubricant makes of that (viscosity grades for gears reach from 32 to 460 mm2/s: ISO 3448).
-_THICKENS_K, _WARM_C, _VISCOUS, _VISCOUS_JUMP = 15.0, 15.0, 0.3, 2.0
+#: 20 degC: it doubles in ten), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
+_THICKENS_K, _WARM_C, _VISCOUS = 15.0, 15.0, 0.3
 #: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1
 #: %/K (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
 #: several hundred kelvin.
@@ -234,4 +233,4 @@ def add_torque_jumps(P, p):
     P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
     P[COULOMB, COULOMB] += (_FRICTION_JUMP * p.offset_friction) ** 2
     P[SLOW, SLOW] += _SLOW_JUMP**2
-    P[VISCOUS, VISCOUS] += (_VISCOUS_JUMP * p.offset_friction / p.maximum_speed) ** 2
+    P[VISCOUS, VISCOUS] += (_FRICTION_JUMP * p.offset_friction / p.maximum_speed) ** 2
