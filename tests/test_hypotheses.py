@@ -224,7 +224,7 @@ def clamped(p):
 
 def test_mixture_is_the_law_of_total_variance(p, clamped):
     """Mean and variance of the first hypothesis and all changes by their probabilities, forces and own variances; and of a
-    drift's distance from that by its odds."""
+    drift's distance from that, and of what it knows less, by its odds."""
     state, _, _ = clamped
     s, rng = state[0], np.random.default_rng(3)
     h, spread = np.zeros(STATES), 40.0
@@ -241,9 +241,32 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
     weights, drift = np.array(odds[:-1]) / np.sum(odds[:-1]), odds[-1] / np.sum(odds)
     mean = weights @ forces[:-1]
     variance = weights @ variances[:-1] + weights @ (np.array(forces[:-1]) - mean) ** 2
-    variance += drift * (forces[-1] - mean) ** 2
+    variance += drift * ((forces[-1] - mean) ** 2 + variances[-1] - variances[0])
+    assert variances[-1] > variances[0]
     assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
     assert s["alternatives"]["share"] == pytest.approx([*weights[1:], drift])
+
+
+def test_a_disc_that_grows_unseen_counts_as_long_as_nothing_has_shown_its_growth(p, clamped):
+    """A long drag heats the disc and moves the motor too little to see the contact angle by: grey iron of 26 mm, 60 K."""
+    state, _, _ = clamped
+    s, h, spread = state[0], np.zeros(STATES), 40.0
+    open_all(s, p)
+    _, cold = mix(s, h, spread, 0.0)
+    _, warm = mix(s, h, spread, 60.0)
+    grown_N = s["slope"] * 0.26e-6 * 60.0 / p["gear_gain"]
+    assert np.sqrt(warm**2 - cold**2) == pytest.approx(np.sqrt(s["alternatives"]["share"][DRIFT]) * grown_N, rel=0.1)
+
+
+def test_a_brake_that_is_held_as_exactly_known_is_no_other(p, clamped):
+    state, _, _ = clamped
+    s, h = state[0], np.zeros(STATES)
+    p["clearance_sigma"] = 0.0
+    open_all(s, p)
+    assert not any(exists(a) for a in s["alternatives"])
+    force, sigma = mix(s, h, 40.0, 0.0)
+    to_force(h, 40.0, s["slope"], s["force"], 0.0)
+    assert (force, sigma) == pytest.approx((s["force"] + 40.0 * s["error"][0], np.sqrt(force_variance(s["covariance"], h))))
 
 
 def test_an_unproven_jump_counts_in_sigma_and_is_said(p, clamped):

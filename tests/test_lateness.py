@@ -192,6 +192,15 @@ def test_what_a_late_angle_leaves_open_counts_while_the_speed_changes(parameters
     assert fuse._spread(s, p, m) == without
 
 
+def test_a_current_that_changes_meanwhile_is_of_another_angle(parameters, s):
+    """By what it changes in the time that the angle is late, beside a third of a sample that they are apart anyway."""
+    p, m = parameters[0], _turning(parameters[0])
+    s["had_current"], m["current_q"] = True, 20.0
+    speeds = fuse._moving_variance(s, p, m) - (0.3 * p["torque_constant"] * 20.0) ** 2
+    s["late"] = 0.004
+    assert fuse._moving_variance(s, p, m) - speeds == pytest.approx((1.3 * p["torque_constant"] * 20.0) ** 2)
+
+
 @pytest.mark.parametrize(("late_s", "told"), [(0.0079, False), (0.0081, True)])
 def test_an_angle_over_two_cycles_old_is_told(parameters, s, late_s, told):
     s["late"] = late_s

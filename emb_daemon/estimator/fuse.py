@@ -88,7 +88,7 @@ from emb_daemon.models.wheel import TURNING_RAD_PER_S
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Share of the largest force by which an unproven jump must move the force to be told.
 _NOTED = 0.003
-#: Part of a sample by which current and angle may be apart in time.
+#: Part of a sample by which current and angle may be apart in time, beside what the angle is late by.
 _LATE = 0.3
 #: Log odds that a change has only after more samples than a sensor's sudden fault takes to be told (at most 12.5 a sample, and
 #: five samples): from then on it may explain what the motor's sliding contradicts.
@@ -159,7 +159,7 @@ def _predict(s, p, m, spread, warmth, known):
         a = s.alternatives[kind]
         if not exists(a):
             continue
-        if kind == DRIFT and not known:
+        if kind == DRIFT:
             add_drift_walks(walked, p, m.wheel_speed != 0.0, m.dt)
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
         place(s, a, p, s.factor * s.scale, warmth)
@@ -177,7 +177,8 @@ def _moving_variance(s, p, m):
     """Variance, (N m)^2, of one torque from noise of the speeds and from current and angle that are apart in time."""
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
-    late = _LATE * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
+    apart = _LATE + s.late / CYCLE_S
+    late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
     return 2.0 * speed_torque * speed_torque + late * late
 
 
@@ -207,7 +208,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     slow = max(variance - white - fast, 0.0)
     out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
     out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
-    for kind in range(ALTERNATIVES if not known else 0):
+    for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
         if not exists(a):
             continue

@@ -66,8 +66,6 @@ _JUMPS_BEFORE, _STOPS_BEFORE = 0.04, 16.0
 #: (`_become_first`) `studies.silent grid --count 4 --pairs 24` has 63 and 101 failing phases with seed 11 and 12, with both 63
 #: and 98; of first strokes with pads 10 % softer 93 % of samples lie within two sigma without and 96 % with it.
 _UNSEEN_ODDS = -3.5
-#: The same of a disc that grows though its calibration, which saw heat, does not know it.
-_GROWTH_ODDS = -8.0
 #: The same of a brake that differs from its calibration in small ways: one in eight does. Of 799 phases that `studies.silent
 #: grid` draws (--count 4 --pairs 24 --seed 11) 151 fail without this hypothesis and 126 with it; on the rig's random logs 98
 #: to 99 % of samples instead of 97 then lie within two sigma, so the odds are no higher.
@@ -120,9 +118,7 @@ def _least_odds(s, kind):
     """Log odds below which those of a change cannot fall, or a later one would have to make up for the past."""
     if kind == DRIFT:
         return _DRIFT_ODDS
-    if kind == DISC_GROWTH:
-        return _GROWTH_ODDS
-    if kind == TORQUE_JUMP or s.jumps == 0.0:
+    if kind != STIFFNESS_JUMP or s.jumps == 0.0:
         return PRIOR_ODDS
     share = min((s.jumps + _JUMPS_BEFORE) / (s.stops + _STOPS_BEFORE), 0.5)
     return max(log(share / (1.0 - share)), PRIOR_ODDS)
@@ -156,6 +152,9 @@ def _open(s, p, kind):
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.least, a.log_odds = _least_odds(s, kind), _first_odds(s, kind)
+    if p.clearance_sigma == 0.0:
+        # A brake that is held as exactly known is no other.
+        a.log_odds = -np.inf
     a.shift = a.age_s = 0.0
     a.kind = kind
 
@@ -168,7 +167,7 @@ def _forget_kept(s):
 
 @njit
 def exists(a):
-    """Whether there is such a hypothesis: a kept jump may be none."""
+    """Whether there is such a hypothesis: a kept jump may be none, and a brake that is known has none."""
     return a.log_odds > -np.inf
 
 
@@ -489,7 +488,7 @@ def contact_sigma(s):
 @njit
 def mix(s, h, spread, warmth):
     """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
-    how far a drift would be from that counts in the latter. ``h``: scratch."""
+    how far a drift would be from that, and what it does not know itself, count in the latter. ``h``: scratch."""
     to_force(h, spread, s.slope, s.force, warmth)
     _share_out(s)
     rest = 1.0
@@ -507,6 +506,8 @@ def mix(s, h, spread, warmth):
     d = s.alternatives[DRIFT]
     drifted = d.shift + spread * d.error[FAST] - first - mean
     to_force(h, spread, s.slope, s.force, warmth)
-    variance += rest * force_variance(s.covariance, h)
-    variance += max(square - mean * mean, 0.0) + d.share * drifted * drifted
+    own = force_variance(s.covariance, h)
+    to_force(h, spread, d.slope, s.force + d.shift, warmth)
+    unknown = max(force_variance(d.covariance, h) - own, 0.0)
+    variance += rest * own + max(square - mean * mean, 0.0) + d.share * (drifted * drifted + unknown)
     return s.force + first + mean, sqrt(variance)
