@@ -29,7 +29,7 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import set_priors
-from emb_daemon.models.fusion import COULOMB, GAIN, LOAD, OFFSET, SCALE, STATES, force_variance
+from emb_daemon.models.fusion import CONTACT, COULOMB, GAIN, GROWTH, LOAD, OFFSET, SCALE, STATES, force_variance
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, PATHS_DISAGREE
 
@@ -170,6 +170,17 @@ def test_a_current_sensor_that_drifts_takes_no_force_with_it(p, ampere_per_s, se
     assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.95
 
 
+@pytest.mark.parametrize("times", [4.0, 6.0])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_lubricant_of_another_grade_is_not_taken_for_other_pads(p, times, seed):
+    """Whose torque at full speed is several times the Coulomb friction: sigma covers from the first stop on."""
+    rows, force = brake.samples(p, brake.stops(p, 2, seed))
+    viscous = times * p["offset_friction"] / p["maximum_speed"]
+    rows["current_q"] += viscous * 0.5 * (rows["speed"] + np.roll(rows["speed"], 1)) / p["torque_constant"]
+    estimates = estimate(brake.noisy(rows, p), p)
+    assert np.mean(np.abs(estimates["force"] - force) < 2.0 * estimates["sigma"]) > 0.95
+
+
 def test_an_offset_that_moved_by_more_than_its_sigma_may_again(p, opened):
     """By as much in as long; one that did not is no reason."""
     s = opened[0]
@@ -224,7 +235,7 @@ def clamped(p):
 
 def test_mixture_is_the_law_of_total_variance(p, clamped):
     """Mean and variance of the first hypothesis and all changes by their probabilities, forces and own variances; and of a
-    drift's distance from that, and of what it knows less, by its odds."""
+    drift's distance from that by its odds."""
     state, _, _ = clamped
     s, rng = state[0], np.random.default_rng(3)
     h, spread = np.zeros(STATES), 40.0
@@ -241,21 +252,29 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
     weights, drift = np.array(odds[:-1]) / np.sum(odds[:-1]), odds[-1] / np.sum(odds)
     mean = weights @ forces[:-1]
     variance = weights @ variances[:-1] + weights @ (np.array(forces[:-1]) - mean) ** 2
-    variance += drift * ((forces[-1] - mean) ** 2 + variances[-1] - variances[0])
-    assert variances[-1] > variances[0]
+    variance += drift * (forces[-1] - mean) ** 2
     assert mix(s, h, spread, 0.0) == pytest.approx((mean, np.sqrt(variance)))
     assert s["alternatives"]["share"] == pytest.approx([*weights[1:], drift])
+
+
+def _grown(s, h, warmth=60.0):
+    """What ``warmth`` K of the disc add to the standard deviation of the force, N."""
+    return np.sqrt(mix(s, h, 40.0, warmth)[1] ** 2 - mix(s, h, 40.0, 0.0)[1] ** 2)
 
 
 def test_a_disc_that_grows_unseen_counts_as_long_as_nothing_has_shown_its_growth(p, clamped):
     """A long drag heats the disc and moves the motor too little to see the contact angle by: grey iron of 26 mm, 60 K."""
     state, _, _ = clamped
-    s, h, spread = state[0], np.zeros(STATES), 40.0
+    s, h = state[0], np.zeros(STATES)
     open_all(s, p)
-    _, cold = mix(s, h, spread, 0.0)
-    _, warm = mix(s, h, spread, 60.0)
-    grown_N = s["slope"] * 0.26e-6 * 60.0 / p["gear_gain"]
-    assert np.sqrt(warm**2 - cold**2) == pytest.approx(np.sqrt(s["alternatives"]["share"][DRIFT]) * grown_N, rel=0.1)
+    mix(s, h, 40.0, 0.0)
+    drift = s["alternatives"][DRIFT]
+    grown_N = drift["slope"] * 0.26e-6 * 60.0 / p["gear_gain"]
+    assert _grown(s, h) == pytest.approx(np.sqrt(drift["share"]) * grown_N, rel=0.1)
+    # Strokes that showed the contact angle together with the growth leave less.
+    P = drift["covariance"]
+    P[GROWTH, CONTACT] = P[CONTACT, GROWTH] = -0.8 * np.sqrt(P[GROWTH, GROWTH] * P[CONTACT, CONTACT])
+    assert _grown(s, h) == pytest.approx(0.6 * np.sqrt(drift["share"]) * grown_N, rel=0.1)
 
 
 def test_a_brake_that_is_held_as_exactly_known_is_no_other(p, clamped):

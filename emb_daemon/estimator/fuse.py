@@ -88,7 +88,7 @@ from emb_daemon.models.wheel import TURNING_RAD_PER_S
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Share of the largest force by which an unproven jump must move the force to be told.
 _NOTED = 0.003
-#: Part of a sample by which current and angle may be apart in time, beside what the angle is late by.
+#: Part of a sample by which current and angle may be apart in time, beside what the angle is late by: friction turns with it.
 _LATE = 0.3
 #: Log odds that a change has only after more samples than a sensor's sudden fault takes to be told (at most 12.5 a sample, and
 #: five samples): from then on it may explain what the motor's sliding contradicts.
@@ -177,7 +177,7 @@ def _moving_variance(s, p, m):
     """Variance, (N m)^2, of one torque from noise of the speeds and from current and angle that are apart in time."""
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
-    apart = _LATE + s.late / CYCLE_S
+    apart = _LATE + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
     late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
     return 2.0 * speed_torque * speed_torque + late * late
 

@@ -13,7 +13,8 @@ motor turns round. So the likeliest is kept beside its successor, until the rele
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
 torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
-proven, and the fused force does not follow it. Its distance from that counts in the standard deviation by its odds.
+proven, and the fused force does not follow it. Its distance from that counts in the standard deviation by its odds. So does
+what its disc may have grown by unseen: a drag heats a disc by tens of kelvin in seconds and hardly moves the motor.
 """
 
 from math import exp, log, sqrt
@@ -486,9 +487,18 @@ def contact_sigma(s):
 
 
 @njit
+def _unseen_growth(a):
+    """Variance, (rad/K)^2, of the growth of a disc whose contact angle is known: what strokes have shown of both together."""
+    P = a.covariance
+    if P[CONTACT, CONTACT] <= 0.0:
+        return P[GROWTH, GROWTH]
+    return max(P[GROWTH, GROWTH] - P[CONTACT, GROWTH] ** 2 / P[CONTACT, CONTACT], 0.0)
+
+
+@njit
 def mix(s, h, spread, warmth):
     """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
-    how far a drift would be from that, and what it does not know itself, count in the latter. ``h``: scratch."""
+    how far a drift would be from that, and its disc's growth, count in the latter. ``h``: scratch."""
     to_force(h, spread, s.slope, s.force, warmth)
     _share_out(s)
     rest = 1.0
@@ -506,8 +516,7 @@ def mix(s, h, spread, warmth):
     d = s.alternatives[DRIFT]
     drifted = d.shift + spread * d.error[FAST] - first - mean
     to_force(h, spread, s.slope, s.force, warmth)
-    own = force_variance(s.covariance, h)
-    to_force(h, spread, d.slope, s.force + d.shift, warmth)
-    unknown = max(force_variance(d.covariance, h) - own, 0.0)
-    variance += rest * own + max(square - mean * mean, 0.0) + d.share * (drifted * drifted + unknown)
+    variance += rest * force_variance(s.covariance, h)
+    grown = d.slope * warmth
+    variance += max(square - mean * mean, 0.0) + d.share * (drifted * drifted + grown * grown * _unseen_growth(d))
     return s.force + first + mean, sqrt(variance)

@@ -58,8 +58,9 @@ _FRICTION, _FRICTION_JUMP, _FRICTION_WALK_PER_SQRT_S = 0.1, 0.5, 0.1 / 60.0
 #: rad/s.
 _SLOW, _SLOW_JUMP, SLOW_RAD_PER_S = 0.05, 0.5, 5.0
 #: Base oil of greases thickens e-fold in this many kelvin below the calibration's temperature (Walther's law between -40 and
-#: 20 degC: it doubles in ten), K; and the speed torque of a warm gear at full speed over its Coulomb torque.
-_THICKENS_K, _WARM_C, _VISCOUS = 15.0, 15.0, 0.3
+#: 20 degC: it doubles in ten), K; the speed torque of a warm gear at full speed over its Coulomb torque, and what another
+#: lubricant makes of that (viscosity grades for gears reach from 32 to 460 mm2/s: ISO 3448).
+_THICKENS_K, _WARM_C, _VISCOUS, _VISCOUS_JUMP = 15.0, 15.0, 0.3, 1.5
 #: Loss of motor torque at the temperature that the largest force's current, flowing for ever, would bring: magnets lose 0.1
 #: %/K (Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2) and a motor rated for seconds at that current would rise by
 #: several hundred kelvin.
@@ -72,11 +73,9 @@ _MISSED, _MISSED_S = 0.3, 10.0
 _CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
 #: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
 #: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
-#: it stands, m per root of a second; stiffness and its walk, shares; torque constant and inertia, shares, that a datasheet may
-#: miss by and that explain a torque as well as stiffness does.
+#: it stands, m per root of a second; stiffness and its walk, shares.
 _DRIFT_CONTACT_M, _DRIFT_WALK_M_PER_SQRT_S, _DRIFT_STANDING = 10e-6, 3e-6, 0.3
 _DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S = 0.02, 0.02 / 60.0
-_DRIFT_GAIN, _DRIFT_INERTIA = 0.02, 0.05
 #: Bounds of what can be learned: beyond them it is a fault.
 LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
@@ -217,8 +216,6 @@ def add_drift(P, p):
     """What a brake in service may differ by from its calibration without anything having happened to it."""
     P[CONTACT, CONTACT] += (_DRIFT_CONTACT_M / p.gear_gain) ** 2
     P[SCALE, SCALE] += _DRIFT_SCALE**2
-    P[GAIN, GAIN] += _DRIFT_GAIN**2
-    P[INERTIA, INERTIA] += _DRIFT_INERTIA**2
     add_growth(P, p)
 
 
@@ -238,4 +235,4 @@ def add_torque_jumps(P, p):
     P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
     P[COULOMB, COULOMB] += (_FRICTION_JUMP * p.offset_friction) ** 2
     P[SLOW, SLOW] += _SLOW_JUMP**2
-    P[VISCOUS, VISCOUS] += (_FRICTION_JUMP * p.offset_friction / p.maximum_speed) ** 2
+    P[VISCOUS, VISCOUS] += (_VISCOUS_JUMP * p.offset_friction / p.maximum_speed) ** 2
