@@ -440,12 +440,17 @@ def resolver_frozen_speed_zero(rng, moments):
 
 @_family
 def resolver_frozen_speed_noise(rng, moments):
-    """The resolver's rotor has come off its shaft."""
+    """The resolver's rotor has come off its shaft; its angle may flicker."""
+    flicker = 1e-3 if rng.random() < 0.5 else 0.0
 
-    def noise(values, _):
+    def speed(values, _):
         return 0.35 * rng.standard_normal(len(values))
 
-    return _freeze(rng, moments, _alter(wire.RESOLVER, wire.MOTOR_SPEED, noise))
+    def angle(values, _):
+        return values + flicker * rng.standard_normal(len(values))
+
+    noise = _chain(_alter(wire.RESOLVER, wire.MOTOR_SPEED, speed), _alter(wire.RESOLVER, wire.MOTOR_ANGLE, angle))
+    return _freeze(rng, moments, noise)
 
 
 @_family

@@ -151,12 +151,30 @@ def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
     estimates, _ = _with(begin, _freeze(*names))
     turned = np.abs(samples["angle"] - samples["angle"][begin]) > 0.6
     moved = begin + np.argmax(turned[begin:])
-    alarm = _alarm(estimates)
-    assert begin < alarm[0] < moved + 15
-    during = slice(alarm[0], begin + _LASTING)
+    named = begin + np.argmax(estimates["source"][begin:] == r.TORQUE_ONLY)
+    assert begin < named < moved + 15
+    during = slice(named, begin + _LASTING)
     assert np.all(estimates["source"][during] == r.TORQUE_ONLY) and np.all(estimates["reasons"][during] & r.STUCK)
     assert _honest(estimates, force, during) and np.median(estimates["sigma"][during]) > 500.0
     assert _recovered(estimates, force)
+
+
+@pytest.mark.parametrize("flicker", [0.0, 1e-3])
+def test_resolver_that_has_slipped_on_its_shaft_is_covered_as_soon_as_the_motor_must_turn(flicker):
+    """Angle and speed of a rotor that stands, with their noise: the torque that releases a held brake accelerates its motor,
+    and no more than ten samples of force are beyond four sigma before that is said."""
+
+    def slip(rows):
+        rng = np.random.default_rng(3)
+        rows["angle"] = rows["angle"][0] + flicker * rng.standard_normal(len(rows))
+        rows["speed"] = 0.35 * rng.standard_normal(len(rows))
+
+    estimates, force = _with(BEFORE_RELEASE, slip)
+    during = slice(BEFORE_RELEASE, BEFORE_RELEASE + _LASTING)
+    beyond = np.abs(estimates["force"] - force)[during] > 4.0 * estimates["sigma"][during]
+    assert np.abs(estimates["stiffness_force"] - force)[during].max() > 3000.0
+    assert beyond.sum() <= 10
+    assert np.any(estimates["reasons"][during] & r.PATHS_DISAGREE) and _recovered(estimates, force)
 
 
 def test_resolver_that_stands_still_with_noise_is_no_fault():

@@ -13,8 +13,11 @@ from emb_daemon.models.plausibility import (
     UNDECIDED,
     beyond_friction,
     count_contradiction,
+    due,
     force_of_torque_alone,
     frozen,
+    hold,
+    stands,
     watch,
 )
 
@@ -152,6 +155,61 @@ def test_a_small_mismatch_of_angle_and_speed_is_forgotten():
     watched.m["speed"] = 200.0
     assert watched.pass_by(2000, speed=200.0, follows=0.99) == AGREE
     assert abs(watched.c["apart"][0]) == pytest.approx(0.008 / (1.0 - np.exp(-0.04)), rel=0.01)
+
+
+def test_a_resolver_that_flickers_at_rest_is_not_believed_again():
+    watched = Watched()
+    watched.m["speed"] = 100.0
+    assert watched.pass_by(5, speed=100.0, follows=0.0) == STIFFNESS_WRONG
+    assert watched.pass_by(200, speed=0.0, angle_noise=1e-3) == STIFFNESS_WRONG
+    assert watched.pass_by(26, speed=10.0) == AGREE
+
+
+def _due_after(angles, acceleration, delay=0.0):
+    """Samples after which a motor at ``angles`` (rad) must have turned at ``acceleration``, rad/s²."""
+    c = np.zeros(1, PLAUSIBILITY)
+    for sample, angle in enumerate(angles):
+        if stands(c[0], angle) and due(c[0], acceleration, delay, _DT):
+            return sample
+    return None
+
+
+@pytest.mark.parametrize("acceleration", [20.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0, 50000.0])
+def test_a_motor_that_comes_in_and_turns_back_is_not_due(acceleration):
+    """However the samples fall about its turning point."""
+    for phase in np.linspace(0.0, 1.0, 21):
+        t = _DT * (np.arange(-60, 60) + phase)
+        assert _due_after(0.5 * acceleration * t * t, acceleration) is None
+
+
+def test_a_motor_that_stands_under_a_torque_that_must_turn_it_is_due():
+    """At 1000 rad/s² it turns by half a fortieth of a radian in the first seven milliseconds, wherever the resolver stands."""
+    flicker = 1e-3 * np.random.default_rng(1).standard_normal(500)
+    assert _due_after(flicker, 1000.0) <= 4
+    assert _due_after(flicker, 1000.0, delay=0.02) == pytest.approx(2 * 0.02 / _DT, abs=2)
+    assert _due_after(flicker, 0.0) is None and _due_after(flicker, -1000.0) is None
+
+
+def _swings(torques, angles=None, presliding_angle=0.02):
+    """What `hold` makes of smoothed torques (N m) over a force that friction of 0.1 N m holds."""
+    c = np.zeros(1, PLAUSIBILITY)
+    stands(c[0], 1.0)
+    counted = 0
+    for torque, angle in zip(torques, np.ones(len(torques)) if angles is None else angles, strict=True):
+        c["torque_mean"] = torque
+        if stands(c[0], angle):
+            counted = hold(c[0], 0.0, 0.01, 4e-5, 0.0, 0.1, presliding_angle)
+    return counted
+
+
+def test_torque_that_swings_by_more_than_friction_turns_over_within_a_standing_angle():
+    """Of 0.26 N m, twice and by a third more than friction, 1 - exp(-0.5) within half a presliding angle: 0.102; and 0.06."""
+    assert _swings([0.0, 0.161, 0.0]) == 0
+    assert _swings([0.0, 0.165]) == 1
+    assert _swings([0.0, 0.165, 0.0, 0.165]) == 3
+    assert _swings([0.0, 0.31, 0.0], presliding_angle=1e-4) == 0 and _swings([0.0, 0.33], presliding_angle=1e-4) == 1
+    assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.0, 1.0, 1.006]) == 2
+    assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.006, 1.006, 1.006]) == 1, "counted from where the angle moved last"
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():

@@ -72,14 +72,17 @@ from emb_daemon.models.fusion import (
 from emb_daemon.models.gear import most_of_spring, steepest
 from emb_daemon.models.plausibility import (
     AGREE,
+    BEYOND_CHANCE,
     STIFFNESS_WRONG,
     TORQUE_FROZEN,
     UNDECIDED,
     beyond_friction,
     count_contradiction,
     disbelieve_resolver,
+    due,
     force_of_torque_alone,
     hold,
+    stands,
 )
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
@@ -186,7 +189,8 @@ def _moving_variance(s, p, m):
 def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out):
     """What each hypothesis learns of one torque, and how likely each makes it; fills torque sigma and innovation of ``out``.
 
-    Returns the standard deviation of the torque (N m) but for what is not known of the friction state."""
+    Returns the standard deviation of the torque (N m) but for what is not known of the friction state, of a motor that turns
+    and of one that stands."""
     h, speed, s_mean = s.sensitivity[0], 0.5 * (m.speed + s.speed), s.friction_mean
     moving = _moving_variance(s, p, m)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force + s.spring_force, 0.0) * s.gear_slope
@@ -224,15 +228,16 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     stay_finite(s)
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
         uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
-    return sqrt(moving + slow)
+    current = p.torque_constant * p.current_sigma
+    return sqrt(moving + slow), sqrt(current * current + slow)
 
 
 @njit
 def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     """All hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``.
 
-    Returns the standard deviation of the torque (N m) but for what is not known of the friction state; infinite without a
-    torque."""
+    Returns the standard deviation of the torque (N m) but for what is not known of the friction state, of a motor that turns
+    and of one that stands; infinite without a torque."""
     warmth = s.disc - s.growth_start if s.temperature_known else 0.0
     known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
@@ -240,7 +245,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
-    out.torque_sigma = torque_sigma = np.inf
+    out.torque_sigma = turning_sigma = standing_sigma = np.inf
     if np.isfinite(torque):
         trusted = s.plausibility.verdict == AGREE and not s.unknown
         if trusted != s.trusted:
@@ -248,7 +253,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
             open_all(s, p)
             s.trusted = trusted
         mean_force = 0.5 * (force_before + s.force)
-        torque_sigma = _take_torque(
+        turning_sigma, standing_sigma = _take_torque(
             s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out
         )
         # At rest friction's error stays what it is: no noise, and no news.
@@ -275,7 +280,7 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     if out.force < 0.0:
         out.force = 0.0
     out.contact_sigma = contact_sigma(s)
-    return torque_sigma
+    return turning_sigma, standing_sigma
 
 
 @njit
@@ -304,17 +309,17 @@ def _gear(p, x, slope):
 
 
 @njit
-def _beyond_friction(s, p, m, x, force, spread):
+def _beyond_friction(s, p, m, x, force, accelerating, spread):
     """`beyond_friction` of a hypothesis with the errors ``x`` and the clamp force ``force`` N."""
-    torque = _motor_torque(s, p, m, x) - p.inertia * (m.speed - s.speed) / m.dt - x[VISCOUS] * m.speed
+    torque = _motor_torque(s, p, m, x) - accelerating - x[VISCOUS] * m.speed
     gain, load, coulomb = _gear(p, x, s.gear_slope)
     return beyond_friction(torque, force + s.spring_force, spread, gain, load, coulomb)
 
 
 @njit
 def _torque_alone(s, p, m):
-    """Clamp force and its standard deviation (N) by the torque alone if nothing has jumped, then the gear gain,
-    load friction (m/rad) and offset friction (N m)."""
+    """Clamp force and its standard deviation (N) by the torque alone if nothing has jumped, then that torque
+    (N m), the gear gain, load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
     gain, load, coulomb = _gear(p, s.error, slope)
     torque = _motor_torque(s, p, m, s.error) - gain * spring
@@ -322,17 +327,18 @@ def _torque_alone(s, p, m):
     sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / gain)
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
-    return force, sigma, gain, load, coulomb
+    return force, sigma, torque, gain, load, coulomb
 
 
 @njit
-def _least_beyond_friction(s, p, m, spread):
-    """`beyond_friction` of the hypothesis that explains the torque best, among those that may explain it."""
-    beyond = _beyond_friction(s, p, m, s.error, s.force, spread)
+def _least_beyond_friction(s, p, m, accelerating, spread):
+    """`beyond_friction` of the hypothesis that explains the torque best, among those that may explain it; ``accelerating``:
+    what accelerates the motor, N m."""
+    beyond = _beyond_friction(s, p, m, s.error, s.force, accelerating, spread)
     for kind in range(DRIFT):
         a = s.alternatives[kind]
         if a.log_odds > _LONG_LIKELY:
-            beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, spread))
+            beyond = min(beyond, _beyond_friction(s, p, m, a.error, s.force + a.shift, accelerating, spread))
     return beyond
 
 
@@ -354,15 +360,24 @@ def _facts_of_torque(s, p):
 
 
 @njit
-def take_sides(s, p, m, torque_sigma, out):
-    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``torque_sigma`` N m, as
-    `fuse` returns it."""
+def take_sides(s, p, m, turning_sigma, standing_sigma, out):
+    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``turning_sigma`` and
+    ``standing_sigma`` N m, as `fuse` returns them."""
     c = s.plausibility
-    force, sigma, gain, load, coulomb = _torque_alone(s, p, m)
+    force, sigma, torque, gain, load, coulomb = _torque_alone(s, p, m)
+    swings = 0
+    if m.has_current and stands(c, m.angle):
+        swings = hold(c, s.force, standing_sigma, gain, load, coulomb, p.presliding_angle)
+        # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
+        if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
+            spread = hypot(gain * out.stiffness_sigma, standing_sigma)
+            beyond = _least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE
+            if due(c, beyond * spread / p.inertia, s.late + effects.known_delay(p.effects), m.dt):
+                swings = max(swings, 1)
     if np.isfinite(out.innovation):
-        beyond = _least_beyond_friction(s, p, m, hypot(gain * out.stiffness_sigma, torque_sigma))
+        spread = hypot(gain * out.stiffness_sigma, turning_sigma)
+        beyond = _least_beyond_friction(s, p, m, p.inertia * (m.speed - s.speed) / m.dt, spread)
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
-    swings = hold(c, m.angle != s.angle, s.force, torque_sigma, gain, load, coulomb) if m.has_current else 0
     if swings > 1:
         disbelieve_resolver(c)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
@@ -391,7 +406,7 @@ def take_sides(s, p, m, torque_sigma, out):
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = hypot(out.sigma, out.innovation)
     if swings > 0 and c.verdict == AGREE:
-        out.sigma = hypot(out.sigma, force - out.force)
+        out.sigma = hypot(out.sigma, hypot(sigma, force - out.force))
         facts |= PATHS_CONTRADICT
     if c.verdict == TORQUE_FROZEN:
         facts |= CURRENT_IMPLAUSIBLE

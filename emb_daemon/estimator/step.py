@@ -108,7 +108,7 @@ def step(s, p, m, out):
     # Over a gap the current of its last cycle and the mean acceleration say nothing of each other.
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown:
         watch_contact(s, p, m, force_before, torque, leverage)
-    torque_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
+    turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
     out.torque_force, out.ml_force = np.nan, s.force
@@ -117,7 +117,7 @@ def step(s, p, m, out):
         force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
-    facts = take_sides(s, p, m, torque_sigma, out)
+    facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
     bound(s.monitor, p, m)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage

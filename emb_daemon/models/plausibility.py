@@ -5,8 +5,8 @@ everything learned let expect. Its squares, less what model errors may make of t
 inspection schemes", Biometrika 41, 1954): a few samples far off or many less far off raise the alarm, and as many good ones
 end it. Which path is wrong is decided by what only one of them uses:
 
-    resolver   angle and speed repeat to the bit although torque or speed must turn the motor, the angle alone while the torque
-               swings up and down by more than friction at rest can carry, or the angle does not follow the speed
+    resolver   angle and speed repeat to the bit although torque or speed must turn the motor, the angle stands while the
+               torque swings up and down by more than friction at rest can carry, or the angle does not follow the speed
     current    repeats to the bit, or asks for force while the pads do not touch
 
 Otherwise it stays open; then stiffness goes on, and its standard deviation covers the difference.
@@ -23,8 +23,8 @@ from emb_daemon.jit import fields, njit
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``held_low``, ``held_high``: between
-#: what it has been since the angle moved last or the torque last swung, ``swings`` times since the angle moved, upwards
-#: (``swing`` 1) or downwards (-1).
+#: what it has been since the angle left ``held_angle`` (rad), ``held`` samples ago, or the torque last swung, ``swings`` times
+#: since then, upwards (``swing`` 1) or downwards (-1); ``due_speed`` (rad/s), ``due_angle`` (rad): how it should have turned.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -33,8 +33,8 @@ PLAUSIBILITY = np.dtype(
         *fields("i8", "still idle alike flickered current_flickered"),
         *fields("f8", "current frozen_s"),
         ("averaged", "?"),
-        *fields("f8", "torque_mean torque_variance held_low held_high"),
-        *fields("i8", "swing swings"),
+        *fields("f8", "torque_mean torque_variance held_angle held_low held_high due_speed due_angle"),
+        *fields("i8", "held swing swings"),
     ],
     align=True,
 )
@@ -62,6 +62,13 @@ _RETURNED, _ALIKE_RAD = 25, 0.05
 _STICTION = 0.3
 #: Standard deviations of one sample's torque that its mean over `_AVERAGED_S` does not reach.
 _CERTAIN = 6.0
+#: An angle that stands changes by less, rad: three counts of a resolver of 12 bit. By so many times as much may friction turn
+#: over as the calibration's does within that.
+_STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
+#: Angle by which a motor must have turned to be contradicted by one that stands, rad: eight times as much it would turn from
+#: rest where in truth it came from one side and went back there. And the torque's standard deviations that do not turn it:
+#: chance shows as much in one sample of 700, and this takes three in a row.
+_DUE_RAD, BEYOND_CHANCE = 10.0 * _STANDS_RAD, 3.0
 #: Standard deviations of the contact angle by which the motor is clear of it when the pads do not touch.
 _CLEAR_OF_CONTACT = 6.0
 #: Time over which torque is averaged when it must do without the resolver, s.
@@ -88,7 +95,7 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
     c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
     if abs(step) > _ALIKE_RAD + delay:
         c.alike = 0
-    elif travel != 0.0:
+    elif abs(travel) > _STANDS_RAD:
         c.alike += 1
     c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
     if m.has_current:
@@ -142,24 +149,45 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 
 @njit
-def hold(c, moved, force, sigma, gear_gain, load_friction, offset_friction):
-    """How often the motor must have turned though the angle has repeated to the bit: the smoothed torque went up or down by
-    more than friction at rest carries in both directions under a clamp force of ``force`` N. Once alone may be an offset of
-    the current, there and back is none.
+def stands(c, angle):
+    """Whether the motor angle ``angle``, rad, stands."""
+    if abs(angle - c.held_angle) <= _STANDS_RAD:
+        c.held += 1
+        return True
+    c.held_angle, c.held_low, c.held_high = angle, c.torque_mean, c.torque_mean
+    c.held = c.swing = c.swings = 0
+    c.due_speed = c.due_angle = 0.0
+    return False
 
-    ``moved``: whether the angle did at this sample; ``sigma``: standard deviation of the torque, N m."""
-    if moved:
-        c.held_low = c.held_high = c.torque_mean
-        c.swing = c.swings = 0
-        return 0
+
+@njit
+def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_angle):
+    """How often the motor must have turned though the angle stands: the smoothed torque went up or down by more than friction
+    at rest carries in both directions under a clamp force of ``force`` N, as far as it turns over within that angle. Once
+    alone may be an offset of the current, there and back is none.
+
+    ``sigma``: standard deviation of the torque, N m; ``presliding_angle`` rad."""
     c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
     carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
-    if c.held_high - c.held_low > 2.0 * carried + _CERTAIN * sigma:
+    turned_over = 1.0 - exp(-_PRESLIDING_TURNS * _STANDS_RAD / presliding_angle)
+    if c.held_high - c.held_low > 2.0 * turned_over * carried + _CERTAIN * sigma:
         way = 1 if c.torque_mean > 0.5 * (c.held_low + c.held_high) else -1
         c.swings += way != c.swing
         c.swing = way
         c.held_low = c.held_high = c.torque_mean
     return c.swings
+
+
+@njit
+def due(c, acceleration, delay, dt):
+    """Whether the motor must have turned though the angle stands, which is ``delay`` s late, by an ``acceleration``, rad/s²,
+    that is beyond doubt."""
+    if c.held < 2:
+        # Any acceleration turns a motor that comes in back to where it was a sample ago.
+        return False
+    c.due_speed = c.due_speed + acceleration * dt if acceleration > 0.0 else 0.0
+    c.due_angle += c.due_speed * dt
+    return c.due_angle - c.due_speed * delay > _DUE_RAD
 
 
 @njit
