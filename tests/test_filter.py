@@ -1,10 +1,14 @@
 """The filter: steady state, shape of its covariance, and whether its sigma means what it says."""
 
 import brake
+import city
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.hypotheses import to_force, to_torque
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import add_growth, add_stiffness_jumps, add_torque_jumps, set_priors, set_walks
@@ -27,6 +31,8 @@ from emb_daemon.models.fusion import (
     variance_along,
 )
 from emb_daemon.offline import estimate
+from emb_daemon.resources import resource
+from emb_daemon.wire.contract import TORQUE_ONLY
 
 
 def _update(x, P, gain, innovation, h, variance):
@@ -269,3 +275,37 @@ def test_contact_angle_is_learned_from_the_torque(parameters):
     # Friction may be off by its own share, which torque tells as contact angle: less is left than there was, but not little.
     assert 0.05 < estimates["contact_sigma"][-1] < 0.1
     assert abs(estimates["force"][-1] - force[-1]) < 2.0 * estimates["sigma"][-1]
+
+
+@pytest.mark.parametrize("share", [-0.2, 0.2])
+def test_what_no_model_of_the_torque_explains_moves_no_force_where_the_calibration_states_it(share):
+    """A gear that gives and takes 20 % beyond 3 kN looks to the torque like other pads, as nothing of it is calibrated."""
+    samples, force = city.drive(seconds=60.0)
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    motor = calibration.motor
+    lost = share * np.maximum(force - 3000.0, 0.0) * motor.gear_gain_m_per_rad / motor.torque_constant_Nm_per_A
+    samples = samples.copy()
+    samples["current_q"] += lost
+
+    def errors(lasting):
+        estimates = estimate(samples, to_parameters(moved(calibration, {"noise.torque_lasting": lasting})))
+        error = estimates["force"] - force
+        return np.sqrt(np.mean(error**2)), np.mean(np.abs(error) < 2.0 * np.hypot(estimates["sigma"], 25.0))
+
+    unsaid, said = errors(0.0), errors(0.1)
+    assert unsaid[0] > 1000.0 and unsaid[1] < 0.7
+    assert said[0] < 50.0 and said[1] > 0.95
+
+
+def test_a_torque_that_may_be_off_says_less_of_the_force_alone(parameters):
+    """Where the resolver is not believed, its share of the force is in sigma."""
+    samples, _ = city.drive()
+    samples = samples.copy()
+    frozen = samples[city.CLAMPING : city.CLAMPING + 500]
+    frozen["angle"], frozen["speed"] = frozen["angle"][0], frozen["speed"][0]
+    without = estimate(samples, parameters)
+    parameters["torque_lasting_sigma"] = 0.2
+    stated = estimate(samples, parameters)
+    alone = (without["source"] == TORQUE_ONLY) & (stated["source"] == TORQUE_ONLY)
+    assert alone.sum() > 300 and stated["force"][alone].max() > 5000.0
+    assert stated["sigma"][alone] == pytest.approx(np.hypot(without["sigma"][alone], 0.2 * stated["force"][alone]), rel=0.1)

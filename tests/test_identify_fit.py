@@ -12,7 +12,7 @@ from synthetic_rig import datasheet, draw, pads
 
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import INERTIA, TORQUE_CONSTANT, value_of
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
@@ -225,6 +225,22 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
     assert np.hypot(0.2, np.sqrt(0.5)) < levels["current_A"] < np.hypot(0.2, 1.0)
     density = levels["current_A"] ** 2 * levels["current_correlation_s"]
     assert density == pytest.approx(0.5 * 1.0, rel=0.3)
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.0, 0.0), (0.008, 0.0), (0.05, 0.05), (0.2, 0.2)])
+def test_torque_that_is_off_by_another_share_in_each_manoeuvre_lasts(share, found):
+    """Noise of 0.3 N m on 1 N m says nothing of it, nor does an open brake; a hot log's counts where cold ones show none."""
+    fit = TorqueFit(dict.fromkeys(KEYS, 1.0) | {LOAD_FRICTION: 0.0}, np.eye(len(KEYS)), {})
+    rng, rows = np.random.default_rng(11), np.delete(np.arange(20_000), slice(9_000, 9_250))
+    force = np.where(rows % 2000 < 250, 10.0, 1e4 * rng.uniform(0.7, 1.3, len(rows)))
+
+    def left(share):
+        off = np.repeat(share * rng.choice([-1.0, 1.0], 80), 250)[rows]
+        current = 1e-4 * off * force + rng.normal(0.0, 0.3, len(rows)) + np.where(force < 100.0, 1.0, 0.0)
+        return Unexplained(fit, rows, current, np.zeros(len(rows)), force)
+
+    silent = Unexplained(fit, *[np.empty(0)] * 4)
+    assert noise._lasting([left(0.0), silent, left(share)], 1e-4, 2e4) == pytest.approx(found, rel=0.25)
 
 
 def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monkeypatch):

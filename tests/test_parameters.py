@@ -86,9 +86,9 @@ def test_bounds_and_units():
     assert units["thermal.friction.force_N[3]"] == "N"
     dimensionless = {key.rpartition(".")[2].partition("[")[0] for key, unit in units.items() if unit == "1"}
     assert dimensionless == {
-        "presliding", "stiffness_relative", "torque_relative", "inner_heat_share", "outer_heat_share", "coefficient", "share",
-        "coverage", "residual_ratio", "curve_change", "friction_change", "maximum_friction_share", "pairs_difference",
-        "torque_constant_relative",
+        "presliding", "stiffness_relative", "torque_relative", "torque_lasting", "inner_heat_share", "outer_heat_share",
+        "coefficient", "share", "coverage", "residual_ratio", "curve_change", "friction_change", "maximum_friction_share",
+        "pairs_difference", "torque_constant_relative",
     }  # fmt: skip
 
 

@@ -166,6 +166,8 @@ class Noise(Struct, kw_only=True):
     presliding: Annotated[NonNegative, usual(0.1)]
     #: Relative error of the torque path that stays.
     torque_relative: Annotated[NonNegative, usual(0.05)]
+    #: Relative error of the torque path that stays for some stops and is another in others: what no model of it explains.
+    torque_lasting: Annotated[NonNegative, usual(0.05)] = 0.0
 
 
 class Pad(Struct, kw_only=True):
@@ -489,6 +491,7 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["speed_sigma"] = c.noise.speed_rad_per_s
     p["presliding_sigma"] = c.noise.presliding
     p["torque_relative_sigma"] = c.noise.torque_relative
+    p["torque_lasting_sigma"] = c.noise.torque_lasting
     _fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
     for name, values in c.effects.items():
         for key, value in values.items():

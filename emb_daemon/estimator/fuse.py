@@ -101,6 +101,9 @@ _TELLING = 0.1
 #: Cycles by which an angle is late from where it is told: one sampled in the cycle before, in a frame that waits for the next,
 #: is no fault.
 _TOLD_CYCLES = 2.0
+#: Time for which what no model of the torque explains stays what it is, s: until a brake is as warm and as hard pressed as not
+#: before, which takes some stops.
+_LASTS_S = 10.0
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
@@ -195,11 +198,13 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     moving = _moving_variance(s, p, m)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force + s.spring_force, 0.0) * s.gear_slope
     doubted = s.effects.terms.torque_sigma
-    white = moving + friction_torque * friction_torque * friction_variance + doubted * doubted
+    lasting = p.torque_lasting_sigma * leverage * max(mean_force + s.spring_force, 0.0)
+    white = moving + friction_torque * friction_torque * friction_variance + doubted * doubted + lasting * lasting
     out.torque_sigma = sqrt(white) / leverage
     # At standstill the friction state's error stays what it is, and what a term outside its range is off by does: however many
-    # samples repeat them, they say it once.
+    # samples repeat them, they say it once. So does what no model explains, for some stops.
     white += ((friction_torque * s.friction_variance) ** 2 + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
+    white += lasting * lasting * _LASTS_S / m.dt
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     to_force(h, spread, s.slope, s.force, warmth)
     slope = s.gear_slope
@@ -229,6 +234,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
         uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     current = p.torque_constant * p.current_sigma
+    slow += lasting * lasting
     return sqrt(moving + slow), sqrt(current * current + slow)
 
 
@@ -324,7 +330,7 @@ def _torque_alone(s, p, m):
     gain, load, coulomb = _gear(p, s.error, slope)
     torque = _motor_torque(s, p, m, s.error) - gain * spring
     force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
-    sigma = hypot(sigma, sqrt(s.covariance[OFFSET, OFFSET]) / gain)
+    sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
     return force, sigma, torque, gain, load, coulomb

@@ -53,7 +53,7 @@ PARAMETERS = np.dtype(
             "f8",
             "relaxation_time clearance clearance_sigma maximum_force maximum_speed stiffness_sigma stiffness_relative_sigma "
             "stiffness_correlation_time current_sigma current_correlation_time speed_sigma presliding_sigma "
-            "torque_relative_sigma contact_walk",
+            "torque_relative_sigma torque_lasting_sigma contact_walk",
         ),
         ("gear", GEAR),
         ("thermal", THERMAL),

@@ -45,7 +45,7 @@ _MEASURED_K = 10.0
 #: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
 _GROWTH_JUMP_M_PER_K = 0.26e-6
 #: Torque constant and current gain: datasheets state 2 to 3 %; a calibration's own is known better, and ages.
-_GAIN, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
+GAIN_SIGMA, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
 #: Offset of the motor torque at power-on: share of the torque that the largest force needs (Hall sensors: 0.5 to 1 % of a
 #: range that is several times that current); and time in which it drifts as far again, s.
 _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
@@ -130,7 +130,7 @@ def set_priors(P, p):
             P[i, j] = 0.0
     P[FAST, FAST] = 1.0
     P[CONTACT, CONTACT] = p.clearance_sigma**2
-    P[GAIN, GAIN] = _GAIN**2
+    P[GAIN, GAIN] = GAIN_SIGMA**2
     P[NOISE, NOISE] = (p.torque_constant * p.current_sigma) ** 2
     P[OFFSET, OFFSET] = torque_offset(p) ** 2
     P[SCALE, SCALE] = _SCALE**2

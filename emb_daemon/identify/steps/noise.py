@@ -12,6 +12,7 @@ import numpy as np
 from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
+from emb_daemon.estimator.unknown import GAIN_SIGMA
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
 from emb_daemon.identify.steps import Step
@@ -39,6 +40,9 @@ _SLID = 0.1
 _TOLD = 0.01
 #: Samples of a stretch of which noise is asked where there are any so long.
 _LONG = 50
+#: Share of the largest force from which a relative error of the torque is looked for, manoeuvres of a log that show one, and
+#: standard errors of their mean by which it is more than chance.
+_LOADED, _MANOEUVRES, _SURE = 0.1, 8, 3.0
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -90,6 +94,7 @@ def identify(
         "stiffness_relative": float(np.hypot(relative, interpolation)),
         "stiffness_correlation_s": integral_time([error for error, _ in errors]),
         **torque_levels(held_out + _more_current(held_out, hot_current), gear_gain, speed),
+        "torque_lasting": _lasting([*held_out, *hot_current], gear_gain, known.stiffness.maximum_force_N),
     }
     if not any(pads.random for pads in stiffness.pads):
         levels["stiffness_relative"] = float(
@@ -210,13 +215,39 @@ def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float)
 
 def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> list[Unexplained]:
     """The ``hot`` logs that leave more current for a manoeuvre and longer than any that is ``held_out``."""
-    most = max((rmse(means) for left in held_out if len(means := _means(_stretches(left)))), default=np.inf)
-    return [left for left in hot if len(means := _means(_stretches(left))) and rmse(means) > most]
+    most = max((rmse(means) for left in held_out if len(means := _means(_without_gaps(left, left.current_A)))), default=np.inf)
+    return [left for left in hot if len(means := _means(_without_gaps(left, left.current_A))) and rmse(means) > most]
 
 
-def _stretches(left: Unexplained) -> list[np.ndarray]:
-    """Unexplained current, A, without gaps."""
-    return np.split(left.current_A, np.flatnonzero(np.diff(left.rows) != 1) + 1)
+def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: float) -> float:
+    """Relative error of the torque that lasts for a manoeuvre, on the log that shows most; 0 where noise may be all of it, and
+    what the estimator grants any torque constant does not count.
+
+    Of each manoeuvre the two halves err alike by what lasts and not by noise: the mean of their errors' products is its
+    variance."""
+    worst = 0.0
+    for left in held_out:
+        torque = left.found.values[TORQUE_CONSTANT] * left.current_A
+        load = (gear_gain + left.found.values[LOAD_FRICTION] * left.friction_mean) * left.force_N
+        manoeuvres = [
+            part[row : row + EPISODE].reshape(2, -1)
+            for part in _without_gaps(left, np.arange(len(left.rows)))
+            for row in range(0, len(part) - EPISODE + 1, EPISODE)
+        ]
+        loaded = [own for own in manoeuvres if np.all(np.mean(left.force_N[own], axis=1) > _LOADED * maximum_force_N)]
+        if len(loaded) < _MANOEUVRES:
+            continue
+        halves = np.array(loaded)
+        errors = np.sum(load[halves] * torque[halves], axis=2) / np.sum(load[halves] ** 2, axis=2)
+        products = errors[:, 0] * errors[:, 1]
+        sure = np.mean(products) > _SURE * np.std(products) / np.sqrt(len(products))
+        worst = max(worst, np.mean(products) if sure else 0.0)
+    return float(np.sqrt(max(worst - GAIN_SIGMA**2, 0.0)))
+
+
+def _without_gaps(left: Unexplained, values: np.ndarray) -> list[np.ndarray]:
+    """``values``, one for each row, of neighbouring cycles."""
+    return np.split(values, np.flatnonzero(np.diff(left.rows) != 1) + 1)
 
 
 def _means(series: list[np.ndarray]) -> np.ndarray:
@@ -245,7 +276,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         values = left.found.values
         current, mean, force = left.current_A, left.friction_mean, left.force_N
         torque = values[TORQUE_CONSTANT] * current
-        series += _stretches(left)
+        series += _without_gaps(left, left.current_A)
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET_FRICTION] + values[LOAD_FRICTION] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))
@@ -285,6 +316,7 @@ def section(page: Page, calibration: Calibration) -> None:
             ["motor speed / rad/s", f"{noise.speed_rad_per_s:.3f}"],
             ["friction while it turns over / %", f"{100 * noise.presliding:.0f}"],
             ["torque path, relative / %", f"{100 * noise.torque_relative:.2f}"],
+            ["torque path, relative, other in other stops / %", f"{100 * noise.torque_lasting:.2f}"],
             ["clearance / rad", with_sigma(contact.clearance_rad, contact.clearance_sigma_rad)],
         ],
     )
