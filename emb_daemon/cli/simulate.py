@@ -1,12 +1,11 @@
 """emb-daemon simulate."""
 
 import argparse
-import signal
-import threading
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.cli.logoptions import add_mapping_argument
+from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
@@ -65,13 +64,11 @@ def run(arguments: argparse.Namespace) -> int:
         keys, file = load_keys(arguments.keys), FreshnessFile(arguments.state)
         bus = SecuredBus(bus, Authentication(heard, sent, keys, file.begin_trip(), file))
     live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stopped = stop_signals()
     live.warm_up()
     print(f"{', '.join(corners)}: {arguments.scenario}, {schedule.seconds:.0f} s over and over; Ctrl-C ends it", flush=True)
     try:
-        live.run(stop, arguments.seconds)
+        live.run(lambda: bool(stopped), arguments.seconds)
     finally:
         bus.close()
     print(f"{live.ticks} cycles, {live.late} late, {live.lost} lost, {bus.unsent} frames not sent")
