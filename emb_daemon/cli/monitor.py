@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     handed_out = any(value is not None for value in (arguments.web, arguments.udp, arguments.record))
     if handed_out and arguments.once:
         raise InputError("--once: expected without --web, --record and --udp")
+    if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
+        raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
     if not arguments.once and not handed_out and not sys.stdout.isatty():
         raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
     options = bus_options(arguments)

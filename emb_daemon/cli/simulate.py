@@ -38,6 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.wire.layout import CORNERS, default_layout
     from emb_daemon.wire.secoc import load_links
 
+    if arguments.seconds is not None and not 0.0 < arguments.seconds < float("inf"):
+        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0, or none to go on until it is ended")
+    if arguments.seed < 0:
+        raise InputError(f"--seed {arguments.seed}: expected 0 or more")
     if (arguments.keys is None) != (arguments.state is None):
         raise InputError("--keys and --state: expected both or neither")
     if arguments.keys and arguments.mapping:
