@@ -20,7 +20,10 @@ EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="fleet_command", metavar="COMMAND", required=True)
-    parsers = {name: commands.add_parser(name, help=text, description=text) for name, (_, text) in _COMMANDS.items()}
+    parsers = {
+        name: commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        for name, (_, text) in _COMMANDS.items()
+    }
     ingest = parsers["ingest"]
     ingest.add_argument(
         "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"

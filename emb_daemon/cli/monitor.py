@@ -20,7 +20,7 @@ _PORT = 8250
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--once", action="store_true", help="listen for two seconds, print one line per corner, end")
+    parser.add_argument("--once", action="store_true", help="listen for a second or two, print one line per corner, end")
     parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
     page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)

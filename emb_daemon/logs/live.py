@@ -18,7 +18,7 @@ from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messa
 from emb_daemon.runtime.bus import PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
-from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.frames import FRAME, row_of
 from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
@@ -268,9 +268,7 @@ class ReferenceBus(PythonCanBus):
         rows = []
         for message, time_ns in self._receive():
             if self._concerns_us(message) and not message.is_error_frame:
-                rows.append(
-                    (time_ns, int.from_bytes(message.data[:8], "little"), message.arbitration_id, len(message.data), 0)
-                )
+                rows.append(row_of(message, time_ns))
             elif self._signals.take(message, time_ns):
                 rows += [our.reference(time_ns) for our in self._signals.messages.values() if our.fresh(time_ns)]
         return np.array(rows, FRAME)
