@@ -55,8 +55,8 @@ def write_logs(folder: Path, seed: int) -> int:
 
 
 def command(stage: str, logs: Path, root: Path) -> list[str]:
-    given = [str(logs), "--output", str(root)] if stage == "ingest" else [str(root)]
-    return [sys.executable, "-m", "emb_daemon.cli.main", "fleet", stage, *given, "--resume", "--workers", "2"]
+    given = [str(logs), "--output", str(root)] if stage == "ingest" else [str(root), "--resume"]
+    return [sys.executable, "-m", "emb_daemon.cli.main", "fleet", stage, *given, "--workers", "2"]
 
 
 def disturbed(stage: str, logs: Path, root: Path) -> str:

@@ -34,6 +34,20 @@ _RUNTIME = [
     "tests/test_daemon.py::test_the_service_manager_hears_ready_watchdog_and_stopping",
     "tests/test_reload.py::test_corners_are_not_changed_by_a_reload",
     "tests/test_reload.py::test_a_bad_calibration_is_named_and_the_old_one_stays",
+    *(
+        f"tests/test_pages.py::{name}"
+        for name in (
+            "test_a_page_is_used_as_a_file_with_its_numbers_would_be",
+            "test_what_no_file_may_hold_is_refused_and_nothing_changes",
+            "test_no_page_is_taken_or_left_but_at_rest",
+            "test_a_loop_that_reading_kept_from_hearing_gets_a_moment_to_hear",
+            "test_what_could_not_be_checked_is_not_taken",
+            "test_a_page_that_was_checked_too_late_is_not_taken",
+            "test_a_reload_that_waits_comes_first",
+            "test_a_reload_goes_back_to_the_file",
+            "test_a_page_ends_though_the_file_is_bad_by_then",
+        )
+    ),
 ]
 _SECOC = [
     f"tests/test_secoc.py::{name}"

@@ -330,3 +330,8 @@ def test_a_table_of_units_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "units.csv").write_text(text)
     with pytest.raises(InputError, match=r"units\.csv"):
         findings.read_units(tmp_path / "units.csv")
+
+
+def test_a_table_of_units_that_is_not_there_is_named_once(tmp_path):
+    with pytest.raises(InputError, match=r"^\S*/units\.csv: No such file or directory$"):
+        findings.read_units(tmp_path / "units.csv")

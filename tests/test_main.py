@@ -11,6 +11,7 @@ import pytest
 from emb_daemon.cli import check
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, Unavailable
+from emb_daemon.resources import resource
 
 
 @pytest.mark.parametrize(
@@ -80,3 +81,26 @@ def test_a_terminal_without_our_characters_is_no_reason_to_end():
 def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
     assert main(["bench", "--seconds", seconds]) == 2
     assert "expected at least 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("simulate --seconds -1", "--seconds -1: expected more than 0, or none to go on until it is ended"),
+        ("simulate --seconds inf", "--seconds inf: expected more than 0, or none to go on until it is ended"),
+        ("simulate --seed -3", "--seed -3: expected 0 or more"),
+        ("monitor --web 99999", "--web 99999: expected a port, 0 to 65535; 0 is any that is free"),
+        ("uds --config {config} --state {tmp}/none", "{tmp}/none: no such state directory; give it with --state"),
+        ("replay {tmp}/a.log --pad-thickness -1", "pad_thickness_mm: -1.0 outside"),
+        ("replay {tmp}/a.log --pad-thickness 77",
+         "pad_thickness_mm: 77.0 is too far from the measured; expected 0 to 12.5"),
+        ("fleet ingest {tmp}/a.log --output {tmp}/fleet --workers -1", "--workers -1: expected 1 or more"),
+        ("fleet ingest {tmp}/a.log --output {tmp}/a.log",
+         "{tmp}/a.log: cannot be a folder of the data set: File exists"),
+    ],
+)  # fmt: skip
+def test_a_number_or_a_folder_that_cannot_be_is_refused_in_one_line(tmp_path, capsys, arguments, line):
+    (tmp_path / "a.log").touch()
+    names = {"tmp": tmp_path, "config": resource("config/emb.yaml")}
+    assert main(arguments.format(**names).split()) == 2
+    assert capsys.readouterr().err.startswith(line.format(**names))

@@ -160,6 +160,19 @@ def test_no_other_torque_says_that_the_sensor_is_off(p, torque, speed, samples):
     assert watched.hold(0.2, samples=500) == pytest.approx(fresh.hold(0.2, samples=500)) and watched.w["missing"] == 0.0
 
 
+def test_friction_that_pressed_while_released_and_holds_the_force_up_leaves_just_that_force(p):
+    """The worst of the datasheet's brakes: the strongest magnets and most friction, which hid a part of the sensor's offset in
+    the released brake and carries a part of the force now. Its upper bound is this force to the newton."""
+    watched, force = Watched(p), 0.9 * p["maximum_force"]
+    healthy, dry = OFFSET_SHARE * p["gear_gain"] * p["maximum_force"], MOST_FRICTION * p["offset_friction"]
+    offset = -1.01 * (healthy + dry) / LEAST_GAIN - dry / MOST_GAIN
+    watched.hold(dry / MOST_GAIN + offset, samples=500)
+    held = dry + MOST_FRICTION * p["load_friction"] * force
+    shown = (p["gear_gain"] * force - held) / MOST_GAIN + offset
+    assert shown > 0.0, "else the weakest magnets would allow more"
+    assert watched.hold(shown, samples=500)[1] == pytest.approx(force, abs=1.0)
+
+
 def test_what_the_sensor_was_once_off_by_it_may_still_be(p):
     watched = Watched(p)
     watched.hold(-0.3, samples=500)

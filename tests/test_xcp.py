@@ -560,3 +560,11 @@ def test_the_file_has_words_for_codes_and_knows_its_slave(described):
 def test_wrong_addresses_are_refused(arguments, said, tmp_path, capsys):
     assert main(["xcp", "--config", str(_CONFIGURATION), "--share", str(tmp_path / "estimates"), *arguments]) == 2
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize("given", ["0x800", "-1", "tester"])
+def test_an_id_that_is_none_is_refused_with_what_was_expected(given, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["a2l", "--config", str(_CONFIGURATION), "--output", "x.a2l", f"--request-id={given}"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"--request-id: {given}: expected an 11-bit CAN id, 0 to 0x7ff\n")

@@ -69,15 +69,14 @@ class Adaptation:
         self._thread: threading.Thread | None = None
         for name, calibration in calibrations.items():
             self.replace(name, calibration, self.read(name, calibration))
-            if self._snapshots:
-                in_use = self.in_use(name)
-                snapshot, time_ns, warning = self._snapshots.load(name, in_use)
-                if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
-                    warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
-                if warning:
-                    log.warning("corner %s: %s", name, warning)
-                elif snapshot is not None:
-                    self._resumable[CORNERS.index(name)] = snapshot, time_ns
+            in_use = self.in_use(name)
+            snapshot, time_ns, warning = self._snapshots.load(name, in_use)
+            if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
+                warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
+            if warning:
+                log.warning("corner %s: %s", name, warning)
+            elif snapshot is not None:
+                self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:
         """What the memory holds for a corner with this calibration; may take long and touches nothing in use."""

@@ -154,9 +154,9 @@ def _replace(s, state, error, sigma):
 
 
 @njit
-def _forget_friction(x, P):
-    """Curve and contact angle err together, which the stiffness path's sigma covers; the filter's own contact state holds
-    what may still differ for this very curve. What concerns the motor and its current sensor is no part of them."""
+def _restart_fitted(x, P):
+    """Zero the errors that the stroke fitted anew, friction and the stiffness path's own, and correlate nothing any more with
+    what is not of the motor and its current sensor. Variances stay, but FAST's is the stationary one again."""
     for i in range(len(x)):
         if i not in _OF_THE_MOTOR:
             if i not in (CONTACT, SCALE, GROWTH):
@@ -191,7 +191,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
     s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
     s.effects = t.effects
-    _forget_friction(s.error, s.covariance)
+    _restart_fitted(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
     if not kept:
         # A new curve rests on the torque constant and the inertia of the stroke.
@@ -204,7 +204,7 @@ def apply_learned(s, p, scratch, rows, learned, a):
     s.contact.confirmed, s.contact.lost = True, False
     drift = s.alternatives[DRIFT]
     if kept:
-        _forget_friction(drift.error, drift.covariance)
+        _restart_fitted(drift.error, drift.covariance)
         known = drift.covariance[CONTACT, CONTACT]
         share = known / (known + a.contact_sigma**2)
         drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - weight * moved

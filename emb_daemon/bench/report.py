@@ -108,7 +108,7 @@ def _both(figures: dict) -> str:
 
 def _logs(logs: dict) -> list[str]:
     step, bulk, single = logs["step"], logs["decode_frames_per_s"], logs["cantools_decode_frames_per_s"]
-    lines = [
+    return [
         f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames per second of CPU time:",
         f"  read {logs['read_frames_per_s'] / 1e6:.1f}; replayed {logs['replay_frames_per_s'] / 1e6:.2f}, "
         f"{logs['replay_times_real_time']:.0f} times real time",
@@ -116,7 +116,6 @@ def _logs(logs: dict) -> list[str]:
         f"step: {step['compiled_us']:.2f} us compiled",
         f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}",
     ]
-    return lines
 
 
 def _start(ready: dict) -> str:

@@ -34,7 +34,7 @@ def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
         # One curve is taken for the pads that are mounted, whatever their thickness.
         return 0.0, np.inf
     below, above = (_CARRIED_ON * (thicknesses[k + 1] - thicknesses[k]) for k in (0, -2))
-    return thicknesses[0] - below, thicknesses[-1] + above
+    return max(thicknesses[0] - below, 0.0), thicknesses[-1] + above
 
 
 def rising_force(coefficients: np.ndarray) -> float:

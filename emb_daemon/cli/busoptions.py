@@ -26,9 +26,12 @@ def add_id_arguments(parser: argparse.ArgumentParser, request_id: int, response_
 
 
 def _can_id(text: str) -> int:
-    value = int(text, 0)
+    try:
+        value = int(text, 0)
+    except ValueError:
+        value = -1
     if not 0 <= value <= 0x7FF:
-        raise ValueError
+        raise argparse.ArgumentTypeError(f"{text}: expected an 11-bit CAN id, 0 to 0x7ff")
     return value
 
 

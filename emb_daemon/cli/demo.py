@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from emb_daemon.cli.outputs import check_output
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon demo --corners 4 --seconds 30"
@@ -19,6 +20,5 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not 1.0 <= arguments.seconds <= 3600.0:
         raise InputError(f"--seconds {arguments.seconds:g}: expected 1 to 3600")
-    if not arguments.picture.absolute().parent.is_dir():
-        raise InputError(f"--picture {arguments.picture}: no such folder {arguments.picture.absolute().parent}")
+    check_output(arguments.picture, [])
     return run_demo(arguments.corners, arguments.seconds, arguments.picture)

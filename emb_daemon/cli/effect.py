@@ -12,7 +12,8 @@ EXAMPLE = "emb-daemon effect export calibration.yaml term:gear_friction:motor_an
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    export = commands.add_parser("export", help="write a term that diagnose found as an effect file")
+    does = "write a term that diagnose found as an effect file"
+    export = commands.add_parser("export", help=does, description=does.capitalize() + ".")
     export.add_argument("calibration", type=Path, metavar="CALIBRATION", help="which has the term")
     export.add_argument("term", metavar="TERM", help="its name, as the calibration states it")
     export.add_argument("--output", type=Path, required=True, metavar="FILE", help="effect file to write")

@@ -10,6 +10,7 @@ from typing import Any
 from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
 from emb_daemon.cli.progress import progress
+from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
 EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
@@ -19,7 +20,10 @@ EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="fleet_command", metavar="COMMAND", required=True)
-    parsers = {name: commands.add_parser(name, help=text, description=text) for name, (_, text) in _COMMANDS.items()}
+    parsers = {
+        name: commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        for name, (_, text) in _COMMANDS.items()
+    }
     ingest = parsers["ingest"]
     ingest.add_argument(
         "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"
@@ -38,12 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parsers[name].add_argument(
             "--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A"
         )
+    for name in ("replay", "learn", "diagnose"):
+        parsers[name].add_argument("--resume", action="store_true", help="go on: keep what is there of the same calibration")
     for name in ("ingest", "replay", "learn", "diagnose"):
         parsers[name].add_argument(
             "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see DIR; default: this machine"
         )
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
-        parsers[name].add_argument("--resume", action="store_true", help="go on: keep what is there of the same calibration")
     parsers["diagnose"].add_argument(
         "--units", type=Path, metavar="FILE.csv", help="what units have in common: columns unit, batch, supplier, ..."
     )
@@ -66,6 +71,8 @@ def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list,
     from emb_daemon.fleet.cluster import cluster
     from emb_daemon.fleet.cluster import run as run_on
 
+    if arguments.workers is not None and arguments.workers < 1:
+        raise InputError(f"--workers {arguments.workers}: expected 1 or more")
     if not items:
         return []
     with progress(text) as show, cluster(arguments.scheduler, arguments.workers) as client:
@@ -73,9 +80,9 @@ def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list,
 
 
 def _ingest(arguments: argparse.Namespace) -> int:
-    from emb_daemon.fleet import ingest
+    from emb_daemon.fleet import dataset, ingest
 
-    root = arguments.output.absolute()
+    root = dataset.folder_of(arguments.output.absolute())
     paths = ingest.log_files(arguments.logs)
     jobs = ingest.jobs(root, paths, arguments.unit or ingest.UNIT_OF_PATH, arguments.mapping and arguments.mapping.absolute())
     done = _work(arguments, "reading logs", partial(ingest.ingest, root), jobs, partial(ingest.give_up, root))

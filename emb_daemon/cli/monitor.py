@@ -20,7 +20,7 @@ _PORT = 8250
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--once", action="store_true", help="listen for two seconds, print one line per corner, end")
+    parser.add_argument("--once", action="store_true", help="listen for a second or two, print one line per corner, end")
     parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
     page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     handed_out = any(value is not None for value in (arguments.web, arguments.udp, arguments.record))
     if handed_out and arguments.once:
         raise InputError("--once: expected without --web, --record and --udp")
+    if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
+        raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
     if not arguments.once and not handed_out and not sys.stdout.isatty():
         raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
     options = bus_options(arguments)

@@ -44,17 +44,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import msgspec
     import numpy as np
 
     from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.parameters import moved
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
 
     _check(arguments)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     if arguments.pad_thickness is not None:
-        calibration = msgspec.structs.replace(calibration, pad_thickness_mm=arguments.pad_thickness)
+        calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
     if not calibration.contact.is_in_reach:
         clearance = calibration.contact.clearance_rad
         print(

@@ -1,12 +1,11 @@
 """emb-daemon simulate."""
 
 import argparse
-import signal
-import threading
 from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.cli.logoptions import add_mapping_argument
+from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
@@ -39,6 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.wire.layout import CORNERS, default_layout
     from emb_daemon.wire.secoc import load_links
 
+    if arguments.seconds is not None and not 0.0 < arguments.seconds < float("inf"):
+        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0, or none to go on until it is ended")
+    if arguments.seed < 0:
+        raise InputError(f"--seed {arguments.seed}: expected 0 or more")
     if (arguments.keys is None) != (arguments.state is None):
         raise InputError("--keys and --state: expected both or neither")
     if arguments.keys and arguments.mapping:
@@ -65,13 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
         keys, file = load_keys(arguments.keys), FreshnessFile(arguments.state)
         bus = SecuredBus(bus, Authentication(heard, sent, keys, file.begin_trip(), file))
     live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stopped = stop_signals()
     live.warm_up()
     print(f"{', '.join(corners)}: {arguments.scenario}, {schedule.seconds:.0f} s over and over; Ctrl-C ends it", flush=True)
     try:
-        live.run(stop, arguments.seconds)
+        live.run(lambda: bool(stopped), arguments.seconds)
     finally:
         bus.close()
     print(f"{live.ticks} cycles, {live.late} late, {live.lost} lost, {bus.unsent} frames not sent")

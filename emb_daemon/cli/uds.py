@@ -6,6 +6,7 @@ from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids
 from emb_daemon.cli.serving import serve
+from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
@@ -31,6 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     listened = Listener().ids
     check_ids(arguments, listened)
     state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
+    if not state.is_dir():
+        raise InputError(f"{state}: no such state directory; give it with --state")
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
     try:
         diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, host_and_port
+from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids, host_and_port
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
@@ -57,7 +57,6 @@ def _udp(text: str):
 def _can(arguments: argparse.Namespace, setup):
     import numpy as np
 
-    from emb_daemon.cli.busoptions import bus_options, check_ids
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.workshop.ifdata import over_can
     from emb_daemon.workshop.measure import Can

@@ -84,7 +84,7 @@ class Session:
 
     def run(self, show, period_s: float) -> None:
         """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
-        drive = (self._stop, self.seconds, self.recorder.sent, self.recorder.heard)
+        drive = (self._stop.is_set, self.seconds, self.recorder.sent, self.recorder.heard)
         daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")
         # The car goes first: a real one waits for nobody.
         car = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY + 1, self.live.run, *drive), name="car")

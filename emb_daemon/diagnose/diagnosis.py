@@ -151,6 +151,7 @@ def diagnose(
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
     """The same of logs that are cut into episodes already; ``judges``: the validation logs."""
     begin, calibration = time.monotonic(), bench.calibration
+    judged_on = "validate" if judges else "left_out_episodes"
     selection = select(bench, progress)
     progress("confirming with the running estimator", 0.8)
     selection, left_out = confirm(selection, judges)
@@ -167,10 +168,10 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     logs = [trial.log for trial in bench.trials]
     result = Diagnosis(
         original=calibration,
-        calibration=_with_provenance(augmented, selection, after, judges is not None, logs),
+        calibration=_with_provenance(augmented, selection, after, judged_on, logs),
         bench=bench,
         judges=judging,
-        judged_on="validate" if judges else "left_out_episodes",
+        judged_on=judged_on,
         selection=selection,
         findings=findings(selection),
         recalibrated=_list_recalibrated(selection),
@@ -399,7 +400,7 @@ def with_terms(calibration: Calibration, selection: Selection) -> Calibration:
 
 
 def _with_provenance(
-    calibration: Calibration, selection: Selection, after: EpisodeErrors, validated: bool, logs: Sequence[Log]
+    calibration: Calibration, selection: Selection, after: EpisodeErrors, judged_on: str, logs: Sequence[Log]
 ) -> Calibration:
     old = calibration.provenance
     sigmas, figures = (dict(old.sigmas), dict(old.figures)) if old else ({}, {})
@@ -408,7 +409,6 @@ def _with_provenance(
         weight = next((abs(move.weight) for move in c.moves if move.key == c.name), 0.0)
         if weight and np.isfinite(sigma) and not c.name.startswith("terms["):
             sigmas[c.name] = float(sigma * weight)
-    judged_on = "validate" if validated else "left_out_episodes"
     figures |= {f"diagnose.{judged_on}.{path}_rmse_N": after.rmse(path) for path in after.paths}
     sources = tuple(
         Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())

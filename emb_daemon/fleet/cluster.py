@@ -110,7 +110,9 @@ def run(
             suspects.append(row)
             return
         except CancelledError:
-            raise Unavailable("the scheduler is gone; the same command with --resume goes on when it is back") from None
+            raise Unavailable(
+                "the scheduler is gone; when it is back, the same command goes on, with --resume where it has that"
+            ) from None
         finally:
             future.release()
         done += 1

@@ -153,7 +153,9 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: {error}") from None
     if not rows or "unit" not in rows[0] or len(rows[0]) < 2:
         raise InputError(f"{path}: expected a header 'unit,FACTOR,...' and rows under it")

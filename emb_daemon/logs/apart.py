@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.wire.frames import FRAME, row_of
 
 #: CPU time that a reader gets: to start, s, and for each megabyte, s. BLF takes python-can up to 5 s a megabyte.
 _START_S, _PER_MEGABYTE_S = 30.0, 60.0
@@ -35,11 +35,8 @@ def frames_of(content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray,
     channels = []
     for message in kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file):
         octets += message.data
-        flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
-        flags |= FD * message.is_fd
-        data = int.from_bytes(message.data[:8], "little")
         channels.append(str(message.channel + 1 if reader_name in _FROM_ZERO else message.channel))
-        rows.append((round(message.timestamp * 1e9), data, message.arbitration_id, len(message.data), flags))
+        rows.append(row_of(message, round(message.timestamp * 1e9)))
     return np.array(rows, FRAME), np.frombuffer(octets, np.uint8), np.array(channels, "U32")
 
 

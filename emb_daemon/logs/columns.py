@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.jit import njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
@@ -11,6 +12,8 @@ from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import load_database, signal_columns, unpack
 
+#: Depths below the friction surface at which a rig's pads have thermocouples, mm: where the estimator tells temperatures.
+DEPTHS_MM = tuple(round(1e3 * depth_m) for depth_m in DEPTHS_M)
 #: How far a reference's frame may be from a sample that it belongs to: half a cycle.
 _NEAR_NS = CYCLE_NS // 2
 
@@ -105,7 +108,7 @@ class References:
         self.pads = {}
         for side in ("Inner", "Outer"):
             pad = decoder.columns(frames, f"RIG_{corner}_{side}Pad")
-            depths = np.array([pad[f"{side}PadTemp{depth}mm"] for depth in (2, 4, 6, 8)])
+            depths = np.array([pad[f"{side}PadTemp{depth}mm"] for depth in DEPTHS_MM])
             self.pads[side.lower()] = (pad["time_ns"], depths)
 
     def at(self, time_ns: np.ndarray, values: np.ndarray) -> np.ndarray:

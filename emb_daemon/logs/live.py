@@ -18,7 +18,7 @@ from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messa
 from emb_daemon.runtime.bus import PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
-from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.frames import FRAME, row_of
 from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
@@ -72,6 +72,10 @@ class _Message:
         values = [value for value in self.signals.values() if isinstance(value, _Value)]
         return all(value.heard_ns and now_ns - value.heard_ns <= most for value in values)
 
+    def last(self) -> dict[str, float]:
+        """By signal what was heard last, or is constant."""
+        return {name: value.last if isinstance(value, _Value) else value for name, value in self.signals.items()}
+
     def frame(self, values: dict[str, float], time_ns: int) -> tuple | None:
         """A FRAME row; None where a value is none that the message can carry."""
         payload = 0
@@ -85,10 +89,9 @@ class _Message:
 
     def reference(self, time_ns: int) -> tuple:
         """A FRAME row of a reference instrument's message, with what is mapped in it."""
-        payload = 0
+        payload, values = 0, self.last()
         for name, layout in self.layout.items():
-            value = self.signals.get(name, math.nan)
-            value = value.last if isinstance(value, _Value) else value
+            value = values.get(name, math.nan)
             if layout["low"] <= value <= layout["high"]:
                 payload |= int(pack(value, layout))
             else:
@@ -136,11 +139,9 @@ class _Signals:
         for our in self.messages.values():
             for value in our.signals.values():
                 if isinstance(value, _Value):
-                    source = value.source
-                    message, _, signal = source.name.rpartition(".")
-                    theirs = mapping.databases[source.bus].get_message_by_name(message)
+                    source, theirs = value.source, mapping.message_of(value.source)
                     readers = self._readers.setdefault((theirs.frame_id, theirs.is_extended_frame), [])
-                    readers.append((mapping.channels[source.bus], theirs, signal, value))
+                    readers.append((mapping.channels[source.bus], theirs, source.signal, value))
 
     def take(self, message, time_ns: int) -> bool:
         """Whether a frame of the rig (python-can Message) holds any of the signals; then they have its values."""
@@ -230,7 +231,7 @@ class MappedBus(PythonCanBus):
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
     """Angle and speed at a sample; one that the rig does not measure from the other, since the sample before."""
-    known = {name: v.last if isinstance(v, _Value) else v for name, v in resolver.signals.items()}
+    known = resolver.last()
     elapsed_s = 1e-9 * (time_ns - resolver.sent_ns) if resolver.sent_ns else math.inf
     before = resolver.before
     if "MotorAngle" not in known:
@@ -245,7 +246,7 @@ def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
 
 def _complete(slow: _Message) -> dict[str, float]:
     """A slow message's values, with those that others stand in for (`resample.SUBSTITUTES`)."""
-    known = {name: v.last if isinstance(v, _Value) else v for name, v in slow.signals.items()}
+    known = slow.last()
     plates = [known[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in known]
     if plates:
         mean = 0.5 * (plates[0] + plates[-1])
@@ -267,9 +268,7 @@ class ReferenceBus(PythonCanBus):
         rows = []
         for message, time_ns in self._receive():
             if self._concerns_us(message) and not message.is_error_frame:
-                rows.append(
-                    (time_ns, int.from_bytes(message.data[:8], "little"), message.arbitration_id, len(message.data), 0)
-                )
+                rows.append(row_of(message, time_ns))
             elif self._signals.take(message, time_ns):
                 rows += [our.reference(time_ns) for our in self._signals.messages.values() if our.fresh(time_ns)]
         return np.array(rows, FRAME)

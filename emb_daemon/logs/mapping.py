@@ -116,11 +116,12 @@ class MappingFile(Struct, kw_only=True):
 
 
 class Source:
-    """One foreign signal of a bus (None: the only one), and how it becomes ours: ``scale`` and ``offset`` from the rig's unit
-    to ours, ``span_ns`` None is a sampling period."""
+    """One foreign signal of a bus (None: the only one), its ``name`` in a DBC ``message`` and ``signal``, and how it becomes
+    ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a sampling period."""
 
     def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
         self.name, self.bus, self.period = mapped.signal, mapped.bus, mapped.period
+        self.message, _, self.signal = mapped.signal.rpartition(".")
         self.scale, self.offset, self.span_ns = scale, offset, span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
@@ -254,8 +255,11 @@ class Mapping:
     @property
     def has_fd(self) -> bool:
         """Whether any of the rig's mapped messages is CAN FD."""
-        names = {(s.bus, s.name.rpartition(".")[0]) for message in self.messages for s in self._sources(message).values()}
-        return any(self.databases[bus].get_message_by_name(name).is_fd for bus, name in names)
+        return any(self.message_of(source).is_fd for name in self.messages for source in self._sources(name).values())
+
+    def message_of(self, source: Source):
+        """The rig's message (cantools) that has a signal."""
+        return self.databases[source.bus].get_message_by_name(source.message)
 
     def taken(self, layout: np.ndarray) -> list[str]:
         """A fault for each message of the rig's DBC with an id that the daemon of a LAYOUT sends with."""
@@ -319,10 +323,9 @@ class Mapping:
         clocks = [next(iter(self._sources(f"EMB_{corner}_Resolver").values()), None) for corner in CORNERS]
         names = {}
         for source in filter(None, clocks):
-            message, _, _ = source.name.rpartition(".")
             place, channel = [], self.channels.get(source.bus)
             if self.databases:
-                place.append(f"{self.databases[source.bus].get_message_by_name(message).frame_id:#x}")
+                place.append(f"{self.message_of(source).frame_id:#x}")
             if channel is not None:
                 place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None

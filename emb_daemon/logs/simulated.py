@@ -68,12 +68,13 @@ class SimulatedRig(PythonCanBus):
                     self._readers.setdefault(ours.frame_id, []).append((column, source, self._their(mapping, source)))
 
     def _their(self, mapping: Mapping, source: Source) -> _Theirs:
-        name, _, signal = source.name.rpartition(".")
-        message = mapping.databases[source.bus].get_message_by_name(name)
+        message = mapping.message_of(source)
         if message.is_multiplexed():
-            raise InputError(f"{mapping.path}: {name} is multiplexed, and which part to send is not known; expected another")
-        theirs = self._theirs.setdefault((source.bus, name), _Theirs(message, mapping.channels[source.bus]))
-        theirs.missing.add(signal)
+            raise InputError(
+                f"{mapping.path}: {message.name} is multiplexed, and which part to send is not known; expected another"
+            )
+        theirs = self._theirs.setdefault((source.bus, message.name), _Theirs(message, mapping.channels[source.bus]))
+        theirs.missing.add(source.signal)
         return theirs
 
     def send(self, frames: np.ndarray) -> None:
@@ -83,7 +84,7 @@ class SimulatedRig(PythonCanBus):
         for frame in frames:
             for column, source, theirs in self._readers.get(int(frame["can_id"]), ()):
                 value = (float(unpack(frame["data"], column)) - source.offset) / source.scale
-                theirs.set(source.name.rpartition(".")[2], value if source.period is None else value % source.period)
+                theirs.set(source.signal, value if source.period is None else value % source.period)
                 changed[id(theirs)] = theirs
         for theirs in changed.values():
             if theirs.missing:

@@ -12,7 +12,7 @@ from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import InputError
 from emb_daemon.interface.signals import OUTPUTS
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.logs.columns import References, latest
+from emb_daemon.logs.columns import DEPTHS_MM, References, latest
 from emb_daemon.logs.read import needs_extra
 from emb_daemon.wire.contract import MODES, SOURCES, reason_words
 from emb_daemon.wire.layout import CORNERS
@@ -56,7 +56,7 @@ def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.nd
         "disc_ref_C": reference.latest(time_ns, reference.disc_C),
     }
     for side, (stamps, depths) in reference.pads.items():
-        for depth, values in zip((2, 4, 6, 8), depths, strict=True):
+        for depth, values in zip(DEPTHS_MM, depths, strict=True):
             columns[f"{side}_{depth}mm_ref_C"] = latest(stamps, values, time_ns)
     return {name: values for name, values in columns.items() if np.isfinite(values).any()}
 

@@ -7,6 +7,7 @@ import json
 import socket
 import threading
 import time
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -145,7 +146,7 @@ class Datagrams:
         self._socket.close()
 
 
-def hand_out(bus, receivers: list, stopped=lambda: False) -> None:
+def hand_out(bus, receivers: list, stopped: Callable[[], bool]) -> None:
     """Hear a bus for ``receivers``, until ``stopped()``."""
     listener = Listener()
     bus.drain()

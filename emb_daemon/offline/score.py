@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_daemon.logs.columns import References, latest
+from emb_daemon.logs.columns import DEPTHS_MM, References, latest
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
@@ -104,7 +104,7 @@ def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: R
     errors = []
     for side, name in enumerate(("inner", "outer")):
         at, values = reference.pads[name]
-        for index, depth in enumerate((2, 4, 6, 8)):
+        for index, depth in enumerate(DEPTHS_MM):
             error = latest(time_ns, estimates["depth"][:, side, index], at) - values[index]
             errors.append(error)
             if np.isfinite(error).any():

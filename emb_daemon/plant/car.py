@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_daemon.jit import njit
+from emb_daemon.logs.columns import DEPTHS_MM
 from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, motor_angle, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
@@ -63,11 +64,10 @@ class World(NamedTuple):
 def _reference_wires() -> np.ndarray:
     database = wire.load_database(resource("dbc/rig.dbc"))
     wires = np.zeros(1, REFERENCE_WIRES)
-    depths = (2, 4, 6, 8)
     kinds = (
         ("Force", ("ClampForceRef", "BrakeTorqueRef", "DiscTempRef")),
-        ("InnerPad", tuple(f"InnerPadTemp{depth}mm" for depth in depths)),
-        ("OuterPad", tuple(f"OuterPadTemp{depth}mm" for depth in depths)),
+        ("InnerPad", tuple(f"InnerPadTemp{depth}mm" for depth in DEPTHS_MM)),
+        ("OuterPad", tuple(f"OuterPadTemp{depth}mm" for depth in DEPTHS_MM)),
     )
     for kind, (name, signals) in enumerate(kinds):
         for corner, label in enumerate(wire.CORNERS):
@@ -78,7 +78,7 @@ def _reference_wires() -> np.ndarray:
 
 
 @njit
-def _train(p, s, training, command, drive, standing):
+def _train(s, training, command, drive, standing):
     """The command that training motion puts in the place of ``command``; changes ``training``."""
     allowed = drive.park_brake == PARK_APPLIED and drive.brake_request == 0 and standing
     training.silent += 1
@@ -280,7 +280,7 @@ def _tick(w, rng, commands, drive, frames, truth):
     count = 0
     for row in range(len(w.corners)):
         p, s, training, corner = w.plants[row], w.states[row], w.trainings[row], w.corners[row]
-        mode, target, rate = _train(p, s, training, commands[row], drive, car.speed == 0.0)
+        mode, target, rate = _train(s, training, commands[row], drive, car.speed == 0.0)
         _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, rng)
         _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, training, truth[row])
         count = _fast_frames(w, rng, row, frames, count)

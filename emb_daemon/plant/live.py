@@ -1,7 +1,7 @@
 """The simulated car in real time on a bus."""
 
-import threading
 import time
+from collections.abc import Callable
 
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import CYCLE_NS
@@ -33,15 +33,15 @@ class LiveCar:
         spare = Car(self.car.plants, self.car.corners)
         spare.hear(spare.tick(self._commands[0], self._drives[0]))
 
-    def run(self, stop: threading.Event, seconds: float | None = None, sent=None, heard=None) -> None:
-        """Run until ``stop`` is set or ``seconds`` are over.
+    def run(self, stopped: Callable[[], bool], seconds: float | None = None, sent=None, heard=None) -> None:
+        """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle has left, with its TRUTH rows and when it left, 0 if it was lost;
         ``heard(frames)`` with whatever came from the bus since. Both views are valid during the call only.
         """
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()
-        while not stop.is_set() and self.ticks != last:
+        while not stopped() and self.ticks != last:
             row = self.ticks % len(self._drives)
             frames = self.car.tick(self._commands[row], self._drives[row])
             self.ticks += 1

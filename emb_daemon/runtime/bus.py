@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.wire.frames import FRAME, row_of
 
 #: Frames of our own that may still be on their way back; four corners send 16 in their busiest tick.
 _ECHOES = 256
@@ -73,17 +73,7 @@ class PythonCanBus:
             message, time_ns = found
             if not self._concerns_us(message) or self._is_echo(message):
                 continue
-            frame = self._frames[count]
-            frame["time_ns"] = time_ns
-            frame["can_id"] = message.arbitration_id
-            frame["length"] = len(message.data)
-            frame["data"] = int.from_bytes(message.data[:8], "little")
-            frame["flags"] = (
-                EXTENDED * message.is_extended_id
-                | REMOTE * message.is_remote_frame
-                | ERROR * message.is_error_frame
-                | FD * message.is_fd
-            )
+            self._frames[count] = row_of(message, time_ns)
             count += 1
         self.full = count == len(self._frames)
         return self._frames[:count]

@@ -9,3 +9,10 @@ FRAME = np.dtype([("time_ns", "i8"), ("data", "u8"), ("can_id", "u4"), ("length"
 EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
 #: Set by `wire.secoc` alone: authentication was asked for, and this frame has none.
 UNAUTHENTIC = 16
+
+
+def row_of(message, time_ns: int) -> tuple[int, int, int, int, int]:
+    """A python-can Message as a FRAME row; of CAN FD's payload the first eight bytes."""
+    flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame
+    flags |= ERROR * message.is_error_frame | FD * message.is_fd
+    return time_ns, int.from_bytes(message.data[:8], "little"), message.arbitration_id, len(message.data), flags
