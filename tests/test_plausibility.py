@@ -162,7 +162,7 @@ def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
 @pytest.mark.parametrize("flicker", [0.0, 1e-3])
 def test_resolver_that_has_slipped_on_its_shaft_is_covered_as_soon_as_the_motor_must_turn(flicker):
     """Angle and speed of a rotor that stands, with their noise: the torque that releases a held brake accelerates its motor,
-    and no more than ten samples of force are beyond four sigma before that is said."""
+    and no more than 80 ms of force are beyond four sigma before that is said."""
 
     def slip(rows):
         rng = np.random.default_rng(3)
@@ -173,7 +173,7 @@ def test_resolver_that_has_slipped_on_its_shaft_is_covered_as_soon_as_the_motor_
     during = slice(BEFORE_RELEASE, BEFORE_RELEASE + _LASTING)
     beyond = np.abs(estimates["force"] - force)[during] > 4.0 * estimates["sigma"][during]
     assert np.abs(estimates["stiffness_force"] - force)[during].max() > 3000.0
-    assert beyond.sum() <= 10
+    assert beyond.sum() <= 20
     assert np.any(estimates["reasons"][during] & r.PATHS_DISAGREE) and _recovered(estimates, force)
 
 

@@ -190,6 +190,12 @@ def test_a_motor_that_stands_under_a_torque_that_must_turn_it_is_due():
     assert _due_after(flicker, 0.0) is None and _due_after(flicker, -1000.0) is None
 
 
+def test_a_torque_of_one_sample_may_have_just_begun():
+    c = np.zeros(1, PLAUSIBILITY)
+    said = [stands(c[0], 0.0) and due(c[0], acceleration, 0.0, _DT) for acceleration in [0.0] * 20 + [50_000.0, 0.0] * 20]
+    assert not any(said)
+
+
 def _swings(torques, angles=None, presliding_angle=0.02):
     """What `hold` makes of smoothed torques (N m) over a force that friction of 0.1 N m holds."""
     c = np.zeros(1, PLAUSIBILITY)

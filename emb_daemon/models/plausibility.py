@@ -24,7 +24,8 @@ from emb_daemon.jit import fields, njit
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``held_low``, ``held_high``: between
 #: what it has been since the angle left ``held_angle`` (rad), ``held`` samples ago, or the torque last swung, ``swings`` times
-#: since then, upwards (``swing`` 1) or downwards (-1); ``due_speed`` (rad/s), ``due_angle`` (rad): how it should have turned.
+#: since then, upwards (``swing`` 1) or downwards (-1); ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s),
+#: ``due_angle`` (rad): how it should have turned.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -33,7 +34,7 @@ PLAUSIBILITY = np.dtype(
         *fields("i8", "still idle alike flickered current_flickered"),
         *fields("f8", "current frozen_s"),
         ("averaged", "?"),
-        *fields("f8", "torque_mean torque_variance held_angle held_low held_high due_speed due_angle"),
+        *fields("f8", "torque_mean torque_variance held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings"),
     ],
     align=True,
@@ -156,7 +157,7 @@ def stands(c, angle):
         return True
     c.held_angle, c.held_low, c.held_high = angle, c.torque_mean, c.torque_mean
     c.held = c.swing = c.swings = 0
-    c.due_speed = c.due_angle = 0.0
+    c.due_acceleration = c.due_speed = c.due_angle = 0.0
     return False
 
 
@@ -182,10 +183,13 @@ def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_
 def due(c, acceleration, delay, dt):
     """Whether the motor must have turned though the angle stands, which is ``delay`` s late, by an ``acceleration``, rad/s²,
     that is beyond doubt."""
+    # What a torque does at a sample it has done since the last only if it did it then: it may have just begun.
+    lasting = min(acceleration, c.due_acceleration)
+    c.due_acceleration = acceleration
     if c.held < 2:
         # Any acceleration turns a motor that comes in back to where it was a sample ago.
         return False
-    c.due_speed = c.due_speed + acceleration * dt if acceleration > 0.0 else 0.0
+    c.due_speed = c.due_speed + lasting * dt if lasting > 0.0 else 0.0
     c.due_angle += c.due_speed * dt
     return c.due_angle - c.due_speed * delay > _DUE_RAD
 
