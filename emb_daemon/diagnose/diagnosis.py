@@ -28,7 +28,7 @@ from emb_daemon.diagnose.unexplained import Dependence, Left, dependences
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
-from emb_daemon.offline.levels import force_error_levels, integral_time
+from emb_daemon.offline.levels import force_error_levels, integral_time, lasting_share
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
@@ -159,6 +159,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     augmented = (
         with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
     )
+    augmented = _with_lasting(augmented, selection)
     progress("judging", 0.9)
     judging = judges or bench
     before = errors(judging, calibration)
@@ -382,6 +383,27 @@ def _with_less_noise(calibration: Calibration, selection: Selection) -> Calibrat
         stiffness_correlation_s=integral_time(np.split(residual, lengths)),
     )
     return msgspec.structs.replace(calibration, noise=levels)
+
+
+def _with_lasting(calibration: Calibration, selection: Selection) -> Calibration:
+    """The calibration with the relative error of the torque that nothing explains and that lasts for a manoeuvre, if that is
+    more than it states: the filter would take it for other pads. What is the same in all of them it learns, and what the
+    calibration grants a gear that wears."""
+    bench = selection.model.bench
+    residual = bench.residuals(selection.applied()).get("torque")
+    if residual is None or not (bench.has_reference and bench.clamps):
+        return calibration
+    ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]
+    loads = np.where(residual != 0.0, selection.screening.signals["clamp_force"], 0.0)
+    apart = residual - (residual @ loads) / max(loads @ loads, 1.0) * loads
+    worst, noise = 0.0, calibration.noise
+    for error, force in zip(np.split(apart, ends), np.split(loads, ends), strict=True):
+        rows = np.flatnonzero(error)
+        cuts = np.flatnonzero(np.diff(rows) != 1) + 1
+        pairs = zip(np.split(error[rows], cuts), np.split(force[rows], cuts), strict=True)
+        worst = max(worst, lasting_share(pairs, calibration.stiffness.maximum_force_N))
+    beyond = float(np.sqrt(max(worst**2 - noise.torque_relative**2, 0.0)))
+    return moved(calibration, {"noise.torque_lasting": max(beyond, noise.torque_lasting)})
 
 
 def with_terms(calibration: Calibration, selection: Selection) -> Calibration:

@@ -76,7 +76,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    return " ".join([text, *_recalibration(diagnosis), *_unexplained(diagnosis)])
+    return " ".join([text, *_recalibration(diagnosis), *_unexplained(diagnosis), *_stated(diagnosis)])
 
 
 def _recalibration(diagnosis: Diagnosis) -> list[str]:
@@ -111,6 +111,13 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
         return [f"{text}, which depend on no signal that was recorded."]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
     return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}."]
+
+
+def _stated(diagnosis: Diagnosis) -> list[str]:
+    before, now = (c.noise.torque_lasting for c in (diagnosis.original, diagnosis.calibration))
+    if now <= before:
+        return []
+    return [f"Some stops leave the torque off by another {100.0 * now:.2g} %, which the calibration states from now on."]
 
 
 def table(diagnosis: Diagnosis) -> str:

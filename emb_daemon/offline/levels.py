@@ -1,11 +1,17 @@
 """What an error of a clamp force is like, as the filter needs it: how large, and how long it stays."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from emb_daemon.estimator.unknown import GAIN_SIGMA
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Cycles up to which an error is followed, ten seconds, and correlation below which nothing of it is left.
 _LAGS, _GONE = 2500, 0.05
+#: Share of the largest load from which a relative error is looked for, cycles of a manoeuvre, how many of them must show it,
+#: and standard errors of their mean by which it is more than chance.
+_LOADED, _MANOEUVRE, _MANOEUVRES, _SURE = 0.1, 250, 8, 3.0
 
 
 def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
@@ -46,3 +52,26 @@ def force_error_levels(errors: np.ndarray, force: np.ndarray) -> tuple[float, fl
 
     found = minimize(cost, [floor_start, relative_start], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-7})
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
+
+
+def lasting_share(pairs: Iterable[tuple[np.ndarray, np.ndarray]], largest: float) -> float:
+    """Relative error of a torque that lasts for a manoeuvre; 0 where noise may be all of it. What the estimator grants any
+    torque constant does not count.
+
+    The two halves of a manoeuvre err alike by what lasts and not by noise: the mean of their errors' products is its variance.
+
+    Args:
+        pairs: error and load of gap-free series, one value for each cycle, in the same unit.
+        largest: the load of the largest force.
+    """
+    products = []
+    for error, load in pairs:
+        count = len(load) // _MANOEUVRE
+        errors, loads = (values[: count * _MANOEUVRE].reshape(count, 2, _MANOEUVRE // 2) for values in (error, load))
+        loaded = np.all(loads.mean(axis=2) > _LOADED * largest, axis=1)
+        errors, loads = errors[loaded], loads[loaded]
+        products.append(np.prod(np.sum(errors * loads, axis=2) / np.sum(loads * loads, axis=2), axis=1))
+    shown = np.concatenate(products) if products else np.zeros(0)
+    if len(shown) < _MANOEUVRES or not np.mean(shown) > _SURE * np.std(shown) / np.sqrt(len(shown)):
+        return 0.0
+    return float(np.sqrt(max(np.mean(shown) - GAIN_SIGMA**2, 0.0)))

@@ -12,7 +12,6 @@ import numpy as np
 from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.estimator.unknown import GAIN_SIGMA
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
 from emb_daemon.identify.steps import Step
@@ -28,7 +27,7 @@ from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import Log
-from emb_daemon.offline.levels import force_error_levels, integral_time
+from emb_daemon.offline.levels import force_error_levels, integral_time, lasting_share
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
@@ -40,9 +39,6 @@ _SLID = 0.1
 _TOLD = 0.01
 #: Samples of a stretch of which noise is asked where there are any so long.
 _LONG = 50
-#: Share of the largest force from which a relative error of the torque is looked for, manoeuvres of a log that show one, and
-#: standard errors of their mean by which it is more than chance.
-_LOADED, _MANOEUVRES, _SURE = 0.1, 8, 3.0
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
 
@@ -220,29 +216,14 @@ def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> 
 
 
 def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: float) -> float:
-    """Relative error of the torque that lasts for a manoeuvre, on the log that shows most; 0 where noise may be all of it, and
-    what the estimator grants any torque constant does not count.
-
-    Of each manoeuvre the two halves err alike by what lasts and not by noise: the mean of their errors' products is its
-    variance."""
-    worst = 0.0
+    """Relative error of the torque that lasts for a manoeuvre, on the log that shows most."""
+    shares = []
     for left in held_out:
         torque = left.found.values[TORQUE_CONSTANT] * left.current_A
         load = (gear_gain + left.found.values[LOAD_FRICTION] * left.friction_mean) * left.force_N
-        manoeuvres = [
-            part[row : row + EPISODE].reshape(2, -1)
-            for part in _without_gaps(left, np.arange(len(left.rows)))
-            for row in range(0, len(part) - EPISODE + 1, EPISODE)
-        ]
-        loaded = [own for own in manoeuvres if np.all(np.mean(left.force_N[own], axis=1) > _LOADED * maximum_force_N)]
-        if len(loaded) < _MANOEUVRES:
-            continue
-        halves = np.array(loaded)
-        errors = np.sum(load[halves] * torque[halves], axis=2) / np.sum(load[halves] ** 2, axis=2)
-        products = errors[:, 0] * errors[:, 1]
-        sure = np.mean(products) > _SURE * np.std(products) / np.sqrt(len(products))
-        worst = max(worst, np.mean(products) if sure else 0.0)
-    return float(np.sqrt(max(worst - GAIN_SIGMA**2, 0.0)))
+        pairs = zip(_without_gaps(left, torque), _without_gaps(left, load), strict=True)
+        shares.append(lasting_share(pairs, gear_gain * maximum_force_N))
+    return max(shares)
 
 
 def _without_gaps(left: Unexplained, values: np.ndarray) -> list[np.ndarray]:
