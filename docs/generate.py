@@ -120,8 +120,8 @@ def _structs(title: str, text: str, kind: type) -> str:
 
 def _catalogue() -> str:
     out = ["# Catalogue of effects", "", "The physical effects that the thesis does not model and the estimator can. Each is"]
-    out += ["one file in `emb_daemon/effects`; an entry under `effects` in a calibration switches it on. `emb-daemon diagnose`"]
-    out += ["finds out which of them a log proves. [How to add one](effects.md).", ""]
+    out += ["one file in `emb_daemon/effects`; an entry under `effects` in a calibration switches it on. `diagnose`"]
+    out += ["finds which of them a log proves. [How to add one](effects.md).", ""]
     out += ["A *placebo* is a disturbed form of an effect that must not explain the residual: if it explains half of what"]
     out += ["the effect explains, `diagnose` refuses the effect.", ""]
     for path, words in _PATHS.items():

@@ -94,8 +94,7 @@ class CampaignFile(Struct, kw_only=True):
     #: A new random motor angle every 100 ms between released and clamped, beginning released: for relaxation, inertia and
     #: friction.
     random: tuple[Trial, ...] = ()
-    #: Trainings with other pads, whose reference force is not used for learning: identification only judges adaptation on
-    #: them.
+    #: Trainings with other pads, without reference force, for the study of adaptation. Identification uses only their `judge`.
     adaptation: tuple[Training, ...] = ()
     #: Logs with sinusoids, for figures over frequency.
     frequency_response: tuple[Sine, ...] = ()
