@@ -297,7 +297,8 @@ def main() -> None:
     attacks += [(f"played back after {old} s, 0.5 ms ahead", played_back(frames, old)) for old in _OLD_S]
     attacks.append((f"{_FLOOD_PER_S} valid frames/s of any counter on one id", flood(frames, rng)))
     print(f"seed {arguments.seed}, {arguments.seconds:g} s\n")
-    print("| attack | frames | accepted | usable | off by over 3 sigma, N | off without a reason, N |\n|---|---|---|---|---|---|")
+    print("| attack | frames | accepted | usable | off by over 3 sigma, N | off without a reason, N |")
+    print("|---|---|---|---|---|---|")
     for name, foreign in attacks:
         mixed = np.concatenate([frames, foreign])
         order = np.argsort(mixed["time_ns"], kind="stable")
