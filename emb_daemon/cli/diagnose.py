@@ -16,9 +16,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="FIT_LOG", help="logs to find effects in")
     parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration to start from")
     parser.add_argument(
-        "--validate", nargs="+", type=Path, default=[], metavar="LOG", help="logs that judge only; default: left-out episodes"
+        "--validate",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="LOG",
+        help="logs for validation only (default: episodes left out)",
     )
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="calibration.yaml, report.json, report.html")
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="folder for calibration.yaml, report.json, report.html"
+    )
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
 
