@@ -119,9 +119,11 @@ def _structs(title: str, text: str, kind: type) -> str:
 
 
 def _catalogue() -> str:
-    out = ["# Catalogue of effects", "", "What the thesis's models lack and the estimator knows; each is one file in"]
-    out += ["`emb_daemon/effects`, switched on by an entry in a calibration's `effects`. `emb-daemon diagnose` finds which"]
-    out += ["of them a log proves. [How to add one](effects.md).", ""]
+    out = ["# Catalogue of effects", "", "The physical effects that the thesis does not model and the estimator can. Each is"]
+    out += ["one file in `emb_daemon/effects`; an entry under `effects` in a calibration switches it on. `diagnose`"]
+    out += ["finds which of them a log proves. [How to add one](effects.md).", ""]
+    out += ["A *placebo* is a disturbed form of an effect that must not explain the residual: if it explains half of what"]
+    out += ["the effect explains, `diagnose` refuses the effect.", ""]
     for path, words in _PATHS.items():
         out += [f"## Effects on {words}", ""]
         for effect in REGISTRY:
@@ -157,16 +159,16 @@ def pages() -> dict[str, str]:
     return {
         "calibration.md": _structs(
             "Calibration file",
-            "Everything identified of one actuator with its pads and disc. `emb-daemon identify` writes it, "
-            "`emb-daemon check` lists every fault of one with its line. Keys carry their unit; an unknown key, a key that "
-            "stands twice or a number that is not finite is refused. [Learned values](integration.md#files) are never "
-            "written into it.",
+            "The keys of a calibration: the file from which the estimator knows a brake. `emb-daemon identify` writes it; "
+            "`emb-daemon check` lists every fault of it with its line. Each key ends in its unit. A file with an unknown key, "
+            "with a key that occurs twice or with a number that is not finite is refused. The daemon never writes into this "
+            "file; it keeps [learned values](integration.md#files) in its state directory.",
             types.Calibration,
         ),
         "configuration.md": _structs(
             "Configuration file",
-            "What `emb-daemon run` and `check` read, for example `config/emb.yaml`. Bus options on the command line and "
-            "python-can's `CAN_*` variables come before what stands here.",
+            "The keys of the file that `emb-daemon run`, `check`, `uds`, `xcp` and `a2l` read with `--config`. Bus options on "
+            "the command line and python-can's `CAN_*` variables override the file.",
             configuration.Configuration,
         ),
         "mapping.md": _structs(
@@ -177,8 +179,8 @@ def pages() -> dict[str, str]:
         ),
         "campaign.md": _structs(
             "Campaign and datasheet",
-            "What `emb-daemon identify` reads: which log plays which part, and what the supplier states. "
-            "[What to record, and why](own_actuator.md).",
+            "The keys of the two files that `emb-daemon identify` reads. The campaign says which log was recorded for which "
+            "purpose; the datasheet holds the supplier's nominal values. [What to record, and why](own_actuator.md).",
             campaign_file.CampaignFile,
         ) + "\n# Datasheet\n\n" + _structs("", "", campaign_file.Datasheet).split("\n", 4)[4],
         "catalogue.md": _catalogue(),

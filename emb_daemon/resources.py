@@ -1,5 +1,6 @@
 """Files that ship with the package: DBC, example configuration, systemd units."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
@@ -18,3 +19,11 @@ def resource(name: str) -> Path:
         if path.exists():
             return path
     raise FileNotFoundError(f"{name}: not part of this installation; reinstall emb_daemon")
+
+
+def shipped_configuration(folder: Path, corners: Sequence[str], *settings: str) -> Path:
+    """A configuration in ``folder`` that gives all ``corners`` the shipped calibration; ``settings`` are further lines."""
+    calibration, path = str(resource("config/calibration.yaml")), folder / "emb.yaml"
+    lines = [f"  {corner}: {{calibration: {calibration!r}}}" for corner in corners]
+    path.write_text("\n".join(["format: 1", *settings, "corners:", *lines, ""]), encoding="utf-8")
+    return path

@@ -247,7 +247,7 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
             total += (len(foreign), others, missing, changed)
         turn += 1
     genuine_frames = turn * int(_of_drive(genuine).sum())
-    print(f"\n| attack on authenticated frames | frames | taken | genuine lost, of {genuine_frames} | forces changed |")
+    print(f"\n| attack on authenticated frames | frames | accepted | genuine lost, of {genuine_frames} | forces changed |")
     print("|---|---|---|---|---|")
     for name, total in totals.items():
         print("| {} | {} | {} | {} | {} |".format(name, *total))
@@ -297,7 +297,8 @@ def main() -> None:
     attacks += [(f"played back after {old} s, 0.5 ms ahead", played_back(frames, old)) for old in _OLD_S]
     attacks.append((f"{_FLOOD_PER_S} valid frames/s of any counter on one id", flood(frames, rng)))
     print(f"seed {arguments.seed}, {arguments.seconds:g} s\n")
-    print("| attack | frames | taken | usable | off by over 3 sigma, N | off without a reason, N |\n|---|---|---|---|---|---|")
+    print("| attack | frames | accepted | usable | off by over 3 sigma, N | off without a reason, N |")
+    print("|---|---|---|---|---|---|")
     for name, foreign in attacks:
         mixed = np.concatenate([frames, foreign])
         order = np.argsort(mixed["time_ns"], kind="stable")

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.bench.loop import measure_loop
-from emb_daemon.resources import resource
+from emb_daemon.resources import shipped_configuration
 from emb_daemon.wire.layout import CORNERS
 from studies.xcp import _MEASURED, Master
 
@@ -81,10 +81,7 @@ def _children(*commands: list) -> Iterator[list[subprocess.Popen]]:
 def another_car(folder: Path) -> Iterator[list[str]]:
     """A simulated car and its daemon, neither of them in real time; gives the options of their bus."""
     bus = ["-i", "udp_multicast", "-c", f"239.74.166.{os.getpid() % 250 + 3}"]
-    calibration = str(resource("config/calibration.yaml"))
-    corners = [f"  {corner}: {{calibration: {calibration!r}}}" for corner in CORNERS]
-    settings = "realtime: {fifo_priority: null, lock_memory: false}"
-    (folder / "emb.yaml").write_text("\n".join(["format: 1", "log_level: error", settings, "corners:", *corners, ""]))
+    shipped_configuration(folder, CORNERS, "log_level: error", "realtime: {fifo_priority: null, lock_memory: false}")
     with _children(["simulate", *bus], ["run", "--config", folder / "emb.yaml", *bus]):
         yield bus
 

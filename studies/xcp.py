@@ -19,7 +19,7 @@ import numpy as np
 
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
 from emb_daemon.interface.signals import INPUTS, OUTPUTS
-from emb_daemon.resources import resource
+from emb_daemon.resources import shipped_configuration
 from emb_daemon.runtime.shared import SHARED, SharedEstimates
 from emb_daemon.wire.layout import CORNERS
 from emb_daemon.workshop.image import address_of
@@ -116,9 +116,7 @@ def main() -> int:
     group, command = f"239.74.165.{os.getpid() % 250 + 3}", [sys.executable, "-m", "emb_daemon.cli.main"]
     with tempfile.TemporaryDirectory(dir="/dev/shm") as name:
         folder = Path(name)
-        calibration = str(resource("config/calibration.yaml"))
-        corners = [f"  {corner}: {{calibration: {calibration!r}}}" for corner in CORNERS]
-        (folder / "emb.yaml").write_text("\n".join(["format: 1", "log_level: error", "corners:", *corners, ""]))
+        shipped_configuration(folder, CORNERS, "log_level: error")
         bus, config, share = ["-i", "udp_multicast", "-c", group], ["--config", folder / "emb.yaml"], folder / "estimates"
         children = [
             subprocess.Popen([*command, "run", *config, "--share", share, *bus]),

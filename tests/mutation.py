@@ -41,6 +41,7 @@ _RUNTIME = [
             "test_what_no_file_may_hold_is_refused_and_nothing_changes",
             "test_no_page_is_taken_or_left_but_at_rest",
             "test_a_loop_that_reading_kept_from_hearing_gets_a_moment_to_hear",
+            "test_pages_are_taken_one_after_the_other",
             "test_what_could_not_be_checked_is_not_taken",
             "test_a_page_that_was_checked_too_late_is_not_taken",
             "test_a_reload_that_waits_comes_first",

@@ -221,9 +221,15 @@ def test_what_is_no_file_holds_nobody_up(tmp_path):
 
 
 @given(st.text(max_size=200))
-def test_no_text_makes_the_reader_fall(text):
+def test_no_text_makes_the_reader_fall(tmp_path_factory, text):
     with pytest.raises(InputErrors):
-        load_yaml(resource("config/calibration.yaml"), Calibration, text)
+        load_yaml(_file(tmp_path_factory, text), Calibration)
+
+
+def _file(tmp_path_factory, text):
+    path = tmp_path_factory.getbasetemp() / "example.yaml"
+    path.write_bytes(text.encode())
+    return path
 
 
 class _Everything(Struct, kw_only=True):
@@ -243,10 +249,9 @@ _number = st.floats(allow_nan=False, allow_infinity=False)
 @given(st.builds(_Everything, text=_words, number=_number, whole=st.integers(), flag=st.booleans(),
                  numbers=st.lists(_number, max_size=4).map(tuple),
                  table=st.dictionaries(_words, st.dictionaries(_words, _number, max_size=2), max_size=2)))  # fmt: skip
-def test_what_is_written_is_read(value):
+def test_what_is_written_is_read(tmp_path_factory, value):
     """Through the calibration's own dumper: any text, also one that looks like a number, any finite number."""
-    text = dump_calibration(value)
-    assert load_yaml(resource("config/calibration.yaml"), _Everything, text) == value
+    assert load_yaml(_file(tmp_path_factory, dump_calibration(value)), _Everything) == value
 
 
 @given(st.floats(1e-6, 10.0), st.floats(1e-9, 1e-3), st.dictionaries(_words, _number, max_size=3))

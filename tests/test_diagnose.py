@@ -23,7 +23,7 @@ from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.episodes import episodes
-from emb_daemon.diagnose.evidence import Averaging, Moments, false_discovery, judge, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out
 from emb_daemon.diagnose.forms import harmonic, made_effect
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.model import Model
@@ -142,11 +142,6 @@ def test_left_out_error_is_that_of_fits_without_the_episode():
         kept = episode != number
         values = np.linalg.lstsq(table[kept], target[kept], rcond=None)[0]
         assert result.left_out[number] == pytest.approx(np.sum((target - table @ values)[~kept] ** 2), rel=1e-6)
-
-
-def test_false_discovery_rate_of_benjamini_and_hochberg():
-    p = np.array([0.01, 0.04, 0.03, 0.5])
-    assert false_discovery(p) == pytest.approx([0.04, 0.16 / 3.0, 0.16 / 3.0, 0.5])
 
 
 def test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut():
@@ -397,7 +392,7 @@ def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
     [term] = made.accepted
     assert term.endswith(":motor_speed")
     # The term has proven that something is there: too few episodes for the catalogue's own test do not speak against a name.
-    monkeypatch.setattr("emb_daemon.diagnose.screening.false_discovery", np.ones_like)
+    monkeypatch.setattr("scipy.stats.false_discovery_control", np.ones_like)
     monkeypatch.setattr("emb_daemon.diagnose.selection.Q_VALUE", 0.0)
     named = revise(grammar._called_by_name(made, channel))
     assert named.accepted == ["viscous_friction"]

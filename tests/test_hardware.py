@@ -195,7 +195,7 @@ def test_replay_of_a_machine_without_pads_says_what_a_clamp_force_is_not(tmp_pat
     table = foreignkit.write_table(tmp_path / "a.parquet", stops)
     mapping, calibration = str(tmp_path / "mapping.yaml"), str(tmp_path / "c.yaml")
     assert main(["replay", str(table), "--mapping", mapping, "--calibration", calibration]) == 0
-    assert f"{calibration}: nothing to clamp within 10000 rad" in capsys.readouterr().err
+    assert f"{calibration}: contact.clearance_rad is 10000 rad, so there is nothing to clamp" in capsys.readouterr().err
 
 
 def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():

@@ -23,7 +23,7 @@ from emb_daemon.resources import resource
         (OSError(errno.ENOSPC, "No space left on device"), 1, "emb-daemon check: No space left on device"),
         (ModuleNotFoundError("x", name="scipy.optimize"), 2,
          "emb-daemon check needs scipy.optimize: pip install 'emb_daemon[offline]'"),
-        (MemoryError(), 2, "emb-daemon check: this machine has not the memory for that"),
+        (MemoryError(), 2, "emb-daemon check: not enough memory on this machine"),
         (KeyboardInterrupt(), 130, None),
     ],
 )  # fmt: skip
@@ -86,8 +86,8 @@ def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("simulate --seconds -1", "--seconds -1: expected more than 0, or none to go on until it is ended"),
-        ("simulate --seconds inf", "--seconds inf: expected more than 0, or none to go on until it is ended"),
+        ("simulate --seconds -1", "--seconds -1: expected more than 0; leave it out to run until Ctrl-C"),
+        ("simulate --seconds inf", "--seconds inf: expected more than 0; leave it out to run until Ctrl-C"),
         ("simulate --seed -3", "--seed -3: expected 0 or more"),
         ("monitor --web 99999", "--web 99999: expected a port, 0 to 65535; 0 is any that is free"),
         ("uds --config {config} --state {tmp}/none", "{tmp}/none: no such state directory; give it with --state"),

@@ -202,6 +202,19 @@ def test_a_loop_that_reading_kept_from_hearing_gets_a_moment_to_hear(daemon):
     assert request.wait() == Answer() and in_use(daemon) == of({CLEARANCE: 7.0})
 
 
+def test_pages_are_taken_one_after_the_other(daemon):
+    silent(daemon.pipeline)
+    first, second = Request(page({CLEARANCE: 7.0})), Request(page({CLEARANCE: 8.0}))
+    daemon.ask_page(first)
+    follow(daemon, lambda: first.read_ns)
+    daemon.ask_page(second)
+    daemon._follow_reload()
+    for value in (7.0, 8.0):
+        rest(daemon.pipeline)
+        follow(daemon, lambda value=value: in_use(daemon) == of({CLEARANCE: value}))
+    assert first.wait() == second.wait() == Answer()
+
+
 def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
     """Whatever ends the check."""
     monkeypatch.setattr("emb_daemon.runtime.pages.moved", lambda *_, **__: 1 / 0)

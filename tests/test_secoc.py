@@ -416,6 +416,7 @@ class TestFreshnessFile:
 
     def test_it_outlives_a_restart_with_what_was_heard(self, tmp_path):
         first = opened(tmp_path)
+        assert not first.stale(), "nothing was heard yet"
         first.verify(signed())
         assert first.stale()
         first.close()

@@ -257,10 +257,13 @@ _GOOD = {
 def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed, said):
     text = dump_calibration(calibration)
     good = msgspec.structs.replace(calibration, terms=(Term(**_GOOD),))
-    assert load_yaml(tmp_path / "c.yaml", Calibration, dump_calibration(good)) == good
+    path = tmp_path / "c.yaml"
+    path.write_text(dump_calibration(good))
+    assert load_yaml(path, Calibration) == good
     broken = "".join(f"\n  {key}: {value}" for key, value in ({**_GOOD, **changed}).items()).replace("\n  ", "\n- ", 1)
+    path.write_text(f"{text}\nterms:{broken}\n")
     with pytest.raises(InputErrors, match="terms") as raised:
-        load_yaml(tmp_path / "c.yaml", Calibration, f"{text}\nterms:{broken}\n")
+        load_yaml(path, Calibration)
     assert said in str(raised.value)
 
 

@@ -342,4 +342,4 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path):
 
 def test_an_id_that_the_daemon_sends_is_refused(capsys):
     assert main(["uds", "--config", str(_CONFIGURATION), "--request-id", "0x200", "-i", "virtual", "-c", "none"]) == 2
-    assert capsys.readouterr().err == "--request-id 0x200: expected an id that nobody else has\n"
+    assert capsys.readouterr().err == "--request-id 0x200: expected an id that no other message uses\n"

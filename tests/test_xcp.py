@@ -555,7 +555,7 @@ def test_the_file_has_words_for_codes_and_knows_its_slave(described):
 @pytest.mark.parametrize("arguments, said", [
     (["--udp", "5555"], "--udp 5555: expected HOST:PORT, such as 127.0.0.1:5555\n"),
     (["--can", "-i", "virtual", "-c", "x", "--request-id", "0x200"],
-     "--request-id 0x200: expected an id that nobody else has\n"),
+     "--request-id 0x200: expected an id that no other message uses\n"),
 ])  # fmt: skip
 def test_wrong_addresses_are_refused(arguments, said, tmp_path, capsys):
     assert main(["xcp", "--config", str(_CONFIGURATION), "--share", str(tmp_path / "estimates"), *arguments]) == 2

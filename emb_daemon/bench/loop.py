@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.ahead import library
 from emb_daemon.bench import empty
-from emb_daemon.resources import resource
+from emb_daemon.resources import shipped_configuration
 from emb_daemon.runtime.rawcan import connected_sockets
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
@@ -72,11 +72,7 @@ class _Child:
 def _configured(corners: int) -> Iterator[list]:
     """Configuration and state folder, as arguments of `bench.served`."""
     with tempfile.TemporaryDirectory() as folder:
-        calibration = str(resource("config/calibration.yaml"))
-        lines = [f"  {name}: {{calibration: {calibration!r}}}" for name in CORNERS[:corners]]
-        config = Path(folder) / "emb.yaml"
-        config.write_text("\n".join(["format: 1", "log_level: error", "corners:", *lines, ""]))
-        yield [config, Path(folder) / "state"]
+        yield [shipped_configuration(Path(folder), CORNERS[:corners], "log_level: error"), Path(folder) / "state"]
 
 
 def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict:

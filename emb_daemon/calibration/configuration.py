@@ -19,13 +19,13 @@ from emb_daemon.wire.secoc import load_links
 
 
 class Bus(Struct, kw_only=True):
-    """The CAN bus, in python-can's words; the command line and CAN_* variables come before it."""
+    """The CAN bus, with the options of python-can. The command line and CAN_* variables override it."""
 
-    #: python-can's name of the interface, such as socketcan.
+    #: Name of the interface in python-can, such as socketcan.
     interface: str | None = None
-    #: Such as can0.
+    #: Channel of the interface, such as can0.
     channel: str | None = None
-    #: In bit/s, for interfaces that set it.
+    #: Bit rate in bit/s, for interfaces that set it.
     bitrate: Annotated[int, Meta(gt=0)] | None = None
 
     def __post_init__(self):
@@ -40,57 +40,57 @@ class Bus(Struct, kw_only=True):
 
 
 class Corner(Struct, kw_only=True):
-    """One wheel's brake."""
+    """The brake of one wheel."""
 
     #: Calibration file, relative to this configuration.
     calibration: str
 
 
 class Realtime(Struct, kw_only=True):
-    """What makes the loop punctual where the system allows it."""
+    """Settings that keep the loop punctual. The daemon runs without those that the system does not permit."""
 
-    #: SCHED_FIFO priority, or null for ordinary scheduling.
+    #: SCHED_FIFO priority; null: ordinary scheduling.
     fifo_priority: Annotated[int, Meta(ge=1, le=99)] | None = 60
-    #: CPU to run the loop on, or null for any.
+    #: CPU on which the loop runs; null: any.
     cpu: Annotated[int, Meta(ge=0)] | None = None
-    #: Keep all memory in RAM (mlockall).
+    #: Whether to keep all memory of the process in RAM (mlockall).
     lock_memory: bool = True
 
 
 class Secoc(Struct, kw_only=True):
-    """Authenticated communication, both ways (AUTOSAR SecOC); needs a state directory and the extra secoc."""
+    """Authentication of received and sent messages (AUTOSAR SecOC). It needs a state directory and the extra secoc."""
 
-    #: File of keys, relative to this configuration; a systemd credential of that name comes before it. Its owner alone may
-    #: read it; a line is the name of an authentication message, such as EMB_FL_Auth, and 32 hexadecimal digits.
+    #: File of keys, relative to this configuration; a systemd credential of that name overrides it. Only its owner may have
+    #: permission to read it. A line is the name of an authentication message, such as EMB_FL_Auth, and 32 hexadecimal digits.
     keys: str
 
 
 class Xcp(Struct, kw_only=True):
-    """What a measurement tool may do besides measuring."""
+    """What a measurement tool (XCP) may do besides measuring."""
 
-    #: Whether it may try other numbers of the calibration, with the car standing and the brakes released, until its server
-    #: ends. Files stay as they are.
+    #: Whether the tool may change numbers of the calibration in use, while the car stands and the brakes are released. The
+    #: changes last until the XCP server ends; files are never changed.
     calibrate: bool = False
 
 
 class Configuration(Struct, kw_only=True):
-    """config/emb.yaml."""
+    """For example config/emb.yaml."""
 
     #: Version of this file format.
     format: Annotated[int, Meta(ge=1, le=1)]
     bus: Bus = Bus()
-    #: FL, FR, RL, RR: those that this process estimates.
+    #: Corners that this process estimates, by name: FL, FR, RL, RR.
     corners: Annotated[dict[Annotated[str, Meta(pattern="^(FL|FR|RL|RR)$")], Corner], Meta(min_length=1)]
-    #: DBC to use instead of the shipped one, relative to this configuration; names of messages and signals are the same,
-    #: units are converted.
+    #: DBC to use instead of the shipped one, relative to this configuration. Its messages and signals must have the same names
+    #: as there; units are converted.
     dbc: str | None = None
-    #: Folder for what adaptation learns; systemd's STATE_DIRECTORY comes before it.
+    #: Folder for learned values and snapshots; systemd's STATE_DIRECTORY overrides it.
     state_directory: str | None = None
-    #: Without it nothing is authenticated.
+    #: Authentication (AUTOSAR SecOC), both ways; if left out, nothing is authenticated.
     secoc: Secoc | None = None
     xcp: Xcp = Xcp()
     realtime: Realtime = Realtime()
-    #: What the journal gets: debug, info, warning or error.
+    #: Least level of the messages that go into the journal.
     log_level: Annotated[str, Meta(pattern="^(debug|info|warning|error)$")] = "info"
 
 

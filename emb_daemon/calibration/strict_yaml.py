@@ -203,17 +203,16 @@ def _compose(name: str, text: str) -> yaml.Node:
     return root
 
 
-def load_yaml(path: Path, kind: type[_T], text: str | None = None) -> _T:
+def load_yaml(path: Path, kind: type[_T]) -> _T:
     """Read a YAML file into a struct type.
 
     Raises:
         InputErrors: every fault found, each as ``file:line: key: what was expected``.
     """
-    if text is None:
-        try:
-            text = read_input(path, _MOST_BYTES).decode()
-        except UnicodeDecodeError as error:
-            raise InputErrors([f"{path}: not a readable text file ({error})"]) from None
+    try:
+        text = read_input(path, _MOST_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise InputErrors([f"{path}: not a readable text file ({error})"]) from None
     reader = _Reader(str(path))
     value = reader.convert(_compose(str(path), text), kind, "")
     if reader.faults:

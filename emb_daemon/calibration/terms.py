@@ -22,43 +22,48 @@ _GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
 
 
 class Term(Struct, kw_only=True):
-    """Coefficient × shape(memory(signal)) × gate, added at one port of the physics. u = (z − centre)/scale, where z is the
-    signal through its memory."""
+    """A term that `emb-daemon diagnose` made for a residual that no effect of the catalogue explains.
 
-    #: Begins with ``term:``.
+    It adds coefficient × shape(u) × gate at one port of the physics. Here u = (z − centre)/scale, and z is the signal after
+    its memory."""
+
+    #: Name; begins with ``term:``.
     name: Annotated[str, Meta(pattern="^term:.+")]
-    #: Where it adds; the coefficient is in the port's unit (`effects.base.HOOKS`).
+    #: Quantity to which the term adds. The coefficient has the unit of this port (`effects.base.HOOKS`).
     port: Literal[PORTS]
-    #: What it is a function of.
+    #: Signal of which the term is a function.
     signal: Literal[tuple(SIGNALS)]
-    #: none; lag: z follows the signal with the time constant memory_scale, s; deficit: what of that is still to come; slip: a
-    #: Maxwell slip element of stretch memory_scale, in the signal's unit; response: z is the signal, and what the shape makes
-    #: of it passes through the lag: heat follows a power of what makes it, whichever way that turns.
+    #: none: z is the signal; lag: z is the signal through a first-order lag of time constant memory_scale, s; deficit: z is
+    #: that lag's output minus the signal; slip: z is the state, -1 to 1, of a Maxwell slip element of stretch memory_scale, in
+    #: the signal's unit; response: z is the signal, and the lag acts on the output of the shape, as heat follows the power
+    #: that makes it.
     memory: Literal[MEMORIES] = "none"
     #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
     #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).
     shape: Literal[SHAPES]
-    #: When it acts: always, closing, opening, turning, standing; load: in proportion to the clamp force over the largest.
+    #: When the term acts: always, while closing, opening, turning or standing; load: always, multiplied by the clamp force
+    #: over the largest force.
     gate: Literal[GATES] = "always"
-    #: In the port's unit.
+    #: Size of the term, in the port's unit.
     coefficient: float
-    #: Second coefficient of a harmonic.
+    #: Coefficient of sin u of a harmonic.
     sine: float = 0.0
     #: Standard deviation of the coefficient.
     sigma: Annotated[float, Meta(ge=0.0)] = 0.0
-    #: In the signal's unit.
+    #: Scale of u, in the signal's unit.
     scale: Positive = 1.0
-    #: In the signal's unit.
+    #: Signal at which u is zero, in the signal's unit.
     centre: float = 0.0
-    #: Of a power.
+    #: Exponent of odd_power and even_power.
     exponent: Annotated[float, Meta(gt=0.0, le=4.0)] = 1.0
-    #: In s, or for a slip element in the signal's unit.
+    #: Time constant, s; of a slip element its stretch, in the signal's unit.
     memory_scale: Positive = 1.0
-    #: Signal from which to which the term was found; outside it stays what it is at the edge, and sigma grows.
+    #: Low end of the range of the signal in which the term was found. Outside the range the term keeps its value at the edge,
+    #: and the force's standard deviation grows.
     low: float
-    #: End of that range.
+    #: High end of that range.
     high: float
-    #: Date and logs.
+    #: Date and logs from which the term was found.
     provenance: str = ""
 
     def __post_init__(self):

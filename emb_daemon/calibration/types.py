@@ -26,13 +26,16 @@ _TRAINING_FORCE_N, _TRAINING_SHARE = 18_000.0, 0.6
 
 
 class Travel(Struct, kw_only=True):
-    """Clamp travel over motor angle past the released position, of a gear that is not constant (ball or roller ramp, cam),
-    from the datasheet's geometry. Between the points runs a rising cubic. Then every angle of pads in this file (clearance,
-    curves, slip angles) is travel over ``gear_gain_m_per_rad``."""
+    """Travel table of a gear that is not constant (ball or roller ramp, cam).
 
-    #: From zero, ascending.
+    Clamp travel over motor angle, both counted from the released position, from the datasheet's geometry. A monotone cubic
+    interpolates between the points. With this table every angle of the pads in this file (clearance, curves, slip angles) is
+    not the motor's own: it is the travel divided by ``gear_gain_m_per_rad``."""
+
+    #: Motor angles of the points: the first is zero, ascending.
     angle_rad: tuple[Annotated[NonNegative, usual(1.0)], ...] = ()
-    #: Likewise; to the largest force with the pads of the softest curve.
+    #: Clamp travel at these angles: the first is zero, ascending. It must reach the largest force with the pads of the softest
+    #: curve.
     travel_mm: tuple[Annotated[NonNegative, usual(0.1)], ...] = ()
 
     def __post_init__(self):
@@ -68,17 +71,19 @@ CONSTANT_GEAR = Travel()
 class Motor(Struct, kw_only=True):
     """Motor and gear (thesis 2.3, 2.4)."""
 
-    #: Motor torque per torque-producing current, at 25 degC.
+    #: Motor torque per torque-producing current (CurrentQ), at 25 degC.
     torque_constant_Nm_per_A: Positive
-    #: Lumped inertia of motor and gear at the motor shaft.
+    #: Inertia of motor and gear together, at the motor shaft.
     inertia_kg_m2: Positive
-    #: Clamp travel per motor angle; equally motor torque per clamp force. Geometry. With `travel`, a mean of it.
+    #: Clamp travel per motor angle, which equals motor torque per clamp force without friction. Known from the geometry. With
+    #: `travel`: the mean slope of that table.
     gear_gain_m_per_rad: Positive
-    #: Fastest that the motor turns.
+    #: Largest speed of the motor.
     maximum_speed_rad_per_s: Positive
-    #: Of a gear that is not constant.
+    #: Only for a gear that is not constant.
     travel: Travel = CONSTANT_GEAR
-    #: Of a spring that helps release: force on the gear's output per travel from the released position, none there.
+    #: Rate of a spring that helps release: force on the gear's output per travel from the released position, where the spring
+    #: is relaxed.
     release_spring_N_per_m: Annotated[NonNegative, usual(1e5)] = 0.0
 
     def __post_init__(self):
@@ -94,11 +99,12 @@ class Motor(Struct, kw_only=True):
 class Friction(Struct, kw_only=True):
     """Friction of the reduction gear at the motor shaft (thesis 4.1)."""
 
-    #: Friction torque per clamp force (mu_g).
+    #: Friction torque that grows with the clamp force, per newton (mu_g).
     load_m_per_rad: Annotated[NonNegative, usual(1e-5)]
-    #: Friction torque without clamp force (eta_g).
+    #: Friction torque that does not depend on the clamp force (eta_g).
     offset_Nm: Annotated[NonNegative, usual(0.03)]
-    #: Motor angle over which friction turns over after a reversal; near zero it is the thesis's sign function.
+    #: Motor angle over which friction changes its direction after a reversal. Near zero, friction is the sign function of the
+    #: thesis.
     presliding_angle_rad: Annotated[float, Meta(ge=1e-6), usual(0.03)]
 
 
@@ -132,13 +138,13 @@ _NOTHING_TO_CLAMP_RAD = 1e3
 
 
 class Contact(Struct, kw_only=True):
-    """Where the pads touch."""
+    """Motor angle at which the pads touch the disc."""
 
     #: Motor angle from the released position to contact.
     clearance_rad: Annotated[NonNegative, usual(10.0)]
-    #: Its standard deviation at power-on.
+    #: Standard deviation of the clearance at power-on.
     clearance_sigma_rad: Positive
-    #: Random walk of the contact angle, by wear and heat.
+    #: Random walk of the contact angle, caused by wear and heat.
     walk_rad_per_sqrt_s: Annotated[NonNegative, usual(1e-4)]
 
     @property
@@ -148,30 +154,31 @@ class Contact(Struct, kw_only=True):
 
 
 class Noise(Struct, kw_only=True):
-    """Errors of both paths, as the filter needs them; identified from data that did not fit the models."""
+    """Errors of both paths, as the filter needs them; identified from data that were not used to fit the models."""
 
-    #: Error of the stiffness path that does not grow with force.
+    #: Error of the stiffness path that does not depend on the force, standard deviation.
     stiffness_N: Positive
-    #: Error of the stiffness path that grows with force, as a share of it.
+    #: Error of the stiffness path that is proportional to the force, standard deviation as a share of the force.
     stiffness_relative: Annotated[NonNegative, usual(0.01)]
-    #: Time over which the stiffness path's error stays the same.
+    #: Correlation time of the stiffness path's error.
     stiffness_correlation_s: Positive
-    #: Noise of the current.
+    #: Standard deviation of the current's noise.
     current_A: Positive
-    #: Time over which the noise of the current stays correlated.
+    #: Correlation time of the current's noise.
     current_correlation_s: Positive
-    #: White noise of the motor speed.
+    #: Standard deviation of the motor speed's noise, which is white.
     speed_rad_per_s: Positive
     #: Error of the friction state in the middle of a reversal, as a share of full friction.
     presliding: Annotated[NonNegative, usual(0.1)]
-    #: Relative error of the torque path that stays.
+    #: Relative error of the torque path that stays the same over the whole drive, standard deviation.
     torque_relative: Annotated[NonNegative, usual(0.05)]
-    #: Relative error of the torque path that stays for some stops and is another in others: what no model of it explains.
+    #: Relative error of the torque path that no model explains, and that stays the same over some stops but not over all of
+    #: them, standard deviation.
     torque_lasting: Annotated[NonNegative, usual(0.05)] = 0.0
 
 
 class Pad(Struct, kw_only=True):
-    """Both brake pads (thesis 7.4 to 8.1). Conductivity is k0 (1 + rise (T - 20 degC)), specific heat likewise."""
+    """Both brake pads (thesis 7.4 to 8.1). Conductivity is k0 (1 + rise (T - 20 degC)), specific heat C0 likewise."""
 
     #: Friction surface of one pad.
     area_m2: Positive
@@ -179,23 +186,23 @@ class Pad(Struct, kw_only=True):
     density_kg_per_m3: Positive
     #: Heat conductivity k0 at 20 degC.
     conductivity_W_per_mK: Positive
-    #: Its relative rise with temperature.
+    #: Relative rise of the conductivity per kelvin.
     conductivity_rise_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Specific heat C0 at 20 degC.
     specific_heat_J_per_kgK: Positive
-    #: Its relative rise with temperature.
+    #: Relative rise of the specific heat per kelvin.
     specific_heat_rise_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Share of the friction power that enters the inner pad directly (thesis p).
     inner_heat_share: Annotated[Share, usual(0.04)]
     #: Share of the friction power that enters the outer pad directly.
     outer_heat_share: Annotated[Share, usual(0.04)]
-    #: Between pad surface and disc while they touch.
+    #: Heat conductance between pad surface and disc while they touch.
     contact_conductance_W_per_m2K: Annotated[NonNegative, usual(1000.0)]
-    #: Between pad surface and disc when the brake is released.
+    #: Heat conductance between pad surface and disc while the brake is released.
     gap_conductance_W_per_m2K: Annotated[NonNegative, usual(300.0)]
-    #: From the released pad surface to the air that the wheel stirs, per wheel speed.
+    #: Heat conductance from the surface of a released pad to the air that the turning wheel moves, per wheel speed.
     surface_cooling_per_speed_J_per_rad_m2K: Annotated[NonNegative, usual(0.1)] = 0.0
-    #: Between pad and the thermocouple on its backing plate.
+    #: Heat conductance between a pad and the thermocouple on its backing plate.
     backplate_conductance_W_per_m2K: Positive
 
     def __post_init__(self):
@@ -204,30 +211,30 @@ class Pad(Struct, kw_only=True):
 
 
 class Disc(Struct, kw_only=True):
-    """The lumped disc (thesis 8.2). Loses cooling + cooling_per_speed * wheel speed, and radiates."""
+    """The disc as one lump (thesis 8.2). To the air it loses cooling + cooling_per_speed * wheel speed, and it radiates."""
 
-    #: Of the whole disc.
+    #: Heat capacity of the whole disc.
     heat_capacity_J_per_K: Positive
-    #: At which the pads' friction acts.
+    #: Radius at which the pads' friction acts.
     effective_radius_m: Positive
-    #: Loss to the air at standstill.
+    #: Heat loss to the air at standstill.
     cooling_W_per_K: Annotated[NonNegative, usual(2.0)]
-    #: Loss to the air per wheel speed.
+    #: Additional heat loss to the air per wheel speed.
     cooling_per_speed_J_per_rad_K: Annotated[NonNegative, usual(0.4)]
-    #: Area times emissivity; radiation follows the fourth power of temperature.
+    #: Radiating area times emissivity; radiation follows the fourth power of temperature.
     radiating_area_m2: Annotated[NonNegative, usual(0.1)] = 0.0
 
 
 class FrictionTable(Struct, kw_only=True):
-    """Pad-on-disc friction coefficient for service without a brake torque sensor (thesis 8.5)."""
+    """Friction coefficient of pad on disc, for a brake without a brake torque sensor (thesis 8.5)."""
 
-    #: Clamp forces of the table's grid.
+    #: Clamp forces of the table's grid, ascending.
     force_N: Annotated[tuple[Annotated[float, usual(1000.0)], ...], Meta(min_length=FORCE_GRID, max_length=FORCE_GRID)]
-    #: Disc speeds of the grid.
+    #: Disc speeds of the grid, ascending.
     disc_speed_rad_per_s: Annotated[
         tuple[Annotated[float, usual(10.0)], ...], Meta(min_length=SPEED_GRID, max_length=SPEED_GRID)
     ]
-    #: Pad surface temperatures of the grid.
+    #: Pad surface temperatures of the grid, ascending.
     surface_temperature_C: Annotated[
         tuple[Annotated[float, usual(100.0)], ...], Meta(min_length=TEMPERATURE_GRID, max_length=TEMPERATURE_GRID)
     ]
@@ -245,16 +252,18 @@ class FrictionTable(Struct, kw_only=True):
 
 
 class Softening(Struct, kw_only=True):
-    """alpha = 1 - per_K * rise - history_per_K * (rise through a first-order lag); rise of the mean pad temperature over
-    that at which the curves were identified (thesis 8.4)."""
+    """Loss of stiffness of hot pads (thesis 8.4).
+
+    alpha = 1 - per_K * rise - history_per_K * (rise through a first-order lag), where rise is the mean pad temperature minus
+    `reference_C`."""
 
     #: Mean pad temperature at which the curves were identified.
     reference_C: Annotated[float, usual(100.0)] = 20.0
-    #: Loss of stiffness per kelvin now.
+    #: Loss of stiffness per kelvin of the present rise.
     per_K: Annotated[float, usual(5e-4)] = 0.0
-    #: Loss of stiffness per kelvin of the rise's history.
+    #: Loss of stiffness per kelvin of the lagged rise.
     history_per_K: Annotated[float, usual(1e-3)] = 0.0
-    #: Time constant of that history.
+    #: Time constant of that lag.
     history_time_s: Positive = 1000.0
 
 
@@ -270,51 +279,54 @@ class Thermal(Struct, kw_only=True):
 
 
 class Adaptation(Struct, kw_only=True):
-    """Limits of park brake adaptation (thesis 3.4): when it may run, what it asks for, and what it may accept."""
+    """Limits of park brake adaptation (thesis 3.4): when training may run, which motion it requests, what it may learn."""
 
-    #: Whether training is asked for and learned from at all.
+    #: Whether the daemon requests training and learns from it.
     enabled: bool = True
-    #: Lowest ambient temperature at which training teaches something.
+    #: Lowest ambient temperature at which training is allowed.
     minimum_ambient_C: Annotated[float, usual(100.0)] = -10.0
-    #: Highest such ambient temperature.
+    #: Highest ambient temperature at which training is allowed.
     maximum_ambient_C: Annotated[float, usual(100.0)] = 45.0
-    #: Clamp force that every other corner of the process must hold while one is trained: what keeps a car on a slope of a
-    #: fifth with three wheels.
+    #: Clamp force that every other corner of the process must hold while one is trained: enough for three wheels to hold a car
+    #: on a slope of 20 %.
     parking_force_N: Positive = 3000.0
-    #: Clamp force down to which training motion is asked for; zero is released, which alone shows contact and clearance.
+    #: Lowest clamp force of the requested motion. Zero means released; only then does training observe contact and clearance.
     low_force_N: Annotated[NonNegative, usual(1000.0)] = 0.0
-    #: Clamp force up to which training motion is asked for; left out, 18 kN or 60 % of the largest force, what is less.
+    #: Highest clamp force of the requested motion. If left out: 18 kN or 60 % of the largest force, whichever is less.
     high_force_N: Positive | None = None
-    #: Share of that force that must be reached.
+    #: Share of high_force_N that the motion must reach.
     coverage: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.7
-    #: Amplitude of the small fast sinusoid on top.
+    #: Amplitude of the small fast sinusoid that is added to the slow motion.
     dither_amplitude_rad: Annotated[NonNegative, usual(1.0)] = 0.9
-    #: Its frequency. The inertia's torque, which shows the torque constant, grows with its square.
+    #: Frequency of that sinusoid. The torque of the inertia shows the torque constant; it grows with the square of the
+    #: frequency.
     dither_frequency_Hz: Positive = 8.0
-    #: Standing quietly with the park brake applied before training is asked for.
+    #: Time for which the car must stand with the park brake applied before the daemon requests training.
     settling_time_s: Annotated[NonNegative, usual(5.0)] = 5.0
-    #: Waiting for the motion that was asked for.
+    #: Time for which the daemon waits for the requested motion to begin.
     answer_time_s: Positive = 10.0
-    #: Longest training.
+    #: Longest duration of a training.
     longest_training_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 45.0
-    #: Samples needed in each force range and direction.
+    #: Least number of samples in each force range and direction.
     samples_per_range: Annotated[int, Meta(ge=1)] = 50
-    #: Residual current over the noise that the calibration knows.
+    #: Largest residual current, as a multiple of the calibration's current noise.
     residual_ratio: Positive = 1.5
-    #: Share by which the travel to high_force_N may be under that of the stiffest curve or over that of the softest.
+    #: Relative amount by which the travel to high_force_N may be below that of the stiffest curve or above that of the
+    #: softest.
     curve_change: Positive = 0.35
-    #: Largest relative change of the friction there.
+    #: Largest relative change of the friction at high_force_N.
     friction_change: Positive = 0.6
     #: Largest change of the clearance.
     clearance_change_rad: Positive = 5.0
-    #: Friction torque over clamp torque that a gear can have.
+    #: Largest ratio of friction torque to clamp torque that a gear can have.
     maximum_friction_share: Annotated[Share, usual(0.5)] = 0.6
     #: Largest standard deviation of the learned force.
     maximum_sigma_N: Positive = 200.0
-    #: Largest RMS difference of the pairs of passes from the learned curve, as a share of the largest force.
+    #: Largest RMS difference between the pairs of passes (clamping and releasing) and the learned curve, as a share of the
+    #: largest force.
     pairs_difference: Positive = 0.04
-    #: Relative standard deviation of the force's scale that training cannot see: gear gain, inertia, and what the pads'
-    #: dynamics are wrong by where they look like inertia.
+    #: Relative standard deviation of the force's scale that training cannot observe: errors of the gear gain, of the inertia,
+    #: and of the pads' dynamics where these look like inertia.
     torque_constant_relative: Annotated[NonNegative, usual(0.01)] = 0.01
 
     def __post_init__(self):
@@ -323,41 +335,42 @@ class Adaptation(Struct, kw_only=True):
 
 
 class Source(Struct, kw_only=True):
-    """One log that a calibration rests on."""
+    """One log from which the calibration was identified."""
 
     #: File name.
     log: str
-    #: Of its content.
+    #: SHA-256 of the log's content.
     sha256: str
 
 
 class Provenance(Struct, kw_only=True):
-    """Where the numbers come from."""
+    """Where the numbers of this file come from."""
 
-    #: Of the identification.
+    #: Date of the identification.
     date: str
-    #: What wrote the file.
+    #: Program and version that wrote the file.
     tool: str
-    #: Campaign file.
+    #: Name of the campaign file.
     campaign: str = ""
     #: Logs that were fitted.
     logs: tuple[Source, ...] = ()
-    #: Error figures on logs that fitted nothing, by name.
+    #: Error figures on logs that were not used for fitting, by name.
     figures: dict[str, float] = msgspec.field(default_factory=dict)
-    #: Worst RMSE on such logs, what `diagnose` need not go below: stiffness_N and torque_N of the paths, temperature_K.
+    #: Worst RMSE on such logs: stiffness_N and torque_N of the paths, temperature_K. `diagnose` need not get below it.
     achieved: dict[str, float] = msgspec.field(default_factory=dict)
     #: Standard deviations of identified values, by key.
     sigmas: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class Calibration(Struct, kw_only=True):
-    """Everything identified of one actuator with its pads and disc."""
+    """Everything that was identified of one actuator with its pads and disc."""
 
     #: Version of this file format.
     format: Annotated[int, Meta(ge=1, le=1)]
-    #: Which actuator it belongs to; learned values are restored only to the same one.
+    #: Name of the actuator, with a serial number if the file belongs to one unit. Learned values are restored only to an
+    #: actuator of the same name.
     actuator: Annotated[str, Meta(min_length=1)]
-    #: Thickness of the pads now mounted.
+    #: Thickness of the pads that are mounted now, friction material alone.
     pad_thickness_mm: Positive
     motor: Motor
     friction: Friction
@@ -365,9 +378,9 @@ class Calibration(Struct, kw_only=True):
     contact: Contact
     noise: Noise
     thermal: Thermal
-    #: Effects switched on, by name, with their parameters.
+    #: Effects of the catalogue that are switched on, by name, with their parameters.
     effects: dict[str, dict[str, float]] = msgspec.field(default_factory=dict)
-    #: Terms that no catalogue holds, as `emb-daemon diagnose` makes them.
+    #: Terms that are not in the catalogue of effects; `emb-daemon diagnose` makes them.
     terms: tuple[Term, ...] = ()
     #: Limits of park brake adaptation.
     adaptation: Adaptation = Adaptation()

@@ -10,10 +10,10 @@ EXAMPLE = "emb-daemon a2l --config /etc/emb_daemon/emb.yaml --output emb_daemon.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help=".a2l")
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="A2L file to write")
     transport = parser.add_mutually_exclusive_group()
-    transport.add_argument("--udp", metavar="HOST:PORT", help="where a tool reaches the server; the file says so")
-    transport.add_argument("--can", action="store_true", help="the server is reached on CAN; the file says so")
+    transport.add_argument("--udp", metavar="HOST:PORT", help="address of the XCP server, to be stated in the file")
+    transport.add_argument("--can", action="store_true", help="state in the file that the XCP server is on CAN")
     add_id_arguments(parser, 0x720, 0x728)
     parser.add_argument("-b", "--bitrate", type=int, help="bit/s of that bus (default: the configuration's)")
 

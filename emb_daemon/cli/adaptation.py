@@ -10,7 +10,9 @@ EXAMPLE = "emb-daemon adaptation show --state /var/lib/emb_daemon"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", choices=("show", "reset", "history"), help="values in use, forget them, or all trainings")
+    parser.add_argument(
+        "action", choices=("show", "reset", "history"), help="print the values in use, delete them, or print all trainings"
+    )
     parser.add_argument(
         "--state", type=Path, metavar="DIR", help="state directory (default: $STATE_DIRECTORY or /var/lib/emb_daemon)"
     )
@@ -34,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.action == "reset":
             if memory.reset(corner):
                 kept = memory.forgotten(corner)
-                print(f"{corner}: forgotten, a copy is in {kept}; a running daemon keeps its values until it is restarted")
+                print(f"{corner}: deleted, a copy is in {kept}; a running daemon uses its values until it is restarted")
                 found = True
             continue
         try:
@@ -64,10 +66,10 @@ def _ask(corners: list[str]) -> None:
     if not corners:
         return
     if not sys.stdin.isatty():
-        raise InputError("adaptation reset: asks before it forgets, and input is no terminal; for scripts there is --yes")
-    answer = input(f"Forget what {', '.join(corners)} learned? [y/N] ")
+        raise InputError("adaptation reset: asks before it deletes, but the input is not a terminal; in scripts use --yes")
+    answer = input(f"Delete what {', '.join(corners)} learned? [y/N] ")
     if answer.strip().lower() not in ("y", "yes"):
-        raise InputError("adaptation reset: nothing was forgotten")
+        raise InputError("adaptation reset: nothing was deleted")
 
 
 def _show(entry) -> None:

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(1, 2, 4, 16),
         default=[1, 2, 4, 16],
         metavar="N",
-        help="1, 2, 4, or 16: four daemons in one process",
+        help="1, 2, 4, or 16 (four daemons in one process)",
     )
     parser.add_argument("--json", action="store_true", help="figures as JSON")
 

@@ -47,7 +47,9 @@ def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
     """Raises InputError if an id of `add_id_arguments` is not the server's alone."""
     for name in ("request_id", "response_id"):
         if getattr(arguments, name) in taken or arguments.request_id == arguments.response_id:
-            raise InputError(f"--{name.replace('_', '-')} {getattr(arguments, name):#x}: expected an id that nobody else has")
+            raise InputError(
+                f"--{name.replace('_', '-')} {getattr(arguments, name):#x}: expected an id that no other message uses"
+            )
 
 
 def bus_options(arguments: argparse.Namespace, defaults=None) -> dict:

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     if faults:
         raise InputErrors(faults)
     if arguments.mapping:
-        print(f"{arguments.mapping}: every signal can become ours")
+        print(f"{arguments.mapping}: no fault, every signal can be converted")
     if not arguments.config:
         return 0
     for name, calibration in setup.calibrations.items():
@@ -43,5 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
         )
     for link in (*setup.links[0], *setup.links[1]):
         if link.name not in setup.keys:
-            print(f"no key {link.name}: nothing under it is believed or authenticated, {link.corner or 'the vehicle'}")
+            sender = link.corner or "vehicle"
+            print(f"{sender}: no key {link.name}: its messages are neither accepted nor sent with authentication")
     return 0

@@ -16,9 +16,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="FIT_LOG", help="logs to find effects in")
     parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration to start from")
     parser.add_argument(
-        "--validate", nargs="+", type=Path, default=[], metavar="LOG", help="logs that judge only; default: left-out episodes"
+        "--validate",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="LOG",
+        help="logs for validation only (default: episodes left out)",
     )
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="calibration.yaml, report.json, report.html")
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="folder for calibration.yaml, report.json, report.html"
+    )
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
 
@@ -27,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from emb_daemon.calibration.files import load_calibration, save_calibration
-    from emb_daemon.diagnose.diagnosis import diagnose, log_paths
+    from emb_daemon.diagnose.diagnosis import diagnose
     from emb_daemon.diagnose.page import page
     from emb_daemon.diagnose.report import report
     from emb_daemon.diagnose.text import table, verdict
@@ -36,20 +43,19 @@ def run(arguments: argparse.Namespace) -> int:
     corner_index(arguments.corner)
     calibration = load_calibration(arguments.calibration)
     read = log_reader(arguments.mapping)
-    paths = log_paths([*arguments.logs, *arguments.validate])
-    try:
-        arguments.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{arguments.output}: cannot be a folder for results: {error.strerror}") from None
-    console = Console()
     with progress("reading logs") as show:
-        logs = [load_log(path, arguments.corner, read) for path in paths]
+        logs = [load_log(path, arguments.corner, read) for path in [*arguments.logs, *arguments.validate]]
+        try:
+            arguments.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{arguments.output}: cannot be a folder for results: {error.strerror}") from None
         fit_logs, judges = logs[: len(arguments.logs)], logs[len(arguments.logs) :]
         diagnosis = diagnose(fit_logs, calibration, judges, lambda text, share: show(share, text))
     save_calibration(diagnosis.calibration, arguments.output / "calibration.yaml")
     text = json.dumps(report(diagnosis), indent=1, ensure_ascii=False)
     write_atomically(arguments.output / "report.json", text.encode())
     write_atomically(arguments.output / "report.html", page(diagnosis).encode())
+    console = Console()
     console.print(verdict(diagnosis))
     console.print(table(diagnosis))
     console.print(f"calibration, report.html and report.json are in {arguments.output}", highlight=False)

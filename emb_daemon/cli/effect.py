@@ -14,8 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     does = "write a term that diagnose found as an effect file"
     export = commands.add_parser("export", help=does, description=does.capitalize() + ".")
-    export.add_argument("calibration", type=Path, metavar="CALIBRATION", help="which has the term")
-    export.add_argument("term", metavar="TERM", help="its name, as the calibration states it")
+    export.add_argument("calibration", type=Path, metavar="CALIBRATION", help="calibration that contains the term")
+    export.add_argument("term", metavar="TERM", help="name of the term in the calibration")
     export.add_argument("--output", type=Path, required=True, metavar="FILE", help="effect file to write")
 
 
@@ -34,5 +34,5 @@ def run(arguments: argparse.Namespace) -> int:
     text = source(term, calibration.stiffness.maximum_force_N, equation(term))
     write_atomically(arguments.output, text.encode())
     own = "\n".join(f"    {name}: {value!r}" for name, value in values(term).items())
-    print(f"{arguments.output}: in the calibration, instead of the term:\neffects:\n  {effect_name(term)}:\n{own}")
+    print(f"{arguments.output} is written. In the calibration, replace the term by:\neffects:\n  {effect_name(term)}:\n{own}")
     return 0

@@ -11,10 +11,16 @@ EXAMPLE = "emb-daemon export --calibration calibration.yaml --output brake.fmu"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="of the actuator")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help=".h: C header; .fmu: FMI 3.0 co-simulation")
+    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration of the actuator")
     parser.add_argument(
-        "--kernels", type=Path, default=default_path(), metavar="FILE", help="for .fmu, made by compile (%(default)s)"
+        "--output", type=Path, required=True, metavar="FILE", help="file to write; .h: C header, .fmu: FMI 3.0 co-simulation"
+    )
+    parser.add_argument(
+        "--kernels",
+        type=Path,
+        default=default_path(),
+        metavar="FILE",
+        help="for .fmu: library that compile made (%(default)s)",
     )
 
 

@@ -28,11 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ingest.add_argument(
         "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"
     )
-    ingest.add_argument("--output", type=Path, required=True, metavar="DIR", help="the data set, made if it is not there")
+    ingest.add_argument("--output", type=Path, required=True, metavar="DIR", help="data set; created if it does not exist")
     ingest.add_argument(
         "--unit",
         metavar="REGEX",
-        help="finds (?P<unit>…), and (?P<day>…) if it has that, in a log's path; default: its folder",
+        help="finds the unit (?P<unit>…), optionally the day (?P<day>…), in a log's path (default: its folder is the unit)",
     )
     add_mapping_argument(ingest)
     for name in ("replay", "learn", "diagnose", "prior", "report"):
@@ -43,10 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A"
         )
     for name in ("replay", "learn", "diagnose"):
-        parsers[name].add_argument("--resume", action="store_true", help="go on: keep what is there of the same calibration")
+        parsers[name].add_argument(
+            "--resume", action="store_true", help="continue: keep existing results of the same calibration"
+        )
     for name in ("ingest", "replay", "learn", "diagnose"):
         parsers[name].add_argument(
-            "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see DIR; default: this machine"
+            "--scheduler", metavar="ADDRESS", help="address of a Dask cluster whose workers see DIR (default: this machine)"
         )
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
     parsers["diagnose"].add_argument(
@@ -137,7 +139,7 @@ def _diagnose(arguments: argparse.Namespace) -> int:
 def _print(found) -> None:
     print(
         f"{len(found.units)} units, {found.drives} drives from {found.first_day} to {found.last_day}; "
-        f"{len(found.silent)} say nothing"
+        f"{len(found.silent)} of the drives cannot be used"
     )
     for title, group in (
         ("shared", found.groups), ("drift, per 30 days", found.drifts), ("season, per 10 K", found.seasons),
@@ -195,11 +197,14 @@ def _bench(arguments: argparse.Namespace) -> int:
 
 #: What runs each command, and what it does.
 _COMMANDS = {
-    "ingest": (_ingest, "log files into a data set partitioned by unit, corner and day: each once, damaged ones listed"),
-    "replay": (_replay, "estimates, figures and integrity of every drive, equal to those of emb-daemon replay"),
-    "learn": (_learn, "what park brake adaptation learns of each unit, drive by drive"),
-    "diagnose": (_diagnose, "what sets units and batches apart, what drifts, by the disagreement of the force paths"),
-    "prior": (_prior, "a calibration with the population's values, their spread, and bounds for adaptation"),
-    "report": (_report, "one page: map of units, worst ten, batches, trend, next action"),
-    "bench": (_bench, "how fast one core of this machine replays a log, stage by stage"),
+    "ingest": (_ingest, "read log files into a data set by unit, corner and day; each once, damaged ones are listed"),
+    "replay": (_replay, "compute estimates, figures and integrity of every drive, equal to those of emb-daemon replay"),
+    "learn": (_learn, "run park brake adaptation over each unit's drives, one after the other"),
+    "diagnose": (
+        _diagnose,
+        "find what distinguishes units and batches, and what drifts, from the disagreement of the force paths",
+    ),
+    "prior": (_prior, "write a calibration with the population's values, their spread, and bounds for adaptation"),
+    "report": (_report, "write the findings as one page: map of units, worst ten, batches, trend, next action"),
+    "bench": (_bench, "measure how fast one core of this machine replays a log, stage by stage"),
 }

@@ -16,14 +16,20 @@ EXAMPLE = "emb-daemon identify campaign.yaml --output calibration.yaml --report 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("campaign", nargs="?", type=Path, metavar="CAMPAIGN.yaml", help="which log plays which part")
+    parser.add_argument(
+        "campaign",
+        nargs="?",
+        type=Path,
+        metavar="CAMPAIGN.yaml",
+        help="campaign file: which log was recorded for which purpose",
+    )
     add_mapping_argument(parser)
     parser.add_argument("--output", type=Path, metavar="CALIBRATION.yaml", help="calibration to write")
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="folder for report.html: every step with data, fit, residual"
     )
     parser.add_argument(
-        "--example", type=Path, metavar="DIR", help="write files of a made-up rig into DIR to start from, and nothing else"
+        "--example", type=Path, metavar="DIR", help="only write the files of a simulated rig into DIR, to start from"
     )
 
 
@@ -64,8 +70,8 @@ def _example(folder: Path) -> int:
 
     print("\n".join(map(str, write_example(folder))))
     print(
-        f"\nA simulated rig's; next:\n  emb-daemon identify {folder}/campaign.yaml --mapping {folder}/mapping.yaml "
-        f"--output {folder}/calibration.yaml"
+        "\nThese are files of a simulated rig. Next:\n"
+        f"  emb-daemon identify {folder}/campaign.yaml --mapping {folder}/mapping.yaml --output {folder}/calibration.yaml"
     )
     return 0
 

@@ -14,7 +14,11 @@ LOG_HELP = (
 
 def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False) -> None:
     parser.add_argument(
-        "--mapping", type=Path, metavar="FILE", required=required, help="YAML that maps another rig's signals to ours"
+        "--mapping",
+        type=Path,
+        metavar="FILE",
+        required=required,
+        help="YAML file that maps another rig's signals to the daemon's",
     )
 
 

@@ -11,25 +11,25 @@ from emb_daemon.errors import InputError, Unavailable
 
 #: Command: what it does. The module of the same name in this package has EXAMPLE, add_arguments and run.
 COMMANDS = {
-    "demo": "simulated car and the real daemon on an in-process bus: live view, summary, picture",
-    "run": "the daemon: estimates from a CAN bus, broadcast 250 times a second",
-    "check": "validate configuration, calibrations and DBC; lists every fault",
-    "replay": "the same estimator over logs, as fast as it goes",
-    "convert": "another rig's log as ours, by a mapping file",
-    "identify": "calibration from a rig campaign, with its evidence",
-    "diagnose": "find what the model lacks, add it, and show the error before and after",
-    "fleet": "many units and drives: ingest, replay, learn, diagnose, prior, report",
-    "effect": "a term that diagnose found, as an effect file",
-    "simulate": "the simulated car on a bus",
-    "monitor": "live view of a running daemon's broadcasts",
-    "files": "DBC, configuration, calibration and units that ship with the package",
-    "compile": "the kernels as one library, for a daemon without a compiler",
-    "export": "the estimator for C programs and simulators: a header, or an FMU",
-    "uds": "trouble codes and data for a workshop's tester, over UDS",
-    "xcp": "measured on a test bench: the estimator's signals and parameters, over XCP",
-    "a2l": "the description of those signals and parameters for a measurement tool",
-    "bench": "whether this machine can hold the loop",
-    "adaptation": "show, reset or list what park brake adaptation has learned",
+    "demo": "run a simulated car and the real daemon in one process: live view, summary, picture",
+    "run": "run the daemon: estimate from a CAN bus, broadcast 250 times a second",
+    "check": "check configuration, calibrations and DBC; list every fault",
+    "replay": "run the daemon's estimator over logs, as fast as possible",
+    "convert": "write another rig's log in the daemon's own format, by a mapping file",
+    "identify": "identify a calibration from a rig campaign, and report the evidence",
+    "diagnose": "find the effects that the model lacks, add them, and show the error before and after",
+    "fleet": "analyse many units and drives: ingest, replay, learn, diagnose, prior, report",
+    "effect": "write a term that diagnose found as an effect file",
+    "simulate": "run a simulated car on a bus",
+    "monitor": "show a running daemon's broadcasts live",
+    "files": "list or print the files that ship with the package: DBC, configuration, calibration, systemd units",
+    "compile": "compile the kernels into one library, for a box without a compiler",
+    "export": "export the estimator for C programs and simulators: a header, or an FMU",
+    "uds": "serve trouble codes and data to a workshop tester, over UDS",
+    "xcp": "serve the estimator's signals and parameters to a measurement tool, over XCP",
+    "a2l": "write the A2L file that describes these signals and parameters for the tool",
+    "bench": "measure whether this machine meets the timing budgets",
+    "adaptation": "show or reset what park brake adaptation has learned, or list all trainings",
 }
 
 #: Extras by the library that only they bring.
@@ -101,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
     except MemoryError:
-        print(f"emb-daemon {chosen.command}: this machine has not the memory for that", file=sys.stderr)
+        print(f"emb-daemon {chosen.command}: not enough memory on this machine", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -20,12 +20,14 @@ _PORT = 8250
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--once", action="store_true", help="listen for a second or two, print one line per corner, end")
-    parser.add_argument("--json", action="store_true", help="with --once: everything known, as JSON; null is what not to use")
-    page = f"a page with live plots, and /metrics for Prometheus, on this machine alone ({_PORT})"
+    parser.add_argument("--once", action="store_true", help="listen for a second or two, print one line per corner, and end")
+    parser.add_argument(
+        "--json", action="store_true", help="with --once: print everything as JSON; values not to be used are null"
+    )
+    page = f"serve a page with live plots, and /metrics for Prometheus, to this machine only (port {_PORT})"
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
-    parser.add_argument("--record", type=Path, metavar="FILE", help="everything heard, as an MCAP file")
-    parser.add_argument("--udp", metavar="HOST:PORT", help="JSON datagrams, 50 a second, for PlotJuggler")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="record everything received into an MCAP file")
+    parser.add_argument("--udp", metavar="HOST:PORT", help="send JSON datagrams, 50 a second, for PlotJuggler")
     add_mapping_argument(parser)
     add_bus_arguments(parser)
 
@@ -43,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
         raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
     if not arguments.once and not handed_out and not sys.stdout.isatty():
-        raise InputError("monitor: output is no terminal; for scripts there is --once, with or without --json")
+        raise InputError("monitor: the output is not a terminal; in scripts use --once, with or without --json")
     options = bus_options(arguments)
     if arguments.mapping:
         from emb_daemon.logs.live import ReferenceBus, open_buses

@@ -17,8 +17,8 @@ def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, 
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: no such folder: {path.absolute().parent}")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is no regular file, which writing would replace")
+        raise InputError(f"{path}: is not a regular file, and writing would replace it")
     if path.resolve() in [given.resolve() for given in inputs if given]:
-        raise InputError(f"{path}: is one of the inputs, which it would overwrite")
+        raise InputError(f"{path}: is one of the inputs, and writing would overwrite it")
     if endings and ending_of(path) not in endings:
         raise InputError(f"{path}: unknown ending, expected one of {', '.join(endings)}")

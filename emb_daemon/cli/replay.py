@@ -20,17 +20,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
-    for option, default, help in (("--from", 0.0, "give results from here on"), ("--to", float("inf"), "stop here")):
+    for option, default, help in (
+        ("--from", 0.0, "give results from this time on"),
+        ("--to", float("inf"), "stop at this time"),
+    ):
         parser.add_argument(option, type=float, default=default, metavar="S", help=f"{help}, seconds of each log")
-    parser.add_argument("--pad-thickness", type=float, metavar="MM", help="thickness of the pads mounted, if not the file's")
     parser.add_argument(
-        "--measured-torque", action="store_true", help="heat the pads with the rig's brake torque sensor, which no car has"
+        "--pad-thickness", type=float, metavar="MM", help="thickness of the mounted pads, if not that of the calibration"
     )
     parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="adapt: read what was learned from DIR, learn, and keep it there"
+        "--measured-torque", action="store_true", help="use the rig's brake torque sensor for the heat model (a car has none)"
     )
     parser.add_argument(
-        "--keys", type=Path, metavar="FILE", help="believe authentic frames alone, authenticate those of --output"
+        "--state", type=Path, metavar="DIR", help="adapt: read learned values from DIR, learn, and store them there"
+    )
+    parser.add_argument(
+        "--keys", type=Path, metavar="FILE", help="accept only authentic frames, and authenticate those of --output"
     )
     parser.add_argument(
         "--output",
@@ -39,8 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="estimates as .csv, .parquet or .signals.mf4, or the frames that the daemon would have sent as .log, .blf, .asc, "
         ".trc or .mf4",
     )
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="a page to look at: forces, errors, heat, events")
-    parser.add_argument("--json", action="store_true", help="error figures as JSON")
+    parser.add_argument(
+        "--report", type=Path, metavar="FILE.html", help="write an HTML report: forces, errors, temperatures, events"
+    )
+    parser.add_argument("--json", action="store_true", help="print error figures as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,8 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not calibration.contact.is_in_reach:
         clearance = calibration.contact.clearance_rad
         print(
-            f"{arguments.calibration}: nothing to clamp within {clearance:g} rad (contact.clearance_rad): estimates are "
-            "clamp forces, never negative; `diagnose` judges a load of either sign",
+            f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
+            "are clamp forces, never negative; `diagnose` takes a load of either sign",
             file=sys.stderr,
         )
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
@@ -102,7 +109,7 @@ def _secure(arguments: argparse.Namespace, read):
     def read_authentic(path: Path):
         frames = authentication.verify(read(path))
         if not len(frames):
-            raise InputError(f"{path}: nothing but authentication frames")
+            raise InputError(f"{path}: contains only authentication frames")
         return frames
 
     return read_authentic, authentication.sign
@@ -116,7 +123,7 @@ def _check(arguments: argparse.Namespace) -> None:
     output, report = arguments.output, arguments.report
     if not 0.0 <= getattr(arguments, "from") < arguments.to:
         raise InputError(
-            f"--from {getattr(arguments, 'from'):g} --to {arguments.to:g}: expected seconds from 0 on that ascend"
+            f"--from {getattr(arguments, 'from'):g} --to {arguments.to:g}: expected 0 or more, and --to after --from"
         )
     inputs = (*arguments.logs, arguments.calibration, arguments.mapping)
     if output:
@@ -124,12 +131,12 @@ def _check(arguments: argparse.Namespace) -> None:
     if report:
         check_output(report, inputs)
     if report and arguments.corner == ALL:
-        raise InputError(f"--report: shows one corner, expected --corner FL, FR, RL or RR instead of {ALL}")
+        raise InputError(f"--report: shows one corner; expected --corner FL, FR, RL or RR instead of {ALL}")
     if output and ending_of(output) in FRAME_ENDINGS:
         if report:
             raise InputError(f"--report: expected together with a table ({', '.join(TABLE_ENDINGS)}) or without --output")
         if arguments.measured_torque:
-            raise InputError("--measured-torque: the daemon has no such input, so there are no frames it would have sent")
+            raise InputError("--measured-torque: the daemon has no such input; expected a table as --output")
 
 
 def _write_table(path: Path, results: list) -> None:

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--share",
         type=Path,
         metavar="FILE",
-        help="file in a folder kept in memory, for the estimates of every tick: xcp reads it",
+        help="share the estimates of every tick in FILE, which must be in a folder kept in memory; xcp reads it",
     )
     add_bus_arguments(parser)
 

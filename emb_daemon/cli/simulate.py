@@ -14,14 +14,18 @@ EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario driv
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds; without it, on Ctrl-C or SIGTERM")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds (default: on Ctrl-C or SIGTERM)")
     parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="the kind of brake; without it, the shipped one")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="calibration of the simulated brake (default: the shipped one)"
+    )
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
     add_mapping_argument(parser)
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="authenticate what is sent, believe nothing else (SecOC)")
-    parser.add_argument("--state", type=Path, metavar="DIR", help="with --keys: folder that keeps the trip counter")
-    parser.add_argument("--seed", type=int, default=0, help="of tolerances and noise (0)")
+    parser.add_argument(
+        "--keys", type=Path, metavar="FILE", help="authenticate sent frames, accept only authentic ones (SecOC)"
+    )
+    parser.add_argument("--state", type=Path, metavar="DIR", help="with --keys: folder for the trip counter")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of tolerances and noise (0)")
     add_bus_arguments(parser)
 
 
@@ -39,13 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.wire.secoc import load_links
 
     if arguments.seconds is not None and not 0.0 < arguments.seconds < float("inf"):
-        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0, or none to go on until it is ended")
+        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0; leave it out to run until Ctrl-C")
     if arguments.seed < 0:
         raise InputError(f"--seed {arguments.seed}: expected 0 or more")
     if (arguments.keys is None) != (arguments.state is None):
         raise InputError("--keys and --state: expected both or neither")
     if arguments.keys and arguments.mapping:
-        raise InputError("--keys: of our own messages; expected without --mapping")
+        raise InputError("--keys: cannot be used with --mapping, whose messages have no authentication")
     schedule = scenario(arguments.scenario)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
@@ -70,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
     stopped = stop_signals()
     live.warm_up()
-    print(f"{', '.join(corners)}: {arguments.scenario}, {schedule.seconds:.0f} s over and over; Ctrl-C ends it", flush=True)
+    print(f"{', '.join(corners)}: {arguments.scenario}, {schedule.seconds:.0f} s, repeated; Ctrl-C ends it", flush=True)
     try:
         live.run(lambda: bool(stopped), arguments.seconds)
     finally:

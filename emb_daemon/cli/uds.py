@@ -14,7 +14,7 @@ EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
     parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="the daemon's state directory; trouble codes are kept there too "
+        "--state", type=Path, metavar="DIR", help="the daemon's state directory; trouble codes are stored there too "
         "(default: $STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon)"
     )  # fmt: skip
     add_id_arguments(parser, 0x710, 0x718)

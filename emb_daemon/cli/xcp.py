@@ -14,14 +14,18 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
-    parser.add_argument("--share", type=Path, required=True, metavar="FILE", help="as given to emb-daemon run")
+    parser.add_argument(
+        "--share", type=Path, required=True, metavar="FILE", help="the file given to emb-daemon run as --share"
+    )
     transport = parser.add_mutually_exclusive_group(required=True)
     transport.add_argument(
         "--udp",
         metavar="HOST:PORT",
-        help="address to be reached at; whoever reaches it can read, and write if the configuration allows it",
+        help="address to listen on; whoever reaches it can read, and write if the configuration allows it",
     )
-    transport.add_argument("--can", action="store_true", help="on the bus of the options below, or of the configuration")
+    transport.add_argument(
+        "--can", action="store_true", help="answer on CAN, on the bus of the options below or of the configuration"
+    )
     add_id_arguments(parser, 0x720, 0x728)
     add_bus_arguments(parser)
 

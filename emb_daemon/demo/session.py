@@ -17,7 +17,7 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.scenarios import city_drive
-from emb_daemon.resources import resource
+from emb_daemon.resources import shipped_configuration
 from emb_daemon.runtime.daemon import Daemon
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.rawcan import socket_pair
@@ -58,11 +58,7 @@ class Session:
         self.seconds = seconds
         names = CORNERS[:corners]
         self._folder = tempfile.TemporaryDirectory(prefix="emb-daemon-demo-")
-        calibration = resource("config/calibration.yaml")
-        lines = [f"  {name}: {{calibration: {str(calibration)!r}}}" for name in names]
-        config = Path(self._folder.name) / "emb.yaml"
-        config.write_text("\n".join(["format: 1", "corners:", *lines, ""]), encoding="utf-8")
-        setup = Setup(config)
+        setup = Setup(shipped_configuration(Path(self._folder.name), names))
         plants = np.array([plant_from_calibration(setup.calibrations[name], _SEED + row) for row, name in enumerate(names)])
         ours, theirs = socket_pair()
         self._buses = (ours, theirs)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -447,15 +446,3 @@ def _with_provenance(
         sigmas=sigmas,
     )
     return msgspec.structs.replace(calibration, provenance=provenance)
-
-
-def log_paths(paths: Sequence[Path]) -> list[Path]:
-    """Check that logs exist before hours are spent on the first.
-
-    Raises:
-        InputError: one does not.
-    """
-    for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: no such file")
-    return list(paths)

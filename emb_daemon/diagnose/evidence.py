@@ -17,7 +17,7 @@ class Averaging:
 
     Attributes:
         episode: of each mean.
-        per_mean: what makes a plain mean of a weighted one, shape (means,).
+        per_mean: what makes a weighted mean of a sum, and a plain mean of a weighted one, shape (means,).
     """
 
     def __init__(self, episode: np.ndarray, samples: int):
@@ -27,13 +27,12 @@ class Averaging:
         within = index - begins[np.searchsorted(begins, index, side="right") - 1]
         self._starts = np.flatnonzero(within % samples == 0)
         counts = np.diff(np.append(self._starts, len(episode)))
-        self._weight = 1.0 / np.sqrt(counts)
-        self.per_mean = self._weight
+        self.per_mean = 1.0 / np.sqrt(counts)
         self.episode = episode[self._starts]
 
     def of(self, columns: np.ndarray) -> np.ndarray:
         """Weighted means of columns (N, k)."""
-        return np.add.reduceat(columns, self._starts, axis=0) * self._weight[:, None]
+        return np.add.reduceat(columns, self._starts, axis=0) * self.per_mean[:, None]
 
 
 @dataclass(frozen=True)
@@ -169,13 +168,3 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
     p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
     return Evidence(p_value, gain, clusters, values, np.sqrt(np.diag(covariance)))
-
-
-def false_discovery(p_values: np.ndarray) -> np.ndarray:
-    """q-values of Benjamini and Hochberg (J. Royal Statistical Society B 57, 1995)."""
-    order = np.argsort(p_values)
-    count = len(p_values)
-    ranked = p_values[order] * count / np.arange(1, count + 1)
-    result = np.empty(count)
-    result[order] = np.minimum.accumulate(ranked[::-1])[::-1]
-    return np.minimum(result, 1.0)

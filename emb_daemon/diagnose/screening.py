@@ -18,7 +18,7 @@ from itertools import chain
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, effect_coordinates
-from emb_daemon.diagnose.evidence import NOT_EXCITED, Evidence, false_discovery, leave_out
+from emb_daemon.diagnose.evidence import NOT_EXCITED, Evidence, leave_out
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
@@ -130,6 +130,8 @@ class Screening:
 
     def test(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
         """Each effect in the shape that does best, with its chance corrected for all that were tried."""
+        from scipy.stats import false_discovery_control
+
         shapes = {effect.name: self._shapes(model, effect) for effect in effects}
         probes = [
             Probe(self.coordinates[effect.name][p.name], shape)
@@ -141,7 +143,7 @@ class Screening:
         columns = dict(zip(probes, columns, strict=True))
         found = [self._best(model, effect, *shapes[effect.name], columns) for effect in effects]
         chances = np.array([c.p_value for c in found] + [1.0] * (len(REGISTRY) - len(found)))
-        return [replace(c, q_value=float(q)) for c, q in zip(found, false_discovery(chances), strict=False)]
+        return [replace(c, q_value=float(q)) for c, q in zip(found, false_discovery_control(chances), strict=False)]
 
     def _shapes(self, model: Model, effect: Effect) -> tuple[list[tuple[tuple[Coordinate, float], ...]], int]:
         """Shapes in which to test an effect, and how many were looked at to choose them."""

@@ -1,4 +1,4 @@
-"""Radiation of the disc beyond what the calibration's disc radiates: it rules when a hot disc stands."""
+"""Radiation of the disc beyond that in the calibration: it dominates while a hot disc stands still."""
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
 from emb_daemon.jit import njit

@@ -32,6 +32,6 @@ EFFECT = Effect(
     source="thesis 10.2; grey iron, 26 mm, 1.0e-5 1/K: 0.26 µm/K",
     state=STATE,
     signal="disc_temperature",
-    manoeuvre="heat the disc, then clamp repeatedly while it cools: wear stays, growth goes back",
+    manoeuvre="heat the disc, then clamp repeatedly while it cools: wear remains, growth reverses",
     placebos=(Placebo("disc temperature of another episode", signal=of_another_episode),),
 )

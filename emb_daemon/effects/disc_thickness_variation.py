@@ -109,7 +109,7 @@ EFFECT = Effect(
     signal="disc_angle",
     manoeuvre="hold the clamp force on a turning wheel for several turns",
     placebos=(
-        Placebo("wheel angle beginning anew with each episode", samples=_from_anywhere),
+        Placebo("wheel angle starting at random in each episode", samples=_from_anywhere),
         Placebo("orders that no disc has", samples=_of_another_size),
     ),
 )

@@ -1,4 +1,4 @@
-"""Pad fade: hot pads rub less, so braking heats less than the friction table says."""
+"""Pad fade: hot pads have less friction, so braking produces less heat than the friction table says."""
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
 from emb_daemon.jit import njit

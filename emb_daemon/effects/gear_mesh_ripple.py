@@ -1,4 +1,4 @@
-"""Ripple of the gear's transmission with the motor angle: it grows with the load."""
+"""Ripple of the gear's transmission ratio over the motor angle: its torque grows with the load."""
 
 from math import cos, sin
 

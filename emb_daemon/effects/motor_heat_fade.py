@@ -1,4 +1,4 @@
-"""Torque constant falling as the motor heats itself: magnets beside a winding that warms with the square of its current.
+"""Torque constant falling as the motor heats itself: the winding warms with the square of its current, and warms the magnets.
 
 No sensor is near. What the current has left in winding and housing is followed by one lag, whose time constant comes from the
 data; what surrounds the motor is for `torque_constant_fade`.
@@ -30,7 +30,7 @@ EFFECT = Effect(
     term=term,
     parameters=(
         Parameter("fade_per_A2", "1/A²", 0.0, 1e-3, 2e-5, "relative loss of torque constant per squared current, settled"),
-        Parameter("time_constant_s", "s", 2.0, 2000.0, 60.0, "of the heat on its way to the magnets", (10.0, 60.0, 300.0)),
+        Parameter("time_constant_s", "s", 2.0, 2000.0, 60.0, "of the heat's way to the magnets", (10.0, 60.0, 300.0)),
     ),
     equation="K_m → K_m (1 − κ h),  τ dh/dt + h = I²",
     source="lumped motor heat: Mellor, Roberts, Turner, IEE Proc. B 138(5), 1991; magnets as torque_constant_fade",

@@ -1,4 +1,4 @@
-"""Pad wear: contact comes later by what friction has removed."""
+"""Pad wear: contact comes later because friction has removed material."""
 
 import numpy as np
 
@@ -26,6 +26,6 @@ EFFECT = Effect(
     source="Archard, J. Applied Physics 24, 1953",
     state=STATE,
     signal="energy",
-    manoeuvre="clamp again after the disc has cooled: growth goes back, wear stays",
+    manoeuvre="clamp again after the disc has cooled: growth reverses, wear remains",
     placebos=(Placebo("friction energy of another episode", signal=of_another_episode),),
 )

@@ -1,4 +1,4 @@
-"""A second Maxwell slip element: the loop's sides are bent, because parts of pads and caliper slip after other travels."""
+"""A second Maxwell slip element: parts of pads and caliper slip after different travels, which bends the sides of the loop."""
 
 from emb_daemon.effects.base import Effect, Parameter
 from emb_daemon.effects.stiffness_hysteresis import STATE, term

@@ -1,4 +1,4 @@
-"""Stribeck friction: at low speed, before the lubricant carries, gear friction is higher."""
+"""Stribeck friction: at low speed, before a film of lubricant forms, gear friction is higher."""
 
 from math import exp
 
@@ -34,5 +34,5 @@ EFFECT = Effect(
     equation="T_f → T_f [1 + r exp(−|ω|/ω_s)]",
     source="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994: T_s/T_c 1.3 to 2",
     signal="motor_speed",
-    manoeuvre="very slow strokes beside fast ones",
+    manoeuvre="very slow strokes and fast ones",
 )

@@ -1,4 +1,4 @@
-"""Lag of the backing plates' thermocouples: they show what the plates were, not what they are."""
+"""Lag of the backing plates' thermocouples: they show the plates' earlier temperature."""
 
 from math import exp
 

@@ -1,4 +1,4 @@
-"""A third relaxation, slower still: friction materials creep over decades of time, which no single element spans."""
+"""A third, still slower relaxation: friction materials creep over decades of time, more than one element can describe."""
 
 from emb_daemon.effects.base import Effect, Parameter
 from emb_daemon.effects.second_relaxation import STATE, term
@@ -15,6 +15,6 @@ EFFECT = Effect(
     source="generalized Maxwell solid (Prony series); Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 3",
     state=STATE,
     signal="time_clamped",
-    manoeuvre="step the motor and hold for a minute, then release and wait as long: the force creeps on, and back",
+    manoeuvre="step the motor and hold for a minute, then release and wait as long: the force creeps, then creeps back",
     beside="second_relaxation",
 )

@@ -1,4 +1,4 @@
-"""Torque constant falling with the current of the moment: iron that saturates carries less of the flux that makes torque.
+"""Torque constant falling with the present current: saturated iron carries less of the flux that makes torque.
 
 Flux linkage is odd in the current, so that its first departure from proportion is cubic and the torque constant's is
 quadratic. Where pads are clamped the current follows the force, and friction or a curve that bend a little look the same: on

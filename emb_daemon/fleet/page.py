@@ -185,7 +185,7 @@ def _data(page: Page, root: Path, found: Findings) -> None:
     section = page.section("Data").items(
         [
             f"{len(files)} log files, {len(damaged)} of them damaged",
-            f"{len(found.silent)} drives say nothing{': ' + silent if silent else ''}",
+            f"{len(found.silent)} drives cannot be used{': ' + silent if silent else ''}",
             f"{len(found.left_out)} units with too few drives to be placed",
             f"{len(figures)} drives replayed, {seconds / 3600.0:.1f} h{'; of the time: ' + raised if raised else ''}",
             f"frames refused: {', '.join(f'{count} {verdict}' for verdict, count in refused.most_common()) or 'none'}",

@@ -52,7 +52,7 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
             "check and decode": lambda: samples_in(frames, (corner,)),
             "estimate": lambda: estimate(samples, parameters),
             "read columns": lambda: read_drive(root, drive),
-            "ask for all causes": lambda: questions.ask(read_drive(root, drive)[0], drive),
+            "project on all causes": lambda: questions.ask(read_drive(root, drive)[0], drive),
             "replay from the file": lambda: Replay(calibration, corner).run(path),
             "replay from columns": lambda: estimate(read_drive(root, drive)[0].samples, parameters),
         }

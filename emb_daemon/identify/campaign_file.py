@@ -15,117 +15,121 @@ _TOLERANCE = 0.15
 
 
 class Trial(Struct, kw_only=True):
-    """One log with pads of one thickness."""
+    """One log, recorded with pads of one thickness."""
 
-    #: Relative to the campaign.
+    #: Log file, relative to the campaign.
     log: str
-    #: The campaign's if it is left out.
+    #: Thickness of the pads; if left out, the campaign's.
     pad_thickness_mm: Positive | None = None
 
 
 class Sine(Trial, kw_only=True):
-    """Motor angle a sinusoid."""
+    """A log in which the motor angle is a sinusoid."""
 
-    #: Of the sinusoid.
+    #: Frequency of the sinusoid.
     frequency_Hz: Positive
 
 
 class Training(Struct, kw_only=True):
-    """Park brake training, and a log to judge on what is known then."""
+    """A log of park brake training, and a log on which the learned values are judged."""
 
-    #: Slow clamp and release with a small fast sinusoid on top, relative to the campaign.
+    #: Log of a slow clamp and release with a small fast sinusoid added, relative to the campaign.
     training: str
-    #: Random motor angle, to judge by.
+    #: Log with random motor angle, on which the learned values are judged.
     judge: str | None = None
-    #: The campaign's if it is left out.
+    #: Thickness of the pads; if left out, the campaign's.
     pad_thickness_mm: Positive | None = None
 
 
 class DiscCooling(Struct, kw_only=True):
-    """Heated, then released at constant disc speed, against which the log is checked."""
+    """A log in which the disc is heated, then released at constant speed."""
 
-    #: Relative to the campaign.
+    #: Log file, relative to the campaign.
     log: str
-    #: Speed of the disc in the log's second half.
+    #: Speed of the disc in the second half of the log; a log with another speed is left out.
     disc_turns_per_s: Annotated[float, Meta(ge=0.0)]
 
 
 class ThermalLogs(Struct, kw_only=True):
-    """Second test rig: the disc turns, thermocouples stand in the pads."""
+    """Logs of a rig whose disc turns and whose pads contain thermocouples."""
 
-    #: About 3 kN, the disc's speed a slow sinusoid: heat paths of pads and disc.
+    #: About 3 kN, with the disc's speed as a slow sinusoid: for the heat paths of pads and disc.
     tune: str | None = None
-    #: Stops and pauses, to judge by.
+    #: Stops and pauses, on which the heat model is judged.
     validate: str | None = None
-    #: A grid of clamp force and disc speed at rising temperature: the friction coefficient.
+    #: A grid of clamp forces and disc speeds at rising temperature: for the friction coefficient.
     heat_flux_map: str | None = None
-    #: Cold clamps, heating, then a burst of clamps every few minutes for hours: softening and its history.
+    #: Cold clamps, heating, then a burst of clamps every few minutes for hours: for softening and its history.
     pad_cooling: str | None = None
-    #: One for each disc speed.
+    #: One log for each disc speed: for the cooling of the disc.
     disc_cooling: tuple[DiscCooling, ...] = ()
 
 
 class Integrated(Struct, kw_only=True):
-    """Everything together on hot pads."""
+    """Logs with everything together on hot pads."""
 
-    #: Training, braking heat and random angle: softening where no burst log is.
+    #: Training, braking heat and random angle: for softening, if there is no log `pad_cooling`.
     fit: str | None = None
-    #: The same again, to judge by.
+    #: The same again, on which the calibration is judged.
     judge: str | None = None
 
 
 class CampaignFile(Struct, kw_only=True):
-    """CAMPAIGN.yaml. Paths are relative to the file."""
+    """CAMPAIGN.yaml. Paths are relative to this file."""
 
-    #: A name, for the calibration's.
+    #: Name of the rig; the calibration's `actuator` is made from it.
     rig: str
-    #: FL, FR, RL or RR: of the log's messages.
+    #: Corner whose messages are in the logs: FL, FR, RL or RR.
     corner: str = "FL"
-    #: The rig's own description of its bus; it must agree with the layout that the daemon reads.
+    #: DBC of the rig; its layout must agree with the one that the daemon reads.
     dbc: str | None = None
-    #: What the supplier states, a file with the keys of the second part of this page.
+    #: Datasheet file, with the keys of the second part of this page.
     datasheet: str
-    #: Of every log that states none, and of the pads that the calibration is for; the datasheet's if it is left out.
+    #: Pad thickness of every log that states none, and of the pads for which the calibration is made; if left out, the
+    #: datasheet's.
     pad_thickness_mm: Positive | None = None
-    #: Slow clamp and release from the released position to the largest force, some ten seconds each way.
+    #: Slow clamp and release between the released position and the largest force, some ten seconds each way: for curve and
+    #: friction.
     curves: tuple[Trial, ...] = ()
-    #: A new random motor angle every 100 ms between released and clamped, beginning released: relaxation, inertia, friction.
+    #: A new random motor angle every 100 ms between released and clamped, beginning released: for relaxation, inertia and
+    #: friction.
     random: tuple[Trial, ...] = ()
-    #: Of other pads, without the reference force: for the study of adaptation; identification judges alone.
+    #: Trainings with other pads, without reference force, for the study of adaptation. Identification uses only their `judge`.
     adaptation: tuple[Training, ...] = ()
-    #: Sinusoids, for figures over frequency.
+    #: Logs with sinusoids, for figures over frequency.
     frequency_response: tuple[Sine, ...] = ()
-    #: One for each state of wear.
+    #: Trainings with a worn gear, one for each state of wear.
     gear_wear: tuple[Training, ...] = ()
-    #: Logs with thermocouples in the pads; without any the force does not follow temperature.
+    #: Logs with thermocouples in the pads. Without them the estimated force does not depend on temperature.
     thermal: ThermalLogs | None = None
-    #: Hot pads, everything together.
+    #: Logs with everything together on hot pads.
     integrated: tuple[Integrated, ...] = ()
 
 
 class Actuator(Struct, kw_only=True):
     """Motor, gear and screw."""
 
-    #: Clamp travel per radian of the motor, which is also torque per clamp force; geometry, taken as exact. With `travel`, a
-    #: mean of it.
+    #: Clamp travel per radian of the motor, which equals motor torque per clamp force without friction. Known from the
+    #: geometry and taken as exact. With `travel`: the mean slope of that table.
     gear_gain_m_per_rad: Positive
-    #: Of a gear that is not constant; likewise taken as exact.
+    #: Only for a gear that is not constant; taken as exact.
     travel: Travel = CONSTANT_GEAR
-    #: Of a spring that helps release: force on the gear's output per travel from the released position, none there; exact.
+    #: Rate of a spring that helps release: force on the gear's output per travel from the released position, where the spring
+    #: is relaxed; taken as exact.
     release_spring_N_per_m: NonNegative = 0.0
-    #: This and the inertia are priors, and a unit beyond their tolerances is reported.
+    #: Torque constant of the motor. A prior: identification reports a unit whose value is beyond the tolerance.
     motor_torque_constant_Nm_per_A: Positive
-    #: Share, two standard deviations.
+    #: Relative tolerance of the torque constant: two standard deviations.
     motor_torque_constant_tolerance: Positive = _TOLERANCE
-    #: Of everything that turns, seen from the motor.
+    #: Inertia of everything that turns, at the motor shaft. A prior, like the torque constant.
     lumped_inertia_kg_m2: Positive
-    #: Share, two standard deviations.
+    #: Relative tolerance of the inertia: two standard deviations.
     lumped_inertia_tolerance: Positive = _TOLERANCE
-    #: The fastest that the motor turns.
+    #: Largest speed of the motor.
     max_motor_speed_rad_per_s: Positive
     #: Largest force of the brake.
     rated_clamp_force_N: Positive
-    #: Motor angle between the released position and contact; half of it must surely be free of contact.
+    #: Motor angle between the released position and contact. Within half of it the pads must certainly not touch.
     pad_clearance_rad: Positive
 
     def __post_init__(self):
@@ -135,9 +139,9 @@ class Actuator(Struct, kw_only=True):
 class Resolver(Struct, kw_only=True):
     """Motor angle sensor."""
 
-    #: Of one turn of the motor.
+    #: Counts per turn of the motor.
     counts_per_revolution: Positive
-    #: In words, for people.
+    #: What the angle is, in words; not evaluated.
     angle_is: str = ""
 
     @property
@@ -149,37 +153,37 @@ class Resolver(Struct, kw_only=True):
 class PadNominal(Struct, kw_only=True):
     """One pad."""
 
-    #: Friction material alone.
+    #: Thickness of the friction material alone.
     thickness_mm: Positive
-    #: That touches the disc.
+    #: Area that touches the disc.
     frontal_area_m2: Positive
-    #: Of the friction material.
+    #: Density of the friction material.
     density_kg_per_m3: Positive
-    #: Of the friction material.
+    #: Specific heat of the friction material.
     specific_heat_J_per_kgK: Positive
-    #: Of the friction material, at 20 degC.
+    #: Heat conductivity of the friction material at 20 degC.
     conductivity_W_per_mK: Positive
 
 
 class DiscNominal(Struct, kw_only=True):
     """Brake disc."""
 
-    #: Of the friction ring.
+    #: Mass of the friction ring.
     mass_kg: Positive
-    #: Of its material.
+    #: Specific heat of the disc's material.
     specific_heat_J_per_kgK: Positive
-    #: At which the pads rub.
+    #: Radius at which the pads' friction acts.
     effective_radius_m: Positive
-    #: That meets the air, both sides.
+    #: Area that is exposed to the air, both sides together.
     cooling_area_m2: Positive
-    #: Of its material.
+    #: Heat conductivity of the disc's material.
     conductivity_W_per_mK: Positive
 
 
 class Wheel(Struct, kw_only=True):
     """Wheel speed sensor."""
 
-    #: Must be the daemon's own count.
+    #: Pulses per turn of the wheel; must be the number that the daemon uses.
     pulses_per_revolution: Positive
 
     def __post_init__(self):
@@ -195,7 +199,7 @@ class Datasheet(Struct, kw_only=True):
     pad: PadNominal
     disc: DiscNominal
     wheel: Wheel | None = None
-    #: Of pad on disc.
+    #: Nominal friction coefficient of pad on disc.
     friction_coefficient: Positive
 
     def stated(self, key: str) -> tuple[float, float]:

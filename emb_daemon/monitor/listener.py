@@ -51,6 +51,10 @@ class Stream:
         """Whether the sender says that the values may be used."""
         return self.status <= contract.STATUS_DEGRADED
 
+    def value(self, column: int) -> float | None:
+        """A signal of the last good frame; None before the first, or if the sender says not to use it."""
+        return self.values[column] if self.values and self.usable else None
+
     def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
         """Count a frame with a good CRC; returns whether its values are new."""
         if self.counter >= 0:
@@ -132,7 +136,8 @@ class Corner:
         )
 
         def value(stream: Stream, column: int, digits: int) -> float | None:
-            return round(stream.values[column], digits) if stream.values and stream.usable else None
+            known = stream.value(column)
+            return None if known is None else round(known, digits)
 
         return {
             "status": contract.STATUSES.get(force.status, "?"),

@@ -170,18 +170,22 @@ def city_drive() -> Schedule:
     )
 
 
-SCENARIOS = {
-    "drive": (city_drive, "two stops, a cruise, parking: 30 s, over and over"),
-    "stops": (
-        lambda: rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0),
-        "brake stops from 20 and 14 m/s",
-    ),
-    "cruise": (
-        lambda: rest(1.0) + accelerate(22.0, 30.0) + drag(2500.0, 22.0, 20.0) + accelerate(22.0, 30.0) + stop(6000.0, 9.0),
-        "driving with a long slight brake application",
-    ),
-    "park": (lambda: rest(1.0) + park(12000.0, 120.0) + rest(2.0), "parked: training motion when the daemon asks for it"),
-}
+def two_stops() -> Schedule:
+    """From 20 and 14 m/s."""
+    return rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0)
+
+
+def cruise() -> Schedule:
+    """Driving with a long slight brake application."""
+    return rest(1.0) + accelerate(22.0, 30.0) + drag(2500.0, 22.0, 20.0) + accelerate(22.0, 30.0) + stop(6000.0, 9.0)
+
+
+def parking() -> Schedule:
+    """Two minutes, in which the daemon may ask for its training motion."""
+    return rest(1.0) + park(12000.0, 120.0) + rest(2.0)
+
+
+SCENARIOS = {"drive": city_drive, "stops": two_stops, "cruise": cruise, "park": parking}
 
 
 def scenario(name: str) -> Schedule:
@@ -192,7 +196,7 @@ def scenario(name: str) -> Schedule:
     """
     if name not in SCENARIOS:
         raise InputError(f"scenario {name}: expected one of {', '.join(SCENARIOS)}")
-    return SCENARIOS[name][0]()
+    return SCENARIOS[name]()
 
 
 #: Share of the demanded force at a rear brake.

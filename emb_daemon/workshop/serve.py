@@ -4,7 +4,6 @@ It shares nothing with the daemon but the bus and files that it only reads; it m
 """
 
 import json
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,20 +31,16 @@ _PAUSE_S = 0.02
 def frame_of(corner: Corner, time_s: int) -> Frame:
     """What a corner's broadcasts say now."""
     force, heat, status = (corner.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS))
-
-    def value(stream, column: int, scale: float = 1.0) -> float | None:
-        known = stream.values and stream.usable and math.isfinite(stream.values[column])
-        return scale * stream.values[column] if known else None
-
+    force_N, sigma_N = (None if kN is None else 1e3 * kN for kN in (force.value(0), force.value(1)))
     return Frame(
         time_s=time_s,
         mode=int(status.values[0]) if status.values else INIT,
         source=int(force.values[3]) if force.values else INVALID,
-        force_N=value(force, 0, 1e3),
-        sigma_N=value(force, 1, 1e3),
-        temperatures_C=tuple(value(heat, column) for column in range(4)),
-        contact_angle_rad=value(status, 2),
-        stiffness_factor=value(status, 1),
+        force_N=force_N,
+        sigma_N=sigma_N,
+        temperatures_C=tuple(heat.value(column) for column in range(4)),
+        contact_angle_rad=status.value(2),
+        stiffness_factor=status.value(1),
     )
 
 
