@@ -72,7 +72,7 @@ class Adaptation:
             in_use = self.in_use(name)
             snapshot, time_ns, warning = self._snapshots.load(name, in_use)
             if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
-                warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
+                warning = f"{self._snapshots.path(name)}: {wrong}: impossible for this brake; not used"
             if warning:
                 log.warning("corner %s: %s", name, warning)
             elif snapshot is not None:

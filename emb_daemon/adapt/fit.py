@@ -472,9 +472,9 @@ def _judge(rows, fit, base, found):
     if not _is_excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
-        return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"
+        return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} times the noise"
     if abs(fit.x[_GAIN]) > _GAIN_LIMIT:
-        return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} of the calibration's"
+        return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} times the calibration's"
     if out_of_bounds := why_out_of_bounds(base, found.values):
         return r.OUT_OF_BOUNDS, out_of_bounds
     if evidence["force_sigma_N"] > limits.maximum_sigma_N:

@@ -78,7 +78,7 @@ def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str
     """What in learned ``values`` a brake with this calibration cannot have, in words; empty if nothing."""
     limits, keys = calibration.adaptation, learned_keys(calibration)
     if wrong := (values.keys() | {CLEARANCE}) ^ keys:
-        return f"{', '.join(sorted(wrong))}: missing, or not learned"
+        return f"{', '.join(sorted(wrong))}: missing, or not a learned value"
     try:
         p = to_parameters(moved(calibration, values, checked=True))
     except InputError as error:

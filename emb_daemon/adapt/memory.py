@@ -89,7 +89,7 @@ def hold(folder: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise Unavailable(f"{folder}: state directory of another process that runs") from None
+        raise Unavailable(f"{folder}: state directory is in use by another running process") from None
     return descriptor
 
 

@@ -36,7 +36,7 @@ class Bus(Struct, kw_only=True):
 
         if self.interface not in VALID_INTERFACES:
             near = difflib.get_close_matches(self.interface, VALID_INTERFACES, 3, 0.4) or sorted(VALID_INTERFACES)
-            raise InvalidValue(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
+            raise InvalidValue(f"interface: unknown to python-can: {self.interface}; similar are {', '.join(near)}")
 
 
 class Corner(Struct, kw_only=True):

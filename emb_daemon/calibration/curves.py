@@ -67,7 +67,9 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
         return table[0]
     low, high = thickness_range(curves)
     if not low <= pad_thickness_mm <= high:
-        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured; expected {low:g} to {high:g}")
+        raise InputError(
+            f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured thicknesses; expected {low:g} to {high:g}"
+        )
     thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
     upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
     share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])

@@ -128,7 +128,7 @@ def value_of(calibration: Calibration, key: str) -> float:
     except (AttributeError, IndexError, KeyError, TypeError):
         found = None
     if type(found) is not float:
-        raise InputError(f"{key}: no number of the calibration{_near(calibration, key)}")
+        raise InputError(f"{key}: not a number of the calibration{_near(calibration, key)}")
     return found
 
 
@@ -184,7 +184,7 @@ def _parts(key: str) -> tuple[str | int, ...]:
 def _near(calibration: Calibration, key: str) -> str:
     effects = [f"effects.{effect}.{name}" for effect, parameters in _EFFECTS.items() for name in parameters]
     near = difflib.get_close_matches(key, dict.fromkeys([*keys(calibration), *effects]), 3, 0.6)
-    return f"; near are {', '.join(near)}" if near else ""
+    return f"; similar are {', '.join(near)}" if near else ""
 
 
 def _neutral(effect: str) -> dict[str, float]:

@@ -77,7 +77,7 @@ class _Reader:
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else "?"
             if name in entries:
-                self.fault(key, _join(path, name), "stands here twice")
+                self.fault(key, _join(path, name), "occurs twice")
             entries[name] = value
         return entries
 

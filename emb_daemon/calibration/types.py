@@ -40,16 +40,18 @@ class Travel(Struct, kw_only=True):
 
     def __post_init__(self):
         if len(self.angle_rad) != len(self.travel_mm):
-            raise InvalidValue(f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected as many")
+            raise InvalidValue(
+                f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected the same number"
+            )
         if 0 < len(self.angle_rad) < 3:
-            raise InvalidValue("expected three points or more")
+            raise InvalidValue("expected at least three points")
         for name in ("angle_rad", "travel_mm"):
             values = getattr(self, name)
             if values and values[0] != 0.0:
                 raise InvalidValue(f"{name}: expected the released position, zero, as first point")
             for row, (before, after) in enumerate(pairwise(values), 1):
                 if after <= before:
-                    raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected more")
+                    raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected ascending values")
 
     def check_mean(self, gear_gain: float) -> None:
         """Raise `InvalidValue` if a gear gain (m/rad) is none of this travel's."""
@@ -59,7 +61,7 @@ class Travel(Struct, kw_only=True):
         # A hundredth: both are rounded.
         if not 0.99 * slopes.min() <= gear_gain <= 1.01 * slopes.max():
             raise InvalidValue(
-                f"gear_gain_m_per_rad: {gear_gain:g} is no mean of travel, which rises by {slopes.min():.3g} to "
+                f"gear_gain_m_per_rad: {gear_gain:g} is not a mean slope of travel, whose slope is {slopes.min():.3g} to "
                 f"{slopes.max():.3g} m/rad"
             )
 

@@ -171,7 +171,7 @@ def city_drive() -> Schedule:
 
 
 SCENARIOS = {
-    "drive": (city_drive, "two stops, a cruise, parking: 30 s, over and over"),
+    "drive": (city_drive, "two stops, a cruise, parking: 30 s, repeated"),
     "stops": (
         lambda: rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0),
         "brake stops from 20 and 14 m/s",
@@ -180,7 +180,7 @@ SCENARIOS = {
         lambda: rest(1.0) + accelerate(22.0, 30.0) + drag(2500.0, 22.0, 20.0) + accelerate(22.0, 30.0) + stop(6000.0, 9.0),
         "driving with a long slight brake application",
     ),
-    "park": (lambda: rest(1.0) + park(12000.0, 120.0) + rest(2.0), "parked: training motion when the daemon asks for it"),
+    "park": (lambda: rest(1.0) + park(12000.0, 120.0) + rest(2.0), "parked: training motion when the daemon requests it"),
 }
 
 

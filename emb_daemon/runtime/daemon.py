@@ -184,7 +184,7 @@ class Daemon:
 
     def _leave_page(self) -> None:
         if self._on_page:
-            log.warning("who asked for other calibrations has gone: back to the files'")
+            log.warning("the XCP server has ended: returning to the calibrations of the files")
             self._reload_wanted = True
 
     def warm_up(self) -> None:
@@ -348,9 +348,9 @@ class Daemon:
         request.read_ns = request.read_ns or now_ns
         if not request.fault:
             if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
-                answer = Answer("it took too long to be checked", later=True)
+                answer = Answer("checking it took too long", later=True)
             elif self._waiting:
-                answer = Answer("a reload waits for the brakes' release", later=True)
+                answer = Answer("a reload is waiting for the brakes to be released", later=True)
             elif request.read and (why_not := self.pipeline.why_not_at_rest()):
                 if now_ns - request.read_ns < _SETTLING_NS:
                     return None
@@ -362,7 +362,7 @@ class Daemon:
             count = len(request.page.values.get(name, ()))
             self._begin_anew(name, calibration, learned, on_page=count > 0)
             if count:
-                log.warning("corner %s: %d numbers are not the file's, and nothing is learned", name, count)
+                log.warning("corner %s: %d numbers differ from the file; adaptation is off", name, count)
         return answer
 
     def _released(self, name: str) -> bool:
@@ -374,13 +374,13 @@ class Daemon:
         try:
             setup = Setup(self._setup.path)
             if setup.calibrations.keys() != self._setup.calibrations.keys():
-                raise InputError(f"{setup.path}: corners: a reload cannot change them, restart instead")
+                raise InputError(f"{setup.path}: corners: a reload cannot change them; restart the daemon")
             calibrations = request.page.applied(setup.calibrations) if request else setup.calibrations
         except InputError as error:
             if request:
                 request.fault = str(error)
             else:
-                log.error("calibration not reloaded, the old one stays: %s", error)
+                log.error("calibration not reloaded, the old one stays in use: %s", error)
             if request or not self._on_page:
                 return
             # A page does not stay because a file is bad.
@@ -412,7 +412,7 @@ class Daemon:
             calibration = self._adaptation.in_use(name)
         self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
         words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
-        log.info("corner %(corner)s: begins anew with calibration %(calibration)s", words, extra={"fields": words})
+        log.info("corner %(corner)s: starts anew with calibration %(calibration)s", words, extra={"fields": words})
 
     def _ping(self) -> bool:
         """Tell the watchdog that the loop is well; False, with the reason in the log, if it is not.
@@ -423,7 +423,7 @@ class Daemon:
         met, missed = self.ticks - self._before[0], self.missed - self._before[1]
         silent = self._active & ~self._estimated
         amiss = [
-            f"corner {name}: estimator lost, what it knows is not a number"
+            f"corner {name}: the estimator's state is not a number"
             for index, name in enumerate(CORNERS)
             if self._lost >> index & 1
         ]
@@ -432,7 +432,7 @@ class Daemon:
             amiss.append(f"{missed} of {met + missed} periods missed")
         self._before, self._estimated, self._lost = (self.ticks, self.missed), 0, 0
         if amiss:
-            log.error("the watchdog is not pinged: %s", "; ".join(amiss))
+            log.error("not pinging the watchdog: %s", "; ".join(amiss))
         else:
             self._manager.notify("WATCHDOG=1")
         return not amiss

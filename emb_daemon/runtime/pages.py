@@ -54,10 +54,12 @@ class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 continue
             calibration = calibrations[name]
             if self.files.get(name) != calibration_hash(calibration):
-                faults.append(f"corner {name}: the file is not the one that the page was made from: start emb-daemon xcp anew")
+                faults.append(
+                    f"corner {name}: the calibration file has changed since the page was made: restart emb-daemon xcp"
+                )
                 continue
             known = set(tunable(calibration))
-            faults += [f"corner {name}: {key}: no number that a page may set" for key in values if key not in known]
+            faults += [f"corner {name}: {key}: not a number that a page may set" for key in values if key not in known]
             if known.issuperset(values):
                 try:
                     result[name] = moved(calibration, values, checked=True)

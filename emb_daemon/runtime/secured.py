@@ -61,20 +61,20 @@ class FreshnessFile:
         """
         kept = self.load()
         if kept.trip >= LAST_TRIP:
-            raise InputError(f"{self.path}: all trip counters are used up; expected new keys, and then no such file")
+            raise InputError(f"{self.path}: all trip counters are used up; install new keys and remove this file")
         begun = kept.next_trip()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             files.write(self.path, begun)
         except OSError as error:
-            raise Unavailable(f"{self.path}: trip counter not kept: {error.strerror}") from None
+            raise Unavailable(f"{self.path}: trip counter cannot be stored: {error.strerror}") from None
         return begun
 
     def keep(self, freshness: Freshness) -> None:
         try:
             files.write(self.path, freshness)
         except OSError as error:
-            log.error("%s: freshness not kept: %s", self.path, error.strerror)
+            log.error("%s: freshness cannot be stored: %s", self.path, error.strerror)
 
 
 class Authentication:
@@ -170,9 +170,13 @@ def secure(bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]
         Unavailable: the trip counter cannot be kept.
     """
     if state is None:
-        raise InputError(f"{setup.path}: secoc: freshness must outlive a restart; expected state_directory as well")
+        raise InputError(f"{setup.path}: secoc: freshness must survive a restart; expected state_directory as well")
     file = FreshnessFile(state)
     authentication = Authentication(*setup.links, setup.keys, file.begin_trip(), file)
     for link in authentication.keyless:
-        log.error("%s: no key %s: nothing under it is believed or authenticated", setup.configuration.secoc.keys, link.name)
+        log.error(
+            "%s: no key %s: its messages are neither accepted nor sent with authentication",
+            setup.configuration.secoc.keys,
+            link.name,
+        )
     return SecuredBus(bus, authentication), {link.corner for link in authentication.keyless} - {""}

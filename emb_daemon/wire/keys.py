@@ -37,7 +37,7 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
     if status.st_mode & (0o037 if credential else 0o077):
         raise InputError(f"{path}: mode {stat.S_IMODE(status.st_mode):o}: others may read or change it; expected 600 or 400")
     if status.st_uid not in (0, os.geteuid()):
-        raise InputError(f"{path}: belongs to somebody else")
+        raise InputError(f"{path}: belongs to another user")
     keys, faults = {}, []
     for number, line in enumerate(text.splitlines(), 1):
         if not (line := line.partition("#")[0].strip()):
@@ -45,9 +45,11 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
         if not (match := _LINE.fullmatch(line)):
             faults.append(f"{path}:{number}: {_EXAMPLE}")
         elif match[1] in keys:
-            faults.append(f"{path}:{number}: {match[1]}: stands there twice")
+            faults.append(f"{path}:{number}: {match[1]}: occurs twice")
         elif (key := bytes.fromhex(match[2])) in keys.values():
-            faults.append(f"{path}:{number}: {match[1]}: another has the same key; expected one for each sender and receiver")
+            faults.append(
+                f"{path}:{number}: {match[1]}: another name has the same key; expected a different key for each name"
+            )
         else:
             keys[match[1]] = key
     if faults:
