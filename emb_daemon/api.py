@@ -148,10 +148,10 @@ def log_of_arrays(
             source = source.averaged(None if current_mean_s is None else 1e9 * current_mean_s)
         messages.setdefault(message, {})[signal] = source
     if not isinstance(angle_rad if angle_rad is not None else speed_rad_per_s, np.ndarray | list | tuple):
-        raise InputError("angle_rad, speed_rad_per_s: expected one of them at least")
+        raise InputError("angle_rad, speed_rad_per_s: expected at least one of them")
     thermocouple = messages.get(f"EMB_{corner}_Thermocouple", {})
     if set(thermocouple) == {"CaliperTemp"}:
-        raise InputError("caliper_C: expected inner_backplate_C or outer_backplate_C beside it")
+        raise InputError("caliper_C: expected inner_backplate_C or outer_backplate_C as well")
     return log_of(frames_of({name: fill_missing(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
 
 
@@ -160,9 +160,11 @@ def _in_time(time_s: np.ndarray, columns: dict) -> tuple[np.ndarray, np.ndarray]
     measured = {name: np.asarray(values, float) for name, values in columns.items() if values is not None and np.ndim(values)}
     for name, values in measured.items():
         if values.shape != time_s.shape:
-            raise InputError(f"{name}: expected as many values as times, found shape {values.shape} beside {time_s.shape}")
+            raise InputError(
+                f"{name}: expected as many values as times, found shape {values.shape} for times of shape {time_s.shape}"
+            )
     if not np.all(np.abs(time_s) < LATEST_S):
-        raise InputError(f"time_s: {time_s[~(np.abs(time_s) < LATEST_S)][0]:g} is no time in s")
+        raise InputError(f"time_s: {time_s[~(np.abs(time_s) < LATEST_S)][0]:g} is not a time in s")
     return in_time("arrays", np.rint(1e9 * time_s).astype(np.int64), list(measured.values()))
 
 

@@ -62,7 +62,7 @@ if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or import
 
     def depend_on(source) -> None:
         if library.in_use():
-            raise RuntimeError(f"{source}: kernels compiled ahead know nothing of it; {library.VARIABLE}= has numba used")
+            raise RuntimeError(f"{source}: is not in the kernels compiled ahead; set {library.VARIABLE}= (empty) to use numba")
 
 else:
     from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit

@@ -40,7 +40,7 @@ def _cache_folder() -> Path:
     global _private
     _private = tempfile.TemporaryDirectory(prefix="emb_daemon-")
     print(
-        f"emb_daemon: cannot keep compiled code in {folder} ({trouble}), compiling anew at every start; "
+        f"emb_daemon: cannot keep compiled code in {folder} ({trouble}), so it compiles at every start; "
         "set NUMBA_CACHE_DIR to a writable folder of your own",
         file=sys.stderr,
     )

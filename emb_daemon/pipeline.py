@@ -132,17 +132,17 @@ class Pipeline:
             corner, name = self.corners[index], wire.CORNERS[index]
             now = corner["sample_ns"]
             if not corner["started"] or corner["predicted"]:
-                return f"corner {name} is not heard"
+                return f"corner {name} sends no samples"
             if self.states[index]["contact"]["engaged"]:
                 return f"corner {name} is not released"
             if now - status["time_ns"] >= _USABLE_NS:
-                return "the vehicle's status is not heard"
+                return "no vehicle status is received"
             if now - wheels["time_ns"] < _USABLE_NS and wheels["values"][index] > TURNING_RAD_PER_S:
                 return f"wheel {name} turns"
         if status["values"][wire.VEHICLE_SPEED] > 0.0:
             return "the vehicle moves"
         if status["values"][wire.BRAKE_REQUEST] != 0.0:
-            return "the brake is asked for"
+            return "braking is requested"
         return ""
 
     def distrust(self, corners) -> None:

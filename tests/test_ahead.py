@@ -146,7 +146,7 @@ def test_one_of_somebody_else_is_refused(tmp_path, monkeypatch):
     if path.stat().st_uid == 0:
         os.chown(path, 1234, -1)
     monkeypatch.setattr(os, "geteuid", lambda: 4321)
-    with pytest.raises(Refused, match="belongs to somebody else"):
+    with pytest.raises(Refused, match="belongs to another user"):
         check(path)
 
 
@@ -170,7 +170,7 @@ def test_what_is_refused_is_told_and_numba_is_used(tmp_path):
 def test_none_is_used_where_numba_has_begun_or_nobody_asks(tmp_path):
     path = _sealed(tmp_path / "kernels.so")
     done = _load("import emb_daemon.jit", EMB_DAEMON_KERNELS=str(path))
-    assert done.stdout == f"kernels of {path} are not used: this process has others already False\n", done.stderr
+    assert done.stdout == f"kernels of {path} are not used: this process has already loaded other kernels False\n", done.stderr
     assert _load(EMB_DAEMON_KERNELS="").stdout == " False\n"
     assert _load(EMB_DAEMON_KERNELS=str(path), NUMBA_DISABLE_JIT="1").stdout == " False\n"
 

@@ -81,7 +81,7 @@ def _missed(figures):
 def test_the_verdict_is_of_four_corners_and_above_the_machines_own_latency(figures):
     assert not _missed(figures)
     figures["loops"][0]["cyclictest"]["p99_us"] = 20.0
-    assert _missed(figures) == ["last frame of a sample to answer, p99, above cyclictest's wake-up"]
+    assert _missed(figures) == ["last frame of a sample to answer, p99, minus cyclictest's wake-up"]
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_unknown_key_with_a_suggestion(tmp_path):
 def test_duplicate_key(tmp_path):
     text = _TEXT.replace("friction:\n  load", "friction:\n  load_m_per_rad: 1.0e-06\n  load", 1)
     (fault,) = _faults(tmp_path, text)
-    assert fault == f":{_line(text, 'friction') + 2}: friction.load_m_per_rad: stands here twice"
+    assert fault == f":{_line(text, 'friction') + 2}: friction.load_m_per_rad: occurs twice"
 
 
 @pytest.mark.parametrize("section", ["motor", "noise", "thermal", "contact"])
@@ -299,7 +299,7 @@ def test_curves_between_measured_thicknesses():
         for thickness in np.linspace(curves[0].pad_thickness_mm, curves[-1].pad_thickness_mm, 40)
     ]
     assert np.all(np.diff(stiffness) < 0.0), "thicker pads are softer"
-    with pytest.raises(InputError, match=r"pad_thickness_mm: 40\.0 is too far from the measured"):
+    with pytest.raises(InputError, match=r"pad_thickness_mm: 40\.0 is too far from the measured thicknesses"):
         curve_at(curves, 40.0)
 
 
@@ -425,7 +425,7 @@ def test_configuration_faults(tmp_path):
         ":3: realtime.fifo_priority",
         ":3: realtime.cpu",
         ":4: log_level",
-        ":5: bus.interface: python-can knows no sockcan; near are ",
+        ":5: bus.interface: unknown to python-can: sockcan; similar are ",
     )
     for text in expected:
         assert sum(text in fault for fault in caught.value.faults) == 1, text

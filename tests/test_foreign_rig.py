@@ -561,8 +561,8 @@ def test_arrays_are_a_log(truth):
         ({"force_N": force_N[:5]}, "force_N: expected as many values as times"),
         ({"caliper_C": 20.0}, "expected inner_backplate_C or outer_backplate_C"),
         ({"time_s": np.roll(time_s, 150)}, "arrays: time goes back by"),
-        ({"time_s": 1e9 * time_s + 1e10}, "is no time in s"),
-        ({"time_s": np.where(time_s > 1.0, np.nan, time_s)}, "time_s: nan is no time in s"),
+        ({"time_s": 1e9 * time_s + 1e10}, "is not a time in s"),
+        ({"time_s": np.where(time_s > 1.0, np.nan, time_s)}, "time_s: nan is not a time in s"),
     ):
         with pytest.raises(InputError, match=expected):
             emb_daemon.log_of_arrays(**{"time_s": time_s, "angle_rad": motion[0]} | wrong)

@@ -114,7 +114,7 @@ def test_report_is_one_file_that_fetches_nothing(identified):
     ("text", "expected"),
     [
         ("curvs: []\n", r"campaign.yaml:5: curvs: unknown key; did you mean curves\?"),
-        ("corner: FL\n", "corner: stands here twice"),
+        ("corner: FL\n", "corner: occurs twice"),
         ("curves:\n  - {pad_thickness_mm: 3}\n", "curves.*log: missing"),
         ("random:\n  - {log: a.log, pad_thickness_mm: -1}\n", "pad_thickness_mm: Expected"),
         ("dbc: nowhere.dbc\n", "nowhere.dbc: no such file"),

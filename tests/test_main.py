@@ -93,7 +93,7 @@ def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
         ("uds --config {config} --state {tmp}/none", "{tmp}/none: no such state directory; give it with --state"),
         ("replay {tmp}/a.log --pad-thickness -1", "pad_thickness_mm: -1.0 outside"),
         ("replay {tmp}/a.log --pad-thickness 77",
-         "pad_thickness_mm: 77.0 is too far from the measured; expected 0 to 12.5"),
+         "pad_thickness_mm: 77.0 is too far from the measured thicknesses; expected 0 to 12.5"),
         ("fleet ingest {tmp}/a.log --output {tmp}/fleet --workers -1", "--workers -1: expected 1 or more"),
         ("fleet ingest {tmp}/a.log --output {tmp}/a.log",
          "{tmp}/a.log: cannot be a folder of the data set: File exists"),

@@ -134,8 +134,8 @@ def test_a_page_is_used_as_a_file_with_its_numbers_would_be(daemon, folder, capl
     (page({CLEARANCE: -1.0}), f"corner FL: {CLEARANCE}: -1.0 outside"),
     (page({CLEARANCE: float("inf")}), f"corner FL: {CLEARANCE}: inf outside"),
     (page({"thermal.friction.force_N[1]": 1e9}), "ascending"),
-    (page({"adaptation.parking_force_N": 1.0}), "adaptation.parking_force_N: no number that a page may set"),
-    (page({"motor.colour": 1.0}), "motor.colour: no number that a page may set"),
+    (page({"adaptation.parking_force_N": 1.0}), "adaptation.parking_force_N: not a number that a page may set"),
+    (page({"motor.colour": 1.0}), "motor.colour: not a number that a page may set"),
     (page({CLEARANCE: 7.0}, "RR"), "corner RR: not estimated"),
     (page({CLEARANCE: 7.0}, file="another"), "corner FL: the file is not the one that the page was made from"),
     (Page({"FL": {CLEARANCE: 7.0}}, {}), "corner FL: the file is not the one that the page was made from"),
@@ -175,9 +175,10 @@ def no_status(pipeline):
 
 
 @pytest.mark.parametrize("circumstance, said", [
-    (moving, "the vehicle moves"), (turning, "wheel FL turns"), (braking, "the brake is asked for"),
-    (clamped, "corner FL is not released"), (silent, "corner FL is not heard"), (not_started, "corner FL is not heard"),
-    (no_status, "the vehicle's status is not heard"),
+    (moving, "the vehicle moves"), (turning, "wheel FL turns"), (braking, "braking is requested"),
+    (clamped, "corner FL is not released"), (silent, "corner FL sends no samples"),
+    (not_started, "corner FL sends no samples"),
+    (no_status, "no vehicle status is received"),
 ])  # fmt: skip
 def test_no_page_is_taken_or_left_but_at_rest(daemon, caplog, circumstance, said):
     circumstance(daemon.pipeline)

@@ -453,7 +453,7 @@ class TestFreshnessFile:
             raise OSError(28, "No space left on device")
 
         monkeypatch.setattr(secured.files, "write", full)
-        with pytest.raises(Unavailable, match="trip counter not kept: No space left on device"):
+        with pytest.raises(Unavailable, match="trip counter cannot be stored: No space left on device"):
             FreshnessFile(tmp_path).begin_trip()
 
     def test_used_up(self, tmp_path):
@@ -498,7 +498,7 @@ class TestKeys:
             os.chown(path, 4242, -1)
         else:
             monkeypatch.setattr(os, "geteuid", lambda: 4242)
-        with pytest.raises(InputError, match="belongs to somebody else"):
+        with pytest.raises(InputError, match="belongs to another user"):
             load_keys(path, {})
 
     def test_a_credential_shows_its_access_list_as_the_groups_right(self, tmp_path):
@@ -521,8 +521,8 @@ class TestKeys:
         [
             ("EMB_FL_Auth 2b7e", "keys:5: expected a name and 32 hexadecimal digits"),
             ("EMB_FL_Auth", "keys:5: expected a name"),
-            ("VEH_Auth ffeeddccbbaa99887766554433221100", "keys:5: VEH_Auth: stands there twice"),
-            ("EMB_FR_Auth 000102030405060708090a0b0c0d0e0f", "keys:5: EMB_FR_Auth: another has the same key"),
+            ("VEH_Auth ffeeddccbbaa99887766554433221100", "keys:5: VEH_Auth: occurs twice"),
+            ("EMB_FR_Auth 000102030405060708090a0b0c0d0e0f", "keys:5: EMB_FR_Auth: another name has the same key"),
         ],
     )
     def test_a_bad_line_is_named_and_no_key_is_told(self, tmp_path, line, said):

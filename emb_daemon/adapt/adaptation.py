@@ -1,8 +1,8 @@
 """The part of adaptation that is not done in a tick: evaluation, memory, words for the log.
 
-In the daemon a helper thread does it, off the real-time priority and without the interpreter's lock where it computes; in
-replay it happens at once. Both take effect at the same sample. What is in use is known to the loop alone: the helper thread
-is given what it needs and hands back what it found.
+In the daemon a helper thread does this, without real-time priority, and while it computes without the interpreter's lock. In a
+replay it is done at once. In both the result takes effect at the same sample. Only the loop accesses the values in use: the
+helper thread gets copies and returns its results.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
 from emb_daemon.wire.contract import NO_RESULT
 from emb_daemon.wire.layout import CORNERS
 
-#: Patience with the helper thread at the end, s.
+#: Time for which `close` waits for the helper thread, s.
 _CLOSING_S = 2.0
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class Adaptation:
     Attributes:
         adapters, limits: ADAPTER and LIMITS arrays, shape (4,).
         rows: TRAINING array, shape (4, CAPACITY).
-        learned: PARAMETERS array, shape (4,): what each corner's last accepted evaluation puts in use.
+        learned: PARAMETERS array, shape (4,): result of each corner's last accepted evaluation.
     """
 
     def __init__(
@@ -72,23 +72,23 @@ class Adaptation:
             in_use = self.in_use(name)
             snapshot, time_ns, warning = self._snapshots.load(name, in_use)
             if snapshot is not None and (wrong := restart.why_implausible(snapshot, to_parameters(in_use))):
-                warning = f"{self._snapshots.path(name)}: {wrong}: beyond what this brake can have; not used"
+                warning = f"{self._snapshots.path(name)}: {wrong}: impossible for this brake; not used"
             if warning:
                 log.warning("corner %s: %s", name, warning)
             elif snapshot is not None:
                 self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:
-        """What the memory holds for a corner with this calibration; may take long and touches nothing in use."""
+        """What is stored for a corner with this calibration. May take long; changes nothing in use."""
         store, warning = self._memory.load(corner, calibration)
         if warning:
             log.warning("corner %s: %s", corner, warning)
         return store
 
     def replace(self, corner: str, calibration: Calibration, store: Store, on_page: bool = False) -> None:
-        """Go over to another calibration between two ticks, and to what `read` found; a training that runs is forgotten.
+        """Change between two ticks to another calibration and to what `read` found for it; a running training is dropped.
 
-        With one that is no file's (``on_page``) nothing is learned, and what the memory holds of the file's stays."""
+        With a calibration that is not that of a file (``on_page``) nothing is learned, and stored values stay as they are."""
         index = CORNERS.index(corner)
         self._calibrations[index], self._stores[index] = calibration, store
         self.limits[index] = r.to_limits(calibration)
@@ -99,13 +99,13 @@ class Adaptation:
         self._resumable.pop(index, None)
         generation = self.adapters[index]["generation"] + 1
         self.adapters[index] = np.zeros((), r.ADAPTER)
-        # Of an evaluation that is still on its way nothing may be taken for one of a later training.
+        # The result of an evaluation that is still running must not be taken for that of a later training.
         self.adapters[index]["generation"] = generation
         if store.current is not None and calibration.adaptation.enabled:
             log.info("corner %s: learned values of %s in use", corner, store.current.date)
 
     def in_use(self, corner: str) -> Calibration:
-        """A corner's calibration with what was learned."""
+        """A corner's calibration with its learned values."""
         index = CORNERS.index(corner)
         current = self._stores[index].current
         return with_learned(self._calibrations[index], current.values if current else None)
@@ -156,7 +156,7 @@ class Adaptation:
                 return
 
     def _resume(self, samples: np.ndarray, states: np.ndarray, parameters: np.ndarray) -> None:
-        """Let corners whose first sample has come go on from where they were."""
+        """Restore the snapshots of corners whose first sample has arrived."""
         for corner in list(self._resumable):
             rows = np.flatnonzero((samples["corner"] == corner) & ~samples["is_prediction"])
             if len(rows):
@@ -169,18 +169,18 @@ class Adaptation:
                     restart.resume(states[corner], parameters[corner], snapshot, elapsed_s)
 
     def _attend(self, corner: int, adapter: np.void, state: np.void, parameters: np.void) -> None:
-        """Have done what the tick asks for."""
+        """Start what the tick has requested: evaluations, snapshots, log lines."""
         if adapter["ended"]:
             adapter["ended"] = False
             self._keep(corner, adapter)
-        # After what was learned, to which it belongs.
+        # After the learned values, to which the snapshot belongs.
         if adapter["snapshot_wanted"]:
             adapter["snapshot_wanted"] = False
             self._keep_snapshot(corner, state, parameters)
         if adapter["evaluation_wanted"]:
             adapter["evaluation_wanted"] = False
             rows = self.rows[corner, : int(adapter["training_rows"])]
-            # Records are views, and the loop goes on writing to them: what is handed over is copied.
+            # Records are views to which the loop keeps writing, so the helper thread gets copies.
             self._do(self._evaluate, corner, int(adapter["generation"]), rows, self._calibrations[corner],
                      self.in_use(CORNERS[corner]), state.copy(), float(adapter["power_on_angle"]),
                      float(adapter["factor_sigma"]))  # fmt: skip
@@ -200,7 +200,7 @@ class Adaptation:
             log.error("corner %s: snapshot could not be written: %s", corner, error)
 
     def _keep(self, corner: int, adapter: np.void) -> None:
-        """Keep the outcome of a training that was evaluated; have it logged and written."""
+        """Keep the outcome of an evaluated training; start logging and writing it."""
         outcome, evaluation = int(adapter["outcome"]), self._evaluations.pop(corner, None)
         store = None
         if outcome == r.ACCEPTED or outcome >= r.NOT_CONVERGED:
@@ -220,7 +220,7 @@ class Adaptation:
             adapter[name] = getattr(evaluation, name)
 
     def close(self, states: np.ndarray, parameters: np.ndarray) -> None:
-        """Keep what STATE and PARAMETERS, shape (4,), hold at the end, and let what is being written be written."""
+        """Store snapshots of STATE and PARAMETERS, shape (4,), and wait for the helper thread to finish writing."""
         for corner in self._stores:
             self._keep_snapshot(corner, states[corner], parameters[corner])
         if self._thread is not None:
@@ -234,7 +234,7 @@ class Adaptation:
             job(*arguments)
 
     def _work(self) -> None:
-        # The service manager may have made the whole process real-time; this thread must never keep the loop waiting.
+        # The service manager may have given the process real-time priority; this thread must not delay the loop.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         with contextlib.suppress(OSError):
@@ -251,7 +251,8 @@ class Adaptation:
         power_on_angle: float, factor_sigma: float,
     ) -> None:  # fmt: skip
         evaluation = fit_training(rows, calibration, base, state, factor_sigma)
-        # Contact is told by the clearance after a restart; where the motor did not start released, that stays as it is.
+        # After a restart the clearance gives the contact angle. If the motor did not start released, the clearance is not
+        # changed.
         clearance = evaluation.contact_angle - power_on_angle
         if abs(clearance - calibration.contact.clearance_rad) <= base.adaptation.clearance_change_rad:
             evaluation.values[CLEARANCE] = clearance

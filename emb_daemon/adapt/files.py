@@ -1,4 +1,4 @@
-"""Files of the state directory: JSON with a checksum, whole at every moment, and out of the way when they are no use."""
+"""Files of the state directory: JSON with a checksum, complete at every moment, set aside when they cannot be used."""
 
 import hashlib
 import os
@@ -11,7 +11,7 @@ from emb_daemon.bounded import read_bounded
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration
 
-#: A hundred times what any file of ours has.
+#: A hundred times the size of the largest file that is written here.
 _MOST_BYTES = 4_000_000
 
 
@@ -21,7 +21,7 @@ class _Sealed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Owned(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a corner's file begins with: whose it is."""
+    """The first fields of a corner's file: to whom it belongs."""
 
     format: int
     corner: str
@@ -43,7 +43,7 @@ def encode(content: msgspec.Struct) -> bytes:
 
 
 def read(path: Path) -> bytes:
-    """Raises OSError; also for what is no regular file, or larger than any of ours."""
+    """Raises OSError; also if it is not a regular file, or larger than any file written here."""
     return read_bounded(path, _MOST_BYTES)
 
 
@@ -51,7 +51,7 @@ def decode(data: bytes, kind: type, version: int):
     """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``.
 
     Raises:
-        ValueError: not one of our files, or damaged; says which.
+        ValueError: not such a file, or damaged; says which.
     """
     try:
         file = msgspec.json.decode(data, type=_Sealed)
@@ -90,7 +90,7 @@ def write(path: Path, content: msgspec.Struct) -> None:
 
 
 def set_aside(path: Path) -> str:
-    """Rename a file that cannot be used; says what became of it."""
+    """Rename a file that cannot be used; returns the result in words."""
     for number in range(1, 1000):
         aside = path.with_name(f"{path.name}.unusable-{number}")
         if not aside.exists():

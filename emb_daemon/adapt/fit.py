@@ -1,19 +1,19 @@
 """The joint fit: contact angle, characteristic curve, friction and presliding angle from motor current and angle.
 
-The estimator's own stiffness and torque paths are run over the training with trial parameters; what motor torque they leave
-unexplained is made small (Levenberg-Marquardt with Huber weights). Dynamics, effects and inertia stay those of the
+The fit runs the estimator's own stiffness and torque paths over the training with trial parameters and minimises the motor
+torque that they leave unexplained (Levenberg-Marquardt with Huber weights). Dynamics, effects and inertia stay those of the
 calibration.
 
-An offset of the torque and the torque constant are fitted beside what is learned, and forgotten: they are the current
-sensor's and the magnets', not the pads'. Motor current alone cannot tell a stronger motor from softer pads; the inertia,
-which steel keeps for life, can, if it is that of the unit that was calibrated. Where the pads have changed too, it may not be:
-then the torque constant lies halfway, with a standard deviation that reaches both.
+An offset of the torque and the torque constant are fitted as well, but not learned, because they belong to the current sensor
+and the magnets and not to the pads. Motor current alone cannot distinguish a stronger motor from softer pads. The inertia can,
+because it never changes, if the unit is the one that was calibrated. If the pads have changed too, the unit may be another:
+the torque constant is then put halfway between both explanations, with a standard deviation that covers both.
 
-Thesis 2.4 and 3.4 take pairs of passes at equal angle instead; they start and check this fit, which also
-uses the samples in between, knows of the pads' dynamics, and comes with a covariance.
+Thesis 2.4 and 3.4 use pairs of passes at equal angle instead. Here they start and check the fit, which also uses the samples
+in between, models the pads' dynamics, and gives a covariance.
 
-Only the paths are compiled. The fit is done once in a park brake's life of minutes, beside the loop, and what little it
-computes itself would take far longer to compile than to run.
+Only the paths are compiled. A fit runs once per training, outside of the loop, and compiling its own small computations would
+take far longer than running them.
 """
 
 from math import exp, expm1, hypot, log, sqrt
@@ -61,27 +61,27 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Order of the fitted values, see `_Training`.
 _CONTACT, _TORQUE_OFFSET, _GAIN, _LOAD, _OFFSET, _PRESLIDING, _INERTIA, _CURVE = range(8)
-#: Standard deviation of the logarithm of the torque constant over the calibration's: magnets lose 0.1 to 0.2 %/K, and the
-#: motor's own current heats them by up to 100 K. Beyond the limit no magnet comes back.
+#: Standard deviation of the logarithm of the torque constant, relative to the calibration: magnets lose 0.1 to 0.2 %/K, and
+#: the motor's own current heats them by up to 100 K. A loss beyond the limit would be permanent.
 _GAIN_SIGMA, _GAIN_LIMIT = 0.1, 0.3
-#: The same of the inertia, rotors and screws of one drawing differing by a tenth, beside a torque constant that is no further
-#: off than a calibration leaves it.
+#: The same of the inertia (rotors and screws of one drawing differ by a tenth), and of the torque constant as a calibration
+#: knows it.
 _INERTIA_SIGMA, _GAIN_KEPT_SIGMA = 0.1, 0.01
 #: Most iterations; the fit has converged when one of them lowers the cost by less than this share.
 _ITERATIONS, _CONVERGED = 40, 1e-7
 #: Residuals beyond this many standard deviations count linearly (Huber): over 99 % as efficient as squares on normal noise.
 _HUBER = 2.5
-#: Samples of which the mean torque is fitted: the acceleration's noise falls with their number, and the motion asked for has
-#: a period of ten such blocks.
+#: Samples in a block, whose mean torque is fitted: the noise of the acceleration falls with their number, and the requested
+#: motion has a period of ten blocks.
 _BLOCK = 5
-#: Blocks beyond this many standard deviations are left out of a second round, if they are no more than this share.
+#: Blocks beyond this many standard deviations are left out of a second round, if they are at most this share of all.
 _FAR, _FEW = 8.0, 0.05
-#: Drop of the cost per correlated block by a curve of its own from which the pads count as changed: at three coefficients
-#: noise alone makes more once in a thousand trainings (chi-square).
+#: The pads count as changed if fitting a new curve lowers the cost by this much, per correlated block: with three coefficients
+#: noise alone does so once in a thousand trainings (chi-square).
 _UNCHANGED = 16.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12
-#: Samples of a training that has begun to tell anything, four seconds; equal parts of the force that each direction must pass.
+#: Least number of samples of a training, four seconds; number of equal force ranges that must be passed in each direction.
 _LEAST_SAMPLES, _RANGES = 1000, 5
 
 
@@ -93,7 +93,7 @@ def unexplained_step(s, p, row):
     torque, leverage, _ = torque_path(s, p, row)
     s.angle, s.speed = row.angle, row.speed
     force = 0.5 * (before + s.force)
-    # What driving has found of friction at low and at high speed; a training's fit has neither.
+    # Driving also learns friction at low and at high speed; the fit of a training has neither.
     slow = (
         s.friction_mean
         * (p.offset_friction + p.load_friction * (force + s.spring_force) * s.gear_slope)
@@ -104,7 +104,7 @@ def unexplained_step(s, p, row):
 
 @entry(Array(STATE), Array(PARAMETERS), Array(r.TRAINING), Array(np.float64), Array(np.float64))
 def _run(states, parameters, rows, residual, force):
-    """`unexplained_step` and stiffness force (N) at each row from where both settle at the first, whose residual is NaN."""
+    """`unexplained_step` and stiffness force (N) at each row, both settled at the first, whose residual is NaN."""
     s, p = states[0], parameters[0]
     settle_paths(s, p, rows[0], rows[0].factor)
     residual[0], force[0] = np.nan, s.force
@@ -130,7 +130,7 @@ class _Training:
         self.left_out = np.zeros((len(rows) - 1) // _BLOCK, bool)
 
     def values(self, x) -> dict[str, float]:
-        """What the fitted values ``x`` mean to the calibration."""
+        """Values of the calibration's keys for the fitted values ``x``."""
         return curve_values(self._calibration, x[_CURVE:] * self._scale) | {
             LOAD_FRICTION: x[_LOAD] * self._calibration.motor.gear_gain_m_per_rad,
             OFFSET_FRICTION: x[_OFFSET],
@@ -138,11 +138,12 @@ class _Training:
         }
 
     def simulate(self, x):
-        """What `_improve` makes small, unexplained motor torque (N m; NaN where unknown) and stiffness force (N) at each row.
+        """Residuals that `_improve` minimises; unexplained motor torque (N m; NaN: unknown) and stiffness force (N) at each
+        row.
 
-        The first is the torque's mean over `_BLOCK` samples in standard deviations of what noise makes of it *with the trial's
-        torque constant*: current and acceleration are both measured (Deming's regression), and in other units a small torque
-        constant would seem to explain more because it makes the current's noise small."""
+        A residual is the mean torque of `_BLOCK` samples, in standard deviations of its noise *with the trial's torque
+        constant*. Current and acceleration are both measured (Deming's regression): without this scaling a small torque
+        constant would seem to explain more, only because it makes the current's noise small."""
         motor = self._calibration.motor
         torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
         inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
@@ -158,14 +159,14 @@ class _Training:
 
 
 def _noises(calibration):
-    """Torque that stands for the noise of one sample's current and speed, N m."""
+    """Torque equivalent to the noise of one sample's current and speed, N m."""
     motor, noise = calibration.motor, calibration.noise
     return motor.torque_constant_Nm_per_A * noise.current_A, motor.inertia_kg_m2 * noise.speed_rad_per_s / CYCLE_S
 
 
 def _block_noise(calibration):
-    """Standard deviation (N m) of the mean torque of `_BLOCK` samples: of current that is correlated over some of them, and of
-    the speeds at both ends."""
+    """Standard deviation (N m) of the mean torque of `_BLOCK` samples, from the correlated noise of the current and from the
+    noise of the speeds at both ends."""
     current, speed = _noises(calibration)
     rho = exp(-CYCLE_S / calibration.noise.current_correlation_s)
     correlated = 1.0 + 2.0 * sum((1.0 - lag / _BLOCK) * rho**lag for lag in range(1, _BLOCK))
@@ -184,7 +185,7 @@ def compile_fit(calibration, state):
 
 
 def _cost(blocks, x, prior):
-    """Huber cost of the finite blocks, and what ``x`` costs by ``prior`` (information)."""
+    """Huber cost of the finite blocks, plus the cost of ``x`` by ``prior`` (information)."""
     size = np.abs(blocks[np.isfinite(blocks)])
     return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() + prior @ (x * x)
 
@@ -218,7 +219,7 @@ def _improve(training, x, steps, prior, free):
                 trial[free] -= np.linalg.solve(damped, gradient)
             except np.linalg.LinAlgError:
                 trial[:] = np.nan
-            # Force rises from contact: a curve that falls there belongs to a contact angle that lies too early.
+            # Force rises from contact. A curve that falls there means that the contact angle is too early.
             if trial[_CURVE] > 0.0:
                 attempt = training.simulate(trial)
                 attempt_cost = _cost(attempt[0], trial, prior)
@@ -234,14 +235,15 @@ def _improve(training, x, steps, prior, free):
     spread = correlation * _deviation(blocks) ** 2
     covariance = np.zeros((len(x), len(x)))
     covariance[np.ix_(free, free)] = _inverse(normal) * spread
-    # The contact angle with the curve held: what the filter may still be wrong by with this very curve.
+    # The contact angle's standard deviation with the curve held: the error that the filter may have with this curve.
     contact_sigma = sqrt(spread / max(normal[_CONTACT, _CONTACT], 1e-300))
     return _Fit(x, blocks, residual, force, cost, iterations, correlation, spread, covariance, contact_sigma)
 
 
 class _Fit(NamedTuple):
-    """Where `_improve` ended: fitted values, what `_Training.simulate` gives there, cost, iterations, factor by which the
-    blocks' correlation widens the covariance, and that with their size; the covariance, zero for what was held."""
+    """Result of `_improve`: fitted values, result of `_Training.simulate` for them, cost, iterations, factor by which the
+    blocks' correlation widens the covariance, the same including their size, and the covariance, zero for values that were
+    held."""
 
     x: np.ndarray
     blocks: np.ndarray
@@ -256,8 +258,8 @@ class _Fit(NamedTuple):
 
 
 def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=_INERTIA_SIGMA):
-    """`_improve` twice: blocks that repeat each other weigh less than they count, and what is known beforehand is weighed
-    against that; outliers are left out of the second round."""
+    """`_improve` twice. The second round weighs correlated blocks and the prior against each other by the first round's
+    correlation, and leaves outliers out."""
     prior = np.zeros(len(x))
     prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, inertia_sigma**-2
     first = _improve(training, x, steps, prior, free)
@@ -279,8 +281,8 @@ def _guess(highest, pairs, now, terms):
 
 
 def _fit_with_and_without_curve(training, x, curve, offset_friction):
-    """(`_Fit`, whether the pads are unchanged): such pads keep the ``curve`` of a whole campaign (in the fit's units), however
-    much better one with more freedom fits the noise."""
+    """(`_Fit`, whether the pads are unchanged). Unchanged pads keep the ``curve`` of the campaign (in the fit's units), even
+    if a curve with more freedom fits the noise better."""
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(offset_friction, 1e-4)
     with_curve, without = np.delete(np.arange(len(x)), _INERTIA), np.delete(np.arange(_CURVE), _INERTIA)
@@ -288,19 +290,20 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     kept = np.concatenate([free.x[:_CURVE], curve])
     held = _fit(training, kept, steps, without)
     if held.cost < free.cost:
-        # What has more freedom explains no less: it began too far off and ended at a curve that does not rise at contact.
+        # A fit with more freedom cannot be worse: it started too far off and ended at a curve that does not rise at contact.
         free = _fit(training, held.x, steps, with_curve)
     if _as_good(held, free):
-        # The rotor's inertia tells the torque constant from the pads' stiffness no better than it is known itself.
+        # The inertia distinguishes torque constant and stiffness only as well as it is known itself.
         return _fit(training, held.x, steps, np.arange(_CURVE), inertia_sigma=INERTIA_SIGMA), True
-    # An inertia that the calibration does not know makes motor and pads look stronger by the same share.
+    # An inertia that differs from the calibration makes motor and pads look stronger by the same share.
     kept = np.concatenate([free.x[:_CURVE], curve])
     kept[_GAIN] = 0.0
     held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
     if _as_good(held, free):
         return held, True
-    # Magnets that lost as much, or the rotor of another unit: what inertia and torque constant contradict each other by is
-    # either's, and its size says how far they may be off (the likeliest standard deviation of two, by their difference).
+    # Either the magnets have lost strength or the rotor is another unit's. The contradiction between inertia and torque
+    # constant may be an error of either; its size gives the standard deviation of both (the most likely one of two values, by
+    # their difference).
     apart = max(abs(free.x[_GAIN]) / sqrt(2.0), _GAIN_KEPT_SIGMA)
     return _fit(training, free.x, steps, np.arange(len(x)), apart, apart), False
 
@@ -325,7 +328,7 @@ def _inverse(normal):
 
 
 def _deviation(values):
-    """Standard deviation of what is known of ``values``, but for outliers."""
+    """Standard deviation of the finite ``values``, without outliers."""
     return 1.4826 * np.median(np.abs(values[np.isfinite(values)]))
 
 
@@ -355,7 +358,7 @@ def _force_sigma(curve, scale, covariance, top):
 
 
 def _is_excited(angle, force, residual, low, high, limits):
-    """Whether each of equal force ranges, and the clearance where it was asked for, was passed in both directions by enough
+    """Whether each of equal force ranges, and the clearance if it was requested, was passed in both directions with enough
     samples."""
     known = np.isfinite(residual)
     known[0] = False
@@ -369,11 +372,11 @@ def _is_excited(angle, force, residual, low, high, limits):
 
 
 def fit_training(rows, calibration, base, state, factor_sigma=0.0):
-    """What one training teaches.
+    """Evaluate one training.
 
     Args:
         rows: TRAINING array, the samples in order.
-        calibration, base: in use until now, and as the file has it.
+        calibration, base: the one in use until now, and the one of the file.
         state: STATE record, the estimator's at the end of the training.
         factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
 
@@ -397,10 +400,10 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
         values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
     curve = to_parameters(moved(calibration, values))["curve"]
     top = highest - x[_CONTACT]
-    # The torque constant's error scales the whole curve, whose shape is known better than its size.
+    # An error of the torque constant scales the whole curve; the shape is known better than the scale.
     along = fit.covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
     constant, relative, force_sigma = _force_sigma(curve, scale, fit.covariance - np.outer(along, along), top)
-    # What the fit cannot see: the dynamics' own error, and those of gear gain and pad temperature, which the curve inherits.
+    # Errors that the fit cannot see but the curve inherits: of the dynamics, the gear gain and the pad temperature.
     scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
     if unchanged:
         values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
@@ -440,7 +443,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
 
 
 def _residual_evidence(fit, calibration):
-    """How large the unexplained torque is, over the torque constant and over what noise makes, and how correlated."""
+    """Size of the unexplained torque, over the torque constant and relative to noise, and its correlation."""
     expected, _ = torque_sigma(*_noises(calibration))
     sigma = _deviation(fit.residual)
     return {
@@ -451,8 +454,8 @@ def _residual_evidence(fit, calibration):
 
 
 def _pairs_difference(pairs, x, curve, rows, gear_gain):
-    """RMS difference of the pairs' forces from the curve, as a share of the largest force; at the pads' temperature, and with
-    the torque constant and offset that were found."""
+    """RMS difference between the pairs' forces and the curve, as a share of the largest force, at the pads' temperature and
+    with the fitted torque constant and offset."""
     factor = rows["factor"].mean()
     force = factor * np.array([characteristic_curve(angle - x[_CONTACT], curve)[0] for angle in pairs[:, ANGLE]])
     seen = exp(x[_GAIN]) * pairs[:, FORCE] - x[_TORQUE_OFFSET] / gear_gain
@@ -460,7 +463,7 @@ def _pairs_difference(pairs, x, curve, rows, gear_gain):
 
 
 def _judge(rows, fit, base, found):
-    """(ACCEPTED or the first reason against it, a note with numbers)."""
+    """(ACCEPTED or the first reason for a rejection, a note with numbers)."""
     limits, evidence = base.adaptation, found.evidence
     covered = limits.coverage * base.training_force_N
     uncertain = evidence["contact_sigma_rad"] + evidence["force_sigma_N"] + evidence["residual_A"]
@@ -472,9 +475,9 @@ def _judge(rows, fit, base, found):
     if not _is_excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
-        return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} of noise"
+        return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} times the noise"
     if abs(fit.x[_GAIN]) > _GAIN_LIMIT:
-        return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} of the calibration's"
+        return r.OUT_OF_BOUNDS, f"torque constant {evidence['torque_gain']:.2f} times the calibration's"
     if out_of_bounds := why_out_of_bounds(base, found.values):
         return r.OUT_OF_BOUNDS, out_of_bounds
     if evidence["force_sigma_N"] > limits.maximum_sigma_N:

@@ -1,4 +1,4 @@
-"""What a training teaches: values of the calibration's own keys, and the bounds outside of which none is believed.
+"""Results of a training: values of the calibration's own keys, and the bounds within which they are accepted.
 
 Learned values are a partial calibration, applied by `calibration.parameters.moved`. They are held to the same bounds when a
 training is accepted and when a file is read.
@@ -16,7 +16,7 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 STIFFNESS_SIGMA = "noise.stiffness_N"
 STIFFNESS_RELATIVE_SIGMA = "noise.stiffness_relative"
 
-#: Points of the travel at which a curve is looked at.
+#: Number of points of the travel at which a curve is checked.
 TRAVELS = 40
 
 
@@ -25,11 +25,11 @@ class Evaluation:
     """Outcome of one training's evaluation.
 
     Attributes:
-        outcome: ACCEPTED or why not; ``note`` says it with numbers where there are any.
+        outcome: ACCEPTED or the reason for the rejection; ``note`` gives its numbers, if any.
         values, sigmas: by the calibration's keys.
         contact_angle: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad.
-        torque_error, torque_error_sigma: of the torque path, as a share of the force: the magnets' and the current sensor's.
-        inertia_error, inertia_sigma: of the calibration's inertia, as a share of it.
+        torque_error, torque_error_sigma: error of the torque path by magnets and current sensor, as a share of the force.
+        inertia_error, inertia_sigma: error of the calibration's inertia, as a share of it.
         evidence: figures for people, by name.
     """
 
@@ -54,12 +54,12 @@ def _mounted_curves(calibration: Calibration) -> range:
 
 
 def curve_terms(calibration: Calibration) -> int:
-    """Number of coefficients of the curve that training can teach."""
+    """Number of coefficients of the curve that a training determines."""
     return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted_curves(calibration))
 
 
 def curve_values(calibration: Calibration, coefficients) -> dict[str, float]:
-    """The keys that make ``coefficients`` the curve of the mounted pads: both curves beside their thickness become it."""
+    """Values that make ``coefficients`` the curve of the mounted pads: both curves next to their thickness are set to it."""
     values = {}
     for index in _mounted_curves(calibration):
         for term in range(len(calibration.stiffness.curves[index].coefficients)):
@@ -69,16 +69,16 @@ def curve_values(calibration: Calibration, coefficients) -> dict[str, float]:
 
 
 def learned_keys(calibration: Calibration) -> set[str]:
-    """The one list of what training teaches. The clearance is missing where the released position was not seen."""
+    """Keys of everything that a training determines. The clearance is missing if the released position was not seen."""
     names = {CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA}
     return names | curve_values(calibration, ()).keys()
 
 
 def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str:
-    """What in learned ``values`` a brake with this calibration cannot have, in words; empty if nothing."""
+    """Which learned ``values`` are impossible for a brake with this calibration, in words; empty if none."""
     limits, keys = calibration.adaptation, learned_keys(calibration)
     if wrong := (values.keys() | {CLEARANCE}) ^ keys:
-        return f"{', '.join(sorted(wrong))}: missing, or not learned"
+        return f"{', '.join(sorted(wrong))}: missing, or not a learned value"
     try:
         p = to_parameters(moved(calibration, values, checked=True))
     except InputError as error:
@@ -112,13 +112,13 @@ def _about(value: float, share: float, margin: float = 0.0) -> tuple[float, floa
 
 
 def _possible_travel(calibration: Calibration) -> tuple[float, float]:
-    """Travel (rad) to full force between the stiffest and the softest pads of the calibration, and as much beyond as another
-    compound makes."""
+    """Bounds of the travel (rad) to full force: stiffest and softest pads of the calibration, and the difference that another
+    compound can make."""
     curves, change = calibration.stiffness.curves, calibration.adaptation.curve_change
     travels = [travel_at(calibration.training_force_N, np.array(curve.coefficients)) for curve in curves]
     return (1.0 - change) * min(travels), (1.0 + change) * max(travels)
 
 
 def with_learned(calibration: Calibration, values: dict[str, float] | None) -> Calibration:
-    """The calibration in use: with learned ``values``, where there are any and learning is enabled."""
+    """The calibration in use: with the learned ``values``, if there are any and learning is enabled."""
     return moved(calibration, values) if values and calibration.adaptation.enabled else calibration

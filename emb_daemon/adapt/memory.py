@@ -1,8 +1,8 @@
-"""What adaptation has learned, kept over a power cycle: one JSON file per corner, whole at every moment.
+"""Learned values, stored over a power cycle: one JSON file per corner, complete at every moment.
 
-A file belongs to one actuator and one calibration; it holds the values now in use and a bounded history. A file that cannot
-be read, whose checksum is wrong or whose values this brake cannot have is set aside under another name and named, and the
-corner starts from its calibration.
+A file belongs to one actuator and one calibration; it contains the values in use and a bounded history. A file that cannot
+be read, whose checksum is wrong or whose values are impossible for this brake is renamed and reported, and the corner starts
+from its calibration.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError, Unavailable
 
 FORMAT = 2
-#: Trainings that a file remembers, and the age from which an unfinished file is nobody's, s.
+#: Number of trainings in a file's history; age from which an unfinished file is no longer being written, s.
 _HISTORY = 50
 _ABANDONED_S = 3600.0
 
@@ -32,7 +32,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     #: ISO 8601.
     date: str
     outcome: str
-    #: What the outcome does not say, such as a value and its bounds.
+    #: Details of the outcome, such as a value and its bounds.
     note: str
     ambient_C: float | None
     pad_rise_K: float | None
@@ -78,18 +78,18 @@ def state_directory(configured: str | None, relative_to: Path, environment=os.en
 
 
 def hold(folder: Path) -> int:
-    """Keep a state directory, which may be read-only, to this process until it ends or the descriptor returned is closed.
+    """Reserve a state directory, which may be read-only, for this process until it ends or the returned descriptor is closed.
 
     Raises:
         InputError: it cannot be made.
-        Unavailable: another process keeps it.
+        Unavailable: another process uses it.
     """
     descriptor = os.open(Memory(folder).folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise Unavailable(f"{folder}: state directory of another process that runs") from None
+        raise Unavailable(f"{folder}: state directory is in use by another running process") from None
     return descriptor
 
 
@@ -121,10 +121,10 @@ class Memory:
         return files.decode(content, Store, FORMAT)
 
     def load(self, corner: str, calibration: Calibration) -> tuple[Store, str | None]:
-        """What is known of a corner with this calibration, and a warning for the log or None.
+        """What is stored for a corner with this calibration, and a warning for the log or None.
 
-        A file that is damaged, or holds values that this brake cannot have, is set aside; one of another actuator or
-        calibration stays until something new is learned, but nothing of it is used.
+        A file that is damaged, or contains values that are impossible for this brake, is set aside. A file of another actuator
+        or calibration is not used, and stays until something new is learned.
         """
         path, ours = self.path(corner), files.owner(FORMAT, corner, calibration)
         self._sweep()
@@ -134,7 +134,7 @@ class Memory:
         return store or Store(**ours, current=None, history=()), warning
 
     def _sweep(self) -> None:
-        """Remove what writers left that were killed long ago."""
+        """Remove unfinished files of writers that were killed long ago."""
         for path in self.folder.glob(".*.json.*"):
             with contextlib.suppress(OSError):
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
@@ -145,7 +145,7 @@ class Memory:
         files.write(self.path(store.corner), store)
 
     def reset(self, corner: str) -> bool:
-        """Forget a corner, but for a copy beside it (`forgotten`); False if there was nothing to forget."""
+        """Delete a corner's file, and keep a copy (`forgotten`); False if there was none."""
         try:
             self.path(corner).replace(self.forgotten(corner))
         except FileNotFoundError:
@@ -153,7 +153,7 @@ class Memory:
         return True
 
     def forgotten(self, corner: str) -> Path:
-        """Where the last reset left what it forgot."""
+        """Path of the copy that the last reset kept."""
         return self.path(corner).with_suffix(".forgotten")
 
 

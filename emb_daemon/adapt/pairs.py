@@ -15,10 +15,10 @@ from emb_daemon.models.gear import through_gear
 from emb_daemon.models.torque import friction_state, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Width of an angle bin, as a share of the travel, and how far friction must have turned over for a sample to count.
+#: Width of an angle bin, as a share of the travel, and the friction state that a sample must have reached to count.
 _BINS = 100
 _TURNED_OVER = 0.97
-#: Passes whose torque is averaged in a bin need this many samples each.
+#: Least number of samples of each pass in a bin.
 _SAMPLES = 4
 #: Samples so many standard deviations from their bin's mean are left out.
 _FAR = 8.0
@@ -38,8 +38,8 @@ def _turn(rows, p, gear_zero, turned):
 
 @entry(Array(TRAINING), PARAMETERS, float, Array(np.float64), Array(np.float64))
 def _sliding(rows, p, gear_zero, direction, torque):
-    """Where friction has turned over: +1 clamping, -1 releasing, else 0; and motor torque (N m) without it, inertia
-    and release spring, over the gear's slope."""
+    """``direction``: +1 where friction has fully developed in clamping, -1 in releasing, else 0. ``torque``: motor torque (N
+    m) without inertia and release spring, over the gear's slope."""
     state, variance = 0.0, 1.0
     direction[0] = 0.0
     for i in range(1, len(rows)):

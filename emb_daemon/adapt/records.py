@@ -1,13 +1,13 @@
-"""What adaptation keeps between ticks: its phases, how a training can end, and the records of both. SI units, degC."""
+"""State of adaptation between ticks: its phases, the outcomes of a training, and their records. SI units, degC."""
 
 import numpy as np
 
 from emb_daemon.jit import fields
 
-#: Phases of a corner's adaptation: nothing; motion was asked for; motion came unasked; a training is being evaluated.
+#: Phases of a corner's adaptation: none; motion is requested; motion without request; a training is being evaluated.
 IDLE, ASKING, WATCHING, EVALUATING = range(4)
 
-#: How a training ended. Before NOT_CONVERGED it was aborted, from there on its evaluation was rejected.
+#: Outcomes of a training. Those before NOT_CONVERGED aborted it; from NOT_CONVERGED on its evaluation was rejected.
 (ACCEPTED, BRAKE_REQUESTED, PARK_BRAKE_LEFT, VEHICLE_MOVED, BAD_INPUT, NO_ANSWER, TOO_LONG, NOT_IN_TIME, AMBIENT,
  OTHERS_NOT_HOLDING, NOT_CONVERGED, TOO_FEW, NOT_COVERED, NOT_EXCITED, RESIDUAL, OUT_OF_BOUNDS, TOO_UNCERTAIN,
  PAIRS_DISAGREE) = range(18)  # fmt: skip
@@ -20,7 +20,7 @@ OUTCOMES = (
     "too uncertain", "pairs of passes disagree with the model",
 )  # fmt: skip
 
-#: Samples of one training: what the path models read of a SAMPLE, and the stiffness factor that held then.
+#: Samples of one training: the fields of SAMPLE that the path models read, and the stiffness factor at that time.
 TRAINING = np.dtype(
     [
         *fields("f8", "dt angle speed current_q wheel_speed wheel_pulse caliper factor"),
@@ -43,15 +43,15 @@ LIMITS = np.dtype(
     align=True,
 )
 
-#: What an `Evaluation` hands to the tick beside PARAMETERS.
+#: Results of an `Evaluation` that the tick gets in addition to PARAMETERS.
 FOUND = ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma", "inertia_error", "inertia_sigma")
 
-#: One corner's adaptation as it runs. ``evaluation_wanted`` asks whoever computes for an evaluation of the first
-#: ``training_rows`` of ``rows``, told apart by ``generation``; ``evaluation_ready`` says that it is there: how it ended, and
-#: if it was accepted what it `FOUND`, the contact angle's standard deviation for the learned curve. ``ended`` asks for the
-#: outcome to be logged and kept. ``force`` is the torque path's without the torque's offset, smoothed; ``holding`` whether the
-#: corner surely clamps with its parking force at ``time_ns``; ``pulse`` the wheel's count since which the car stood.
-#: ``snapshot_wanted`` asks for what the estimator knows to be kept, last at ``snapshot_ns``.
+#: State of one corner's adaptation. ``evaluation_wanted`` requests an evaluation of the first ``training_rows`` of ``rows``;
+#: ``generation`` identifies it. ``evaluation_ready``: the result is there, that is its outcome and, if it was accepted, what
+#: it `FOUND` (the contact angle's standard deviation is for the learned curve). ``ended`` requests that the outcome is logged
+#: and stored. ``force``: that of the torque path without the torque's offset, smoothed. ``holding``: whether the corner
+#: certainly clamps with its parking force at ``time_ns``. ``pulse``: count of the wheel's pulses when the car came to a stand.
+#: ``snapshot_wanted`` requests a snapshot of the estimator; the last one was at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
         *fields("i8", "phase result outcome"),
@@ -71,8 +71,8 @@ ADAPTER = np.dtype(
     align=True,
 )
 
-#: Samples that one training may have, and time between the end of training and the moment at which its outcome takes
-#: effect: a fixed number of samples, so that a replay does what the daemon did. At 4 ms.
+#: Largest number of samples of one training, and number of samples from the end of a training until its outcome takes effect,
+#: at 4 ms. The latter is fixed, so that a replay does the same as the daemon.
 TRAINING_SAMPLES = 15_000
 EVALUATION_SAMPLES = 750
 CAPACITY = TRAINING_SAMPLES + EVALUATION_SAMPLES

@@ -1,8 +1,8 @@
-"""What an estimator knew when it was last heard of, kept over a restart: one JSON file per corner.
+"""Snapshots of an estimator's state, stored over a restart: one JSON file per corner.
 
-Which quantities these are, and how much less sure they are by the time of the restart, is the estimator's to say (a record
-dtype, with functions that fill it and start from it); here it is stored under its field names, with the moment of the real
-time clock, and given back only to the same actuator with the same calibration, learned values included.
+The estimator decides which quantities a snapshot contains, and by how much their uncertainty has grown at the restart (a
+record dtype, with functions that fill it and start from it). This module stores the record under its field names, with the
+time of the real-time clock, and returns it only for the same actuator with the same calibration, learned values included.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ class Snapshot(files.Owned, frozen=True, kw_only=True):
 
 
 def to_fields(record: np.void) -> dict[str, object]:
-    """A record, nested ones included, as names and plain values. An infinite value is stored as NaN: both mean unknown."""
+    """A record, nested ones included, as names and plain values. An infinite value is stored as NaN; both mean unknown."""
     names = record.dtype.names
     return {name: to_fields(record[name]) if record[name].dtype.names else record[name].tolist() for name in names}
 
@@ -60,8 +60,8 @@ class Snapshots:
     """The snapshots of one folder.
 
     Args:
-        folder: that exists.
-        dtype: record that is kept.
+        folder: an existing one.
+        dtype: of the record that is stored.
     """
 
     def __init__(self, folder: Path, dtype: np.dtype):
@@ -71,12 +71,12 @@ class Snapshots:
         return self._folder / f"restart-{corner}.json"
 
     def save(self, corner: str, calibration: Calibration, record: np.void, time_ns: int) -> None:
-        """Keep a record of ``dtype``. Raises OSError; the old file is then untouched."""
+        """Store a record of ``dtype``. Raises OSError; the old file is then unchanged."""
         ours = files.owner(_FORMAT, corner, calibration)
         files.write(self.path(corner), Snapshot(**ours, time_ns=time_ns, state=to_fields(record)))
 
     def load(self, corner: str, calibration: Calibration) -> tuple[np.void | None, int, str | None]:
-        """What was kept of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
+        """The snapshot of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
         the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
         path = self.path(corner)
         found, warning = files.read_own(path, Snapshot, files.owner(_FORMAT, corner, calibration))

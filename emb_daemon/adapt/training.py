@@ -1,7 +1,8 @@
-"""What adaptation does in a tick: watch for the chance, ask, collect, wait for the evaluation, go over to what it found.
+"""The part of adaptation in a tick: wait for an opportunity, request motion, collect, wait for the evaluation, apply the
+result.
 
-Training is asked for once per application of the park brake. Motion that comes unasked while the park brake is applied is
-used too; then whoever moves the brake may raise BrakeRequest with it, so that only an asked training ends on it.
+Training is requested once per application of the park brake. Motion without a request while the park brake is applied is used
+too. The controller may then raise BrakeRequest for this motion, so BrakeRequest ends only a requested training.
 """
 
 from math import hypot
@@ -19,15 +20,15 @@ from emb_daemon.jit import Array, entry, njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, GROWTH, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
-#: Wheel speed up to which a wheel stands, rad/s: some 3 cm/s at the rim.
+#: Wheel speed up to which a wheel counts as standing, rad/s: some 3 cm/s at the rim.
 _STANDING_RAD_S = 0.1
-#: Pulses of a wheel that turned: one more or less is an edge of the encoder's wheel that stands before its sensor.
+#: Number of pulses that shows a turning wheel: a single one may come from an edge that stands just at the sensor.
 _ROLLED_PULSES = 2
-#: Time between snapshots of what the estimator knows: a restart loses no more than this.
+#: Time between snapshots of the estimator's state: the most that a restart loses.
 _SNAPSHOT_NS = 10_000_000_000
-#: Age of another corner's estimate from which nothing is known of it.
+#: Age of another corner's estimate from which it is not used.
 _SILENT_NS = 100_000_000
-#: Motor travel that counts as motion, and the time without any after which unasked motion is over.
+#: Motor travel that counts as motion, and the time without motion after which motion without request has ended.
 _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
 #: time over which collecting goes on after a full stroke.
@@ -44,7 +45,8 @@ _BAD = (
 
 @njit
 def _obstacle(a, m, estimate, limits, others_hold):
-    """ACCEPTED if training may go on, or what forbids it. A gap is bridged for as long as the estimate is."""
+    """ACCEPTED if training may continue, else the reason why not. Gaps in the input are tolerated as long as the estimate is
+    predicted."""
     if a.phase == r.ASKING and not others_hold:
         return r.OTHERS_NOT_HOLDING
     if not estimate.is_sample:
@@ -64,7 +66,7 @@ def _obstacle(a, m, estimate, limits, others_hold):
 
 @njit
 def _has_rolled(a, m):
-    """Whether the wheel turned since the car was found standing."""
+    """Whether the wheel has turned since the car came to a stand."""
     if not m.has_wheel_pulse:
         return False
     pulses = (m.wheel_pulse - a.pulse) % e.PULSE_MODULO
@@ -76,8 +78,8 @@ def _has_rolled(a, m):
 
 @njit
 def others_hold(adapters, limits, k, time_ns):
-    """Whether every other corner that this process estimates holds its parking force: then the car stays where it is while
-    corner ``k`` is opened. One that is being trained does not count, nor one of which nothing is heard."""
+    """Whether every other corner that this process estimates holds its parking force, so that the car does not move while
+    corner ``k`` is opened. A corner that is being trained, or that sends nothing, does not count as holding."""
     for other in range(len(adapters)):
         o = adapters[other]
         silent = time_ns - o.time_ns > _SILENT_NS
@@ -88,7 +90,7 @@ def others_hold(adapters, limits, k, time_ns):
 
 @njit
 def end_training(a, outcome, result):
-    """Back to idle; nothing that was collected survives."""
+    """Return to idle and discard everything collected."""
     a.phase = r.IDLE
     a.rows = 0
     a.evaluation_wanted = a.evaluation_ready = False
@@ -112,7 +114,7 @@ def _begin(a, phase):
 def _collect(a, s, rows, m):
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
-    # The current is a cycle's mean: it does not tell of the acceleration over a gap.
+    # The current is the mean of one cycle, and does not belong to the acceleration over a gap.
     row.current_q, row.has_current = m.current_q, m.has_current and m.dt <= ONE_CYCLE_S
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
@@ -123,7 +125,7 @@ def _collect(a, s, rows, m):
 
 @njit
 def _stroke(a, limits, dt):
-    """Whether a whole stroke lies behind: released, clamped, released, and a little more."""
+    """Whether a complete stroke has been made: released, clamped, released, and some time after."""
     low = a.force < _LOW * limits.high_force + limits.low_force
     if a.was_high:
         if low or a.tail_time > 0.0:
@@ -147,7 +149,7 @@ def _progress(a, limits):
 
 @njit
 def _replace(s, state, error, sigma):
-    """Believe an ``error`` of one state with standard deviation ``sigma``, whatever was believed before."""
+    """Set one state to ``error`` with standard deviation ``sigma``, regardless of its earlier value."""
     for i in range(len(s.error)):
         s.covariance[state, i] = s.covariance[i, state] = 0.0
     s.error[state], s.covariance[state, state] = error, sigma * sigma
@@ -155,8 +157,8 @@ def _replace(s, state, error, sigma):
 
 @njit
 def _restart_fitted(x, P):
-    """Zero the errors that the stroke fitted anew, friction and the stiffness path's own, and correlate nothing any more with
-    what is not of the motor and its current sensor. Variances stay, but FAST's is the stationary one again."""
+    """Zero the errors that the stroke has fitted anew (friction and the stiffness path), and all correlations with states
+    other than those of motor and current sensor. Variances stay, except that of FAST, which becomes the stationary one."""
     for i in range(len(x)):
         if i not in _OF_THE_MOTOR:
             if i not in (CONTACT, SCALE, GROWTH):
@@ -169,11 +171,11 @@ def _restart_fitted(x, P):
 
 @njit
 def apply_learned(s, p, scratch, rows, learned, a):
-    """Go over from ``p`` to ``learned`` PARAMETERS and what the evaluation in ``a`` (ADAPTER) found beside them; bring the
-    path models to the last of ``rows``.
+    """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER); run the path
+    models up to the last of ``rows``.
 
-    Where the curve stays, driving has told more of contact and stiffness than one stroke: what the stroke says of the contact
-    angle is weighed against that, unless the pads have moved; and that the brake may drift is as likely as driving made it."""
+    If the curve is unchanged, driving has shown more of contact and stiffness than one stroke. The stroke's contact angle is
+    then combined with the filter's by their variances, unless the pads have moved, and the drift hypothesis keeps its odds."""
     known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
     kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
@@ -194,11 +196,11 @@ def apply_learned(s, p, scratch, rows, learned, a):
     _restart_fitted(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
     if not kept:
-        # A new curve rests on the torque constant and the inertia of the stroke.
+        # A new curve depends on the torque constant and the inertia of the stroke.
         faded = s.error[FADE] * s.winding + s.error[HOUSING] * s.housing
         _replace(s, GAIN, -a.torque_error - faded, a.torque_error_sigma)
         _replace(s, INERTIA, a.inertia_error, a.inertia_sigma)
-        # What the stroke left open of the new curve, driving may still find.
+        # Driving may still correct what the stroke left uncertain of the new curve.
         s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
     s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
@@ -217,13 +219,13 @@ def apply_learned(s, p, scratch, rows, learned, a):
 
 @njit
 def _conclude(a, s, parameters, learned, scratch, rows):
-    """The moment for the outcome of an evaluation; ``parameters`` has shape (1,)."""
+    """Apply the outcome of an evaluation at its fixed time; ``parameters`` has shape (1,)."""
     if not a.evaluation_ready:
         end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
     elif a.evaluation == r.ACCEPTED:
         apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
         parameters[0] = learned
-        # Those made before belong to the values that were in use until now.
+        # Earlier snapshots belong to the values that were in use until now.
         a.snapshot_ns, a.snapshot_wanted = a.time_ns, True
         end_training(a, r.ACCEPTED, e.RESULT_ACCEPTED)
     else:
@@ -233,14 +235,14 @@ def _conclude(a, s, parameters, learned, scratch, rows):
 
 @njit
 def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
-    """Advance one corner's adaptation by one estimate, and state it there.
+    """Advance one corner's adaptation by one estimate, and write its state into the estimate.
 
     Args:
         a: ADAPTER record.
         s: STATE record of the corner.
-        parameters: its PARAMETERS, shape (1,); ``learned`` the PARAMETERS record that an accepted evaluation puts there.
+        parameters: its PARAMETERS, shape (1,); ``learned``: the PARAMETERS record that an accepted evaluation copies there.
         limits: LIMITS record.
-        others_hold: whether the car stays where it is while this corner is opened.
+        others_hold: whether the other corners hold the car while this corner is opened.
         scratch: STATE array, shape (1,).
         rows: TRAINING array, shape (CAPACITY,).
         m, estimate: SAMPLE and ESTIMATE; the sample is old if the estimate is a prediction.
@@ -278,7 +280,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
 
 @njit
 def _follow(a, s, p, limits, m, estimate):
-    """Keep account of motion, force and temperature."""
+    """Update the records of motion, force and temperature."""
     if not a.started:
         a.started = True
         a.power_on_angle = a.still_angle = m.angle
@@ -294,7 +296,7 @@ def _follow(a, s, p, limits, m, estimate):
     a.holding = estimate.source != e.INVALID and estimate.force - 2.0 * estimate.sigma >= limits.parking_force
     a.ambient = m.ambient if m.has_status else np.nan
     a.rise = 0.5 * (s.mean[0] + s.mean[1]) - m.ambient if s.temperature_known and m.has_status else np.nan
-    # Temperature is read off the same thermal model now and then; what it may be wrong by, the curve inherits.
+    # The temperature comes from the thermal model; the learned curve inherits its error.
     t = p.thermal
     a.factor_sigma = (
         t.softening * hypot(s.temperature_sigma, t.sigma) + t.softening_history * hypot(s.history_sigma, t.sigma)
@@ -308,7 +310,7 @@ def _follow(a, s, p, limits, m, estimate):
 
 @njit
 def _advance(a, s, parameters, learned, limits, scratch, rows, m):
-    """A phase other than idle, nothing being in the way."""
+    """Advance a phase other than idle; no obstacle is present."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
         _collect(a, s, rows, m)

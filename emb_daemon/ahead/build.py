@@ -127,7 +127,7 @@ def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
     needed = [function.name for function in module.functions if function.is_declaration and _HERE_ALONE.match(function.name)]
     needed += re.findall(r"(?m)^@(\S+) = .*inttoptr \(i64", str(module))
     if needed:
-        raise RuntimeError(f"kernels need what only this process has: {', '.join(needed)}")
+        raise RuntimeError(f"kernels refer to addresses of this process: {', '.join(needed)}")
     return machine.emit_object(module)
 
 

@@ -103,7 +103,7 @@ def who_else_writes(path: Path) -> str:
         if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
             return f"{place} is writable by anybody"
         if place == path and os.geteuid() != 0 and status.st_uid not in (0, os.geteuid()):
-            return f"{place} belongs to somebody else"
+            return f"{place} belongs to another user"
     return ""
 
 
@@ -132,7 +132,7 @@ def read_manifest(path: Path) -> Manifest:
     try:
         manifest = msgspec.json.decode(line, type=Manifest)
     except msgspec.DecodeError:
-        raise Refused("it is not whole, or no library that emb-daemon compile has made") from None
+        raise Refused("it is incomplete, or was not made by emb-daemon compile") from None
     if manifest.format != _FORMAT or hashlib.sha256(elf).hexdigest() != manifest.sha256:
         raise Refused("its content is damaged")
     return manifest
@@ -178,7 +178,7 @@ def load() -> str:
     if path:
         try:
             if "emb_daemon.jit" in sys.modules:
-                raise Refused("this process has others already")
+                raise Refused("this process has already loaded other kernels")
             manifest = check(path)
             # What was left open by a linker that knew no libm is looked for among what is loaded.
             ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
@@ -187,7 +187,7 @@ def load() -> str:
         except (Refused, OSError) as refusal:
             why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
     if _loaded is None and importlib.util.find_spec("numba") is None:
-        missing = f"{default_path()}: no such file; expected what emb-daemon compile has made"
+        missing = f"{default_path()}: no such file; emb-daemon compile makes it"
         raise InputError(f"{why or missing}; and numba is not installed")
     return why
 

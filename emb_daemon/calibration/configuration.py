@@ -29,14 +29,14 @@ class Bus(Struct, kw_only=True):
     bitrate: Annotated[int, Meta(gt=0)] | None = None
 
     def __post_init__(self):
-        # python-can is imported only for what it alone knows: it brings much along.
+        # python-can is imported only if needed, because it imports many other modules.
         if self.interface in (None, "socketcan"):
             return
         from can.interfaces import VALID_INTERFACES
 
         if self.interface not in VALID_INTERFACES:
             near = difflib.get_close_matches(self.interface, VALID_INTERFACES, 3, 0.4) or sorted(VALID_INTERFACES)
-            raise InvalidValue(f"interface: python-can knows no {self.interface}; near are {', '.join(near)}")
+            raise InvalidValue(f"interface: unknown to python-can: {self.interface}; similar are {', '.join(near)}")
 
 
 class Corner(Struct, kw_only=True):
@@ -95,14 +95,14 @@ class Configuration(Struct, kw_only=True):
 
 
 class Setup:
-    """A configuration with everything that it names, loaded and checked.
+    """A configuration, with all files that it names loaded and checked.
 
     Attributes:
         calibrations: by corner name.
         parameters: PARAMETERS array, shape (4,).
         layout: LAYOUT array, shape (1,).
-        keys: of authenticated communication, by name; None where it is not configured.
-        links: that the daemon receives, and that it sends, authenticated.
+        keys: of authenticated communication, by name; None if it is not configured.
+        links: authenticated links that the daemon receives, and those that it sends.
     """
 
     def __init__(self, path: Path):
@@ -142,7 +142,7 @@ class Setup:
 
 
 def _read_named(path: Path) -> tuple[str | None, dict[str, str]]:
-    """(DBC, calibration by corner) that a faulty configuration names all the same: their faults are told with its own."""
+    """(DBC, calibration by corner) that a faulty configuration names, so that their faults are listed with its own."""
     try:
         content = load_yaml(path, Any)
     except InputError:

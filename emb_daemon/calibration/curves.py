@@ -9,8 +9,8 @@ from emb_daemon.calibration.fields import Positive, Struct, usual
 from emb_daemon.errors import InputError, InvalidValue
 from emb_daemon.estimator.records import CURVE_TERMS
 
-#: How far curves are carried on beyond the measured thicknesses, as a share of the nearest interval, and to what share of the
-#: nearest measured one a coefficient's compliance may fall there: a straight line would lead it through zero.
+#: How far curves are extrapolated beyond the measured thicknesses, as a share of the nearest interval; and the least
+#: compliance of a coefficient there, as a share of the nearest measured one, because a straight line would cross zero.
 _CARRIED_ON, _LEAST_COMPLIANCE = 0.5, 0.5
 
 
@@ -28,10 +28,10 @@ class Curve(Struct, kw_only=True):
 
 
 def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
-    """Thinnest and thickest pads in mm that `curve_at` tells a curve of."""
+    """Thinnest and thickest pads in mm for which `curve_at` gives a curve."""
     thicknesses = [curve.pad_thickness_mm for curve in curves]
     if len(curves) == 1:
-        # One curve is taken for the pads that are mounted, whatever their thickness.
+        # A single curve is used for the mounted pads, whatever their thickness.
         return 0.0, np.inf
     below, above = (_CARRIED_ON * (thicknesses[k + 1] - thicknesses[k]) for k in (0, -2))
     return max(thicknesses[0] - below, 0.0), thicknesses[-1] + above
@@ -53,12 +53,12 @@ def rising_force(coefficients: np.ndarray) -> float:
 def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
     """Coefficients of the characteristic curve at a pad thickness, shape (CURVE_TERMS,).
 
-    The reciprocal of each coefficient runs straight between measured thicknesses, and on beyond them by at most half the
-    nearest interval: pads are compliances in series with the caliper, so what adds up with thickness is the compliance.
-    A coefficient whose sign changes between the two thicknesses runs straight itself, and all others with it.
+    The reciprocal of each coefficient is linear between measured thicknesses, and beyond them by at most half the nearest
+    interval: pads and caliper are compliances in series, so compliance grows linearly with thickness. If a coefficient changes
+    its sign between the two thicknesses, all coefficients are interpolated linearly instead.
 
     Raises:
-        InputError: the thickness is too far outside of what was measured.
+        InputError: the thickness is too far from the measured ones.
     """
     table = np.zeros((len(curves), CURVE_TERMS))
     for row, curve in enumerate(curves):
@@ -67,7 +67,9 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
         return table[0]
     low, high = thickness_range(curves)
     if not low <= pad_thickness_mm <= high:
-        raise InputError(f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured; expected {low:g} to {high:g}")
+        raise InputError(
+            f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured thicknesses; expected {low:g} to {high:g}"
+        )
     thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
     upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
     share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])

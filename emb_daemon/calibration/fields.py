@@ -11,7 +11,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 def usual(size: float) -> Meta:
-    """Size that is usual of a number which may be zero; from there a relative step leads nowhere (`parameters`)."""
+    """Usual size of a number that may be zero: at zero a relative step would be zero (`parameters`)."""
     return Meta(extra={"usual": size})
 
 

@@ -1,4 +1,4 @@
-"""Calibration files: load, state which one it is, write."""
+"""Calibration files: load, hash, write."""
 
 import hashlib
 from pathlib import Path
@@ -36,7 +36,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Numbers that our reader and every YAML 1.1 reader take for numbers; lists of numbers on one line."""
+    """Writes numbers so that `strict_yaml` and every YAML 1.1 reader read them as numbers; lists of numbers on one line."""
 
 
 def _float(dumper: yaml.Dumper, value: float) -> yaml.Node:

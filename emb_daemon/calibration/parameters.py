@@ -21,13 +21,13 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
 
-#: Keys of what more than one part of the program finds.
+#: Keys that several parts of the program use.
 TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
 LOAD_FRICTION, OFFSET_FRICTION = "friction.load_m_per_rad", "friction.offset_Nm"
 PRESLIDING_ANGLE, CLEARANCE = "friction.presliding_angle_rad", "contact.clearance_rad"
 
-#: Step of a numerical derivative over the size of what moves: errors of rounding and of curvature are both far below
-#: the residuals of a fit, and few samples cross a switch such as contact or a reversal.
+#: Step of a numerical derivative, relative to the size of the parameter. With it the errors of rounding and of curvature are
+#: both far below the residuals of a fit, and few samples cross a switch such as contact or a reversal.
 _STEP = 1e-3
 
 #: Units of keys, by the ending that states them.
@@ -77,11 +77,11 @@ class Parameter:
 
     Attributes:
         key: its path in the file.
-        value: as it stands, in ``unit``; that of an effect which is switched off is what switching it on would set.
+        value: present value, in ``unit``; of an effect that is switched off, the value that switching it on would set.
         step: for numerical derivatives, in ``unit``; positive at any value, zero included.
-        relative: whether the step is a share of the value; it is not where the value is small beside its usual size, nor
-            for positions and effects, whose zero is a value like any other.
-        low, high: bounds of what the file may state, in ``unit``.
+        relative: whether the step is a share of the value. It is not if the value is small compared with its usual size, nor
+            for positions and effects, for which zero is an ordinary value.
+        low, high: bounds that the file accepts, in ``unit``.
     """
 
     key: str
@@ -128,7 +128,7 @@ def value_of(calibration: Calibration, key: str) -> float:
     except (AttributeError, IndexError, KeyError, TypeError):
         found = None
     if type(found) is not float:
-        raise InputError(f"{key}: no number of the calibration{_near(calibration, key)}")
+        raise InputError(f"{key}: not a number of the calibration{_near(calibration, key)}")
     return found
 
 
@@ -136,7 +136,8 @@ def moved(calibration: Calibration, values: Mapping[str, float], *, checked: boo
     """The calibration with the numbers at ``values``' keys set, in the keys' units.
 
     An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where
-    ``values`` does not set them. Unless ``checked``, bounds and cross-checks are left to the caller: a fit asks often.
+    ``values`` does not set them. Unless ``checked``, the caller checks bounds and cross-checks, because a fit calls this
+    often.
 
     Raises:
         InputError: no number has a key; names near ones.
@@ -171,7 +172,7 @@ def keys(calibration: Calibration) -> list[str]:
 
 @cache
 def _parts(key: str) -> tuple[str | int, ...]:
-    """Names and indices of a key; empty for what is no key."""
+    """Names and indices of a key; empty if it is not a key."""
     parts: list[str | int] = []
     for piece in key.split("."):
         match = _PART.fullmatch(piece)
@@ -184,11 +185,11 @@ def _parts(key: str) -> tuple[str | int, ...]:
 def _near(calibration: Calibration, key: str) -> str:
     effects = [f"effects.{effect}.{name}" for effect, parameters in _EFFECTS.items() for name in parameters]
     near = difflib.get_close_matches(key, dict.fromkeys([*keys(calibration), *effects]), 3, 0.6)
-    return f"; near are {', '.join(near)}" if near else ""
+    return f"; similar are {', '.join(near)}" if near else ""
 
 
 def _neutral(effect: str) -> dict[str, float]:
-    """Parameters of an effect that does nothing yet."""
+    """Parameters of an effect with zero amplitudes."""
     return {
         parameter.name: float(min(max(parameter.prior if parameter.starts else 0.0, parameter.low), parameter.high))
         for parameter in _EFFECTS[effect].values()
@@ -196,12 +197,12 @@ def _neutral(effect: str) -> dict[str, float]:
 
 
 def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
-    """A copy of ``node`` with the number at ``parts`` below it set; what lies beside the path is shared."""
+    """A copy of ``node`` with the number at ``parts`` below it set; everything outside of the path is shared."""
     if not parts:
         return value
     part, rest = parts[0], parts[1:]
     if isinstance(node, msgspec.Struct):
-        # No __post_init__: validity as a whole is for `_validate` to judge.
+        # Without __post_init__: `_validate` checks the whole.
         result = copy.copy(node)
         msgspec.structs.force_setattr(result, part, _set(getattr(node, part), rest, value))
         return result
@@ -245,7 +246,7 @@ def _bounds(names: tuple[str, ...]) -> tuple[float, float, float]:
 
 
 def in_words(key: str) -> str:
-    """What a key is of, without its unit: of ``thermal.softening.per_K`` softening."""
+    """A key in words, without its unit: softening for ``thermal.softening.per_K``."""
     *path, name = key.split(".")
     while not (left := _UNIT.sub("", name)) and path:
         name = path.pop()

@@ -1,8 +1,8 @@
 """YAML read strictly into msgspec structs.
 
 PyYAML alone takes `1e-3` for a string, `on` for true, `010` for eight, keeps the last of two equal keys and accepts `.nan`.
-Here a scalar is what YAML 1.2's core schema says, a duplicate key or a number that is not finite is a fault, and every
-fault of a file is reported at once with its line.
+Here a scalar is read by YAML 1.2's core schema, a duplicate key or a number that is not finite is a fault, and all faults of a
+file are reported together, with their lines.
 """
 
 import difflib
@@ -23,14 +23,14 @@ _T = typing.TypeVar("_T")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 _CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
-#: Beyond what any file of ours has: bytes of a file, characters of a number, and levels, which the composer's and our own
-#: recursion must bear.
+#: Limits beyond any valid file: bytes of a file, characters of a number, and levels of nesting, because composer and reader
+#: are recursive.
 _MOST_BYTES, _LONGEST_NUMBER, _DEEPEST = 4_000_000, 40, 50
 _NOT_FINITE = {".nan", ".inf", "-.inf", "+.inf", "nan", "inf", "-inf"}
 
 
 def is_not_plain_text(text: str) -> bool:
-    """Whether ``text`` without quotes is read as something else than text."""
+    """Whether ``text`` without quotes would be read as something other than text."""
     return text in _CONSTANTS or text.lower() in _NOT_FINITE or bool(_INTEGER.match(text) or _FLOAT.match(text))
 
 
@@ -77,7 +77,7 @@ class _Reader:
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else "?"
             if name in entries:
-                self.fault(key, _join(path, name), "stands here twice")
+                self.fault(key, _join(path, name), "occurs twice")
             entries[name] = value
         return entries
 
@@ -181,7 +181,7 @@ def _holds_struct(kind: Any) -> bool:
 
 
 def _compose(name: str, text: str) -> yaml.Node:
-    """The file's tree. What libyaml would follow without end, or into a stack overflow, is refused before."""
+    """The file's tree. Content with which libyaml would not end, or overflow its stack, is refused first."""
     depth = 0
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:

@@ -15,9 +15,9 @@ from emb_daemon.errors import InvalidValue
 #: `Calibration` says of the largest.
 _MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0}
 _FACTOR = 0.9
-#: ... and most that may come to a factor. Friction and times change severalfold with load and warmth, but of three times as
-#: much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor constant
-#: twice as large is another machine's.
+#: ... and the most that may be added to a factor. Friction and times change severalfold with load and warmth, but of three
+#: times as much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor
+#: constant twice as large is another machine's.
 _GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
 
 
@@ -83,7 +83,7 @@ class Term(Struct, kw_only=True):
 
     @property
     def limit(self) -> float:
-        """Most that it may take away, and a response may add, in the port's unit."""
+        """Most that it may subtract, and that a response may add, in the port's unit."""
         return _MOST_AT.get(self.port, _FACTOR)
 
     @property
@@ -93,14 +93,14 @@ class Term(Struct, kw_only=True):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether it stays within its limits. What a response reaches, the time for which its signal stays says: the kernel
-        holds it there."""
+        """Whether it stays within its limits. How far a response goes depends on how long its signal lasts; the kernel limits
+        it."""
         least, most = self.reach
         return self.memory == "response" or (least >= -self.limit and most <= self.growth)
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Least and most that it adds inside its range, in the port's unit; nothing is among it."""
+        """Least and most that it adds inside its range, in the port's unit; always includes zero."""
         ends = (self.low, self.high)
         if self.memory == "slip":
             ends = (-1.0, 1.0)
@@ -133,7 +133,7 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:
-    """What is wrong with all of them together."""
+    """Faults of all terms together."""
     names = [term.name for term in terms]
     faults = [f"terms: {name} occurs twice" for name in sorted(set(names)) if names.count(name) > 1]
     if len(terms) > MOST:

@@ -40,31 +40,33 @@ class Travel(Struct, kw_only=True):
 
     def __post_init__(self):
         if len(self.angle_rad) != len(self.travel_mm):
-            raise InvalidValue(f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected as many")
+            raise InvalidValue(
+                f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected the same number"
+            )
         if 0 < len(self.angle_rad) < 3:
-            raise InvalidValue("expected three points or more")
+            raise InvalidValue("expected at least three points")
         for name in ("angle_rad", "travel_mm"):
             values = getattr(self, name)
             if values and values[0] != 0.0:
                 raise InvalidValue(f"{name}: expected the released position, zero, as first point")
             for row, (before, after) in enumerate(pairwise(values), 1):
                 if after <= before:
-                    raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected more")
+                    raise InvalidValue(f"{name}[{row}]: {after:g} after {before:g}; expected ascending values")
 
     def check_mean(self, gear_gain: float) -> None:
-        """Raise `InvalidValue` if a gear gain (m/rad) is none of this travel's."""
+        """Raise `InvalidValue` if a gear gain (m/rad) cannot be the mean slope of this travel."""
         if not self.angle_rad:
             return
         slopes = 1e-3 * np.diff(self.travel_mm) / np.diff(self.angle_rad)
-        # A hundredth: both are rounded.
+        # Tolerance of a hundredth, because both are rounded.
         if not 0.99 * slopes.min() <= gear_gain <= 1.01 * slopes.max():
             raise InvalidValue(
-                f"gear_gain_m_per_rad: {gear_gain:g} is no mean of travel, which rises by {slopes.min():.3g} to "
+                f"gear_gain_m_per_rad: {gear_gain:g} is not a mean slope of travel, whose slope is {slopes.min():.3g} to "
                 f"{slopes.max():.3g} m/rad"
             )
 
 
-#: One object: what is left out of a file is told by identity.
+#: A single object: a default that the file leaves out is recognised by identity.
 CONSTANT_GEAR = Travel()
 
 
@@ -132,8 +134,8 @@ class Stiffness(Struct, kw_only=True):
                 )
 
 
-#: Clearance from which a calibration says that there is nothing to clamp: an actuator on a dynamometer. A brake's is some ten,
-#: and a screw of this many turns longer than a caliper.
+#: Clearance from which a calibration states that there is nothing to clamp, as of an actuator on a dynamometer. The clearance
+#: of a brake is some ten rad; a screw for this one would be longer than a caliper.
 _NOTHING_TO_CLAMP_RAD = 1e3
 
 
@@ -149,7 +151,7 @@ class Contact(Struct, kw_only=True):
 
     @property
     def is_in_reach(self) -> bool:
-        """Whether the motor can reach pads at all; else the load on the spindle is no function of its angle."""
+        """Whether the motor can reach pads. If not, the load on the spindle is not a function of the motor angle."""
         return self.clearance_rad < _NOTHING_TO_CLAMP_RAD
 
 
@@ -268,7 +270,7 @@ class Softening(Struct, kw_only=True):
 
 
 class Thermal(Struct, kw_only=True):
-    """Heat and what it does to the stiffness."""
+    """Heat model, and its effect on the stiffness."""
 
     pad: Pad
     disc: Disc
@@ -309,7 +311,7 @@ class Adaptation(Struct, kw_only=True):
     longest_training_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 45.0
     #: Least number of samples in each force range and direction.
     samples_per_range: Annotated[int, Meta(ge=1)] = 50
-    #: Largest residual current, as a multiple of the calibration's current noise.
+    #: Largest residual torque, as a multiple of the noise that the calibration states.
     residual_ratio: Positive = 1.5
     #: Relative amount by which the travel to high_force_N may be below that of the stiffest curve or above that of the
     #: softest.
@@ -418,7 +420,7 @@ class Calibration(Struct, kw_only=True):
             raise InvalidValue("\n".join(faults))
 
     def _out_of_travel(self) -> list[str]:
-        """What of the pads' way to the largest force the gear's table does not cover."""
+        """Faults for pads whose travel to the largest force exceeds the gear's table."""
         faults, reached = [], self.motor.gear()["turned"][-1]
         for curve in self.stiffness.curves:
             needed = self.contact.clearance_rad + travel_at(self.stiffness.maximum_force_N, np.array(curve.coefficients))
@@ -430,13 +432,13 @@ class Calibration(Struct, kw_only=True):
         return faults
 
     def __reduce__(self):
-        # A default that is left out is told by identity: field by field, a copy in another process would state it and have
-        # another hash.
+        # Defaults are recognised by identity. A copy made field by field in another process would state them, and therefore
+        # have another hash.
         return _decode, (msgspec.json.encode(self),)
 
     @property
     def training_force_N(self) -> float:
-        """Clamp force up to which training motion is asked for."""
+        """Highest clamp force of the requested training motion."""
         share_of_maximum = _TRAINING_SHARE * self.stiffness.maximum_force_N
         return self.adaptation.high_force_N or min(_TRAINING_FORCE_N, share_of_maximum)
 

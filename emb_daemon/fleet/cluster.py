@@ -111,7 +111,7 @@ def run(
             return
         except CancelledError:
             raise Unavailable(
-                "the scheduler is gone; when it is back, the same command goes on, with --resume where it has that"
+                "the scheduler is gone; when it is back, run the same command again, with --resume if it has that option"
             ) from None
         finally:
             future.release()

@@ -139,7 +139,7 @@ def load(root: Path) -> Findings:
     try:
         return msgspec.json.decode(path.read_bytes(), type=Findings)
     except OSError:
-        raise InputError(f"{path}: not there, expected emb-daemon fleet diagnose to have been run") from None
+        raise InputError(f"{path}: no such file; run emb-daemon fleet diagnose first") from None
     except msgspec.DecodeError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -163,7 +163,7 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
     for line, row in enumerate(rows, start=2):
         unit = row.pop("unit")
         if unit in result:
-            raise InputError(f"{path}:{line}: unit {unit} stands there already")
+            raise InputError(f"{path}:{line}: unit {unit} occurs twice")
         if None in row or None in row.values():
             raise InputError(f"{path}:{line}: expected {len(rows[0]) + 1} columns")
         result[unit] = {name: value for name, value in row.items() if value}
@@ -185,7 +185,7 @@ def find(
     least = _SLOPE_DRIVES if slopes else _LEAST_DRIVES
     placed = {key: scores for key, scores in fleet.items() if len(scores) >= least}
     left_out = {
-        f"{unit} {corner}": f"{len(scores)} drives that say something, expected {least}"
+        f"{unit} {corner}": f"{len(scores)} drives can be used, expected {least}"
         for (unit, corner), scores in fleet.items()
         if (unit, corner) not in placed
     }
@@ -356,9 +356,13 @@ def _manoeuvre(cause: Cause) -> str:
 
 
 _ACTIONS: dict[str, Callable[[Cause], str]] = {
-    "level": lambda cause: f"Take two units to a rig with a force sensor, and emb-daemon diagnose; {_manoeuvre(cause)}.",
-    "day": lambda _: "Have the daemons train more often, or let the calibration follow.",
-    "warmth": lambda _: "The calibration lacks an effect over temperature: emb-daemon diagnose on cold and warm drives.",
-    "unit": lambda cause: f"Train it, then emb-daemon diagnose on its drives; {_manoeuvre(cause)}.",
-    "ageing": lambda cause: f"It ages unlike the others: train it, and look at it again in a month; {_manoeuvre(cause)}.",
+    "level": lambda cause: (
+        f"Take two units to a rig with a force sensor, record logs, and run emb-daemon diagnose; {_manoeuvre(cause)}."
+    ),
+    "day": lambda _: "Let the daemons train more often, or update the calibration.",
+    "warmth": lambda _: "The calibration lacks an effect of temperature: run emb-daemon diagnose on cold and warm drives.",
+    "unit": lambda cause: f"Train it, then run emb-daemon diagnose on its drives; {_manoeuvre(cause)}.",
+    "ageing": lambda cause: (
+        f"It ages differently from the others: train it, and check it again in a month; {_manoeuvre(cause)}."
+    ),
 }

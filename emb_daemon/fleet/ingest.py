@@ -58,7 +58,7 @@ def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping
         path = Path(path).absolute()
         found = compiled.search(str(path))
         if not found:
-            raise InputError(f"{path}: --unit {pattern} does not fit")
+            raise InputError(f"{path}: --unit {pattern} does not match")
         earlier = known.get(str(path))
         if earlier and (earlier["size"], earlier["mtime_ns"]) == _stamp(path):
             continue

@@ -36,23 +36,26 @@ def fleet_page(root: Path) -> Page:
     page.verdict(not (found.groups or unlike), _headline(found))
     accused = [*found.groups, *unlike[:_WORST], *found.drifts, *found.seasons]
     actions = [f"{one.where}: {_words(one.cause)}, {one.size_N:+.0f} N. {one.action}" for one in accused]
-    page.section("What to do next").items(actions or ["Nothing: units differ as healthy units do."])
+    page.section("What to do next").items(actions or ["Nothing: the units differ no more than healthy units do."])
     caption = (
-        "What a group has over all other units: RMS of the force in contact ± a standard deviation from how units differ; "
+        "Difference between a group and all other units: RMS of the force in contact ± one standard deviation, "
+        "from the differences between units; "
         "chance that any row here is false (Holm)."
     )
-    _table(page, "Batches", found.groups, caption, f"No group of units is set apart by any of {found.causes} causes.")
+    _table(
+        page, "Batches", found.groups, caption, f"No group of units differs from the others in any of {found.causes} causes."
+    )
     page.section("Map of units").figure(
         _map(found.units),
-        "One mark for each unit by what sets it furthest apart from its group, in standard deviations of ordinary units. "
+        "One mark for each unit: its largest difference from its group, in standard deviations of ordinary units. "
         f"Ringed ones are named below. The colour is full at {_FULL:g}.",
     )
     more = f" {len(unlike) - _WORST} more in findings.json." if len(unlike) > _WORST else ""
     caption = (
-        "The worst first, over the unit's own group; chance that a row is false (Benjamini and Hochberg): these are "
-        f"only looked at in a workshop.{more}"
+        "Difference from the unit's own group, worst first; chance that a row is false (Benjamini and Hochberg): these "
+        f"units are only inspected in a workshop.{more}"
     )
-    _table(page, "Units unlike the others", unlike[:_WORST], caption, "None is proven to be.")
+    _table(page, "Units that differ from the others", unlike[:_WORST], caption, "No unit is proven to differ.")
     _trends(page, found)
     _population(page, found)
     _data(page, root, found)
@@ -66,7 +69,7 @@ def _headline(found: Findings) -> str:
     groups = counted(len({one.where for one in found.groups}), "batch shares", "batches share")
     units = counted(len({one.where for one in (*found.outliers, *found.ageing)}), "unit is", "units are")
     drifts = counted(len(found.drifts), "drift", "drifts")
-    return f"{groups} something, {units} unlike the others, {drifts}".capitalize()
+    return f"{groups} a cause, {units} different from the others, {drifts}".capitalize()
 
 
 def _words(name: str) -> str:
@@ -125,7 +128,7 @@ def _map(units: list[Placed]):
         margin={"l": 96, "r": 16, "t": 30, "b": 40},
         plot_bgcolor="white",
         font={"family": "system-ui, sans-serif", "size": 12.5, "color": INK},
-        xaxis={"title": {"text": "units of the group, furthest apart first"}, "gridcolor": GRID, "zeroline": False},
+        xaxis={"title": {"text": "units of the group, largest difference first"}, "gridcolor": GRID, "zeroline": False},
     )
     figure.update_yaxes(
         tickvals=list(range(len(names))), ticktext=names, autorange="reversed", zeroline=False, gridcolor="white"
@@ -134,8 +137,8 @@ def _map(units: list[Placed]):
 
 
 def _trends(page: Page, found: Findings) -> None:
-    caption = f"Drift per {PER_DAYS:g} days, season per {PER_K:g} K of the surroundings' temperature; chance as for batches."
-    otherwise = "Nothing drifts, and nothing follows the surroundings' temperature."
+    caption = f"Drift per {PER_DAYS:g} days, season per {PER_K:g} K of ambient temperature; chance as for batches."
+    otherwise = "Nothing drifts, and nothing depends on the ambient temperature."
     section = _table(page, "Trend", [*found.drifts, *found.seasons], caption, otherwise)
     style = Style(ACCENT, mode="lines+markers")
     panels = [
@@ -157,7 +160,8 @@ def _trends(page: Page, found: Findings) -> None:
 
 def _population(page: Page, found: Findings) -> None:
     ranked = sorted(found.population, key=lambda one: -one.spread_N)[:_SPREAD_ROWS]
-    page.section("What units differ in", "Between ordinary units, each unit's own noise taken out (random effects).").table(
+    about = "Differences between ordinary units, without each unit's own noise (random effects)."
+    page.section("What units differ in", about).table(
         ["cause", "spread / N", "a unit's noise / N", "mean / N", "mean", "spread"],
         [
             [
@@ -166,7 +170,7 @@ def _population(page: Page, found: Findings) -> None:
             ]
             for one in ranked
         ],
-        f"{found.causes} causes were asked, of which the drives tell {found.directions} directions apart.",
+        f"{found.causes} causes were tested; the drives distinguish {found.directions} directions among them.",
     )  # fmt: skip
 
 
@@ -186,8 +190,8 @@ def _data(page: Page, root: Path, found: Findings) -> None:
         [
             f"{len(files)} log files, {len(damaged)} of them damaged",
             f"{len(found.silent)} drives cannot be used{': ' + silent if silent else ''}",
-            f"{len(found.left_out)} units with too few drives to be placed",
-            f"{len(figures)} drives replayed, {seconds / 3600.0:.1f} h{'; of the time: ' + raised if raised else ''}",
+            f"{len(found.left_out)} units with too few drives",
+            f"{len(figures)} drives replayed, {seconds / 3600.0:.1f} h{'; time with a reason: ' + raised if raised else ''}",
             f"frames refused: {', '.join(f'{count} {verdict}' for verdict, count in refused.most_common()) or 'none'}",
         ]
     )

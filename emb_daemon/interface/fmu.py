@@ -128,7 +128,7 @@ def _description(variables: list[_Variable], token: str, about: str) -> bytes:
         if name in _BASE_UNITS:
             ElementTree.SubElement(unit, "BaseUnit", {key: str(value) for key, value in _BASE_UNITS[name].items()})
     categories = ElementTree.SubElement(root, "LogCategories")
-    ElementTree.SubElement(categories, "Category", name="logStatusError", description="why a call failed")
+    ElementTree.SubElement(categories, "Category", name="logStatusError", description="reason why a call failed")
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(CYCLE_S))
     listed = ElementTree.SubElement(root, "ModelVariables")
     structure = ElementTree.SubElement(root, "ModelStructure")

@@ -38,14 +38,14 @@ INPUTS = (
     Signal("vehicle_speed_m_per_s", "vehicle_speed", "m/s", "speed of the vehicle"),
     Signal("park_brake", "park_brake", "1", "0 released, 1 applied, 2 in transition, 3 fault"),
     Signal("brake_request", "brake_request", "1", "1 while the driver or a system brakes"),
-    Signal("brake_torque_Nm", "brake_torque", "N.m", "a rig's brake torque sensor heats the pads; not a number: there is none",
+    Signal("brake_torque_Nm", "brake_torque", "N.m", "torque of a rig's brake torque sensor; NaN if there is none",
            float("nan")),
     Signal("has_current", "has_current", "", "current_A is fresh", True),
     Signal("has_thermocouple", "has_thermocouple", "", "inner_backplate_C, outer_backplate_C and caliper_C are fresh", True),
     Signal("has_wheel_speed", "has_wheel_speed", "", "wheel_speed_rad_per_s is fresh", True),
     Signal("has_wheel_pulse", "has_wheel_pulse", "", "wheel_pulse is fresh", True),
     Signal("has_status", "has_status", "", "ambient_C, vehicle_speed_m_per_s, park_brake and brake_request are fresh", True),
-    Signal("is_prediction", "is_prediction", "", "there is no sample: tell what can be said since the last one", False),
+    Signal("is_prediction", "is_prediction", "", "there is no sample: predict from the last one", False),
     Signal("reasons_outside", "reasons", "", "bits of DegradedReasons that are known outside the estimator", 0),
 )  # fmt: skip
 
@@ -59,7 +59,7 @@ OUTPUTS = (
     Signal("ml_force_N", "ml_force", "N", "both paths weighted by their variances, without memory"),
     Signal("contact_angle_rad", "contact_angle", "rad", "motor angle at which the pads touch"),
     Signal("contact_angle_sigma_rad", "contact_sigma", "rad", "one standard deviation of contact_angle_rad"),
-    Signal("stiffness_factor", "stiffness_factor", "1", "stiffness over that of the calibration"),
+    Signal("stiffness_factor", "stiffness_factor", "1", "stiffness relative to the calibration"),
     *(Signal(f"{pad}_{part}_C", f"{part}[{side}]", "degC", f"{pad} pad, {words}")
       for side, pad in enumerate(("inner", "outer"))
       for part, words in (("surface", "friction surface"), ("mean", "mean over its thickness"))),
@@ -68,8 +68,8 @@ OUTPUTS = (
       for side, pad in enumerate(("inner", "outer")) for index, depth in enumerate(DEPTHS_M)),
     Signal("disc_C", "disc", "degC", "brake disc, lumped"),
     Signal("mode", "mode", "", "mode of the estimator: " + ", ".join(f"{code} {word}" for code, word in enumerate(MODES))),
-    Signal("source", "source", "", f"what clamp_force_N rests on: {_SOURCES}"),
-    Signal("reasons", "reasons", "", "why not to trust the estimate: bits of DegradedReasons"),
+    Signal("source", "source", "", f"source of clamp_force_N: {_SOURCES}"),
+    Signal("reasons", "reasons", "", "reasons not to trust the estimate: bits of DegradedReasons"),
 )  # fmt: skip
 
 #: Fields of a SAMPLE that say which sample it is, in words.

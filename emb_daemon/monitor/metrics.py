@@ -11,20 +11,23 @@ _TEMPERATURES = ("inner_surface", "inner_mean", "outer_surface", "outer_mean")
 _GAUGES = {
     "emb_clamp_force_newtons": ("Clamp force", lambda state: _times(state["clamp_force_kN"], 1e3)),
     "emb_clamp_force_sigma_newtons": ("One standard deviation", lambda state: _times(state["clamp_force_sigma_kN"], 1e3)),
-    "emb_stiffness_factor": ("Stiffness over the calibration's", lambda state: state["stiffness_factor"]),
+    "emb_stiffness_factor": ("Stiffness relative to the calibration", lambda state: state["stiffness_factor"]),
     "emb_contact_angle_radians": ("Motor angle at which the pads touch", lambda state: state["contact_angle_rad"]),
-    "emb_input_age_seconds": ("Age of the sample answered", lambda state: _times(state["input_age_ms"], 1e-3)),
-    "emb_silent_seconds": ("Time since any good frame", lambda state: state["silent_s"]),
-    "emb_forces_per_second": ("Clamp forces heard in the last second", lambda state: state["forces_per_s"]),
+    "emb_input_age_seconds": (
+        "Age of the sample from which the force was estimated",
+        lambda state: _times(state["input_age_ms"], 1e-3),
+    ),
+    "emb_silent_seconds": ("Time since the last good frame", lambda state: state["silent_s"]),
+    "emb_forces_per_second": ("Clamp forces received in the last second", lambda state: state["forces_per_s"]),
 }
 _COUNTERS = {
     "emb_frames_received_total": ("Good frames", "received"),
-    "emb_frames_missing_total": ("Frames that the E2E counter says were sent besides", "missing"),
-    "emb_frames_damaged_total": ("Frames with a wrong CRC or a counter that stands still", "damaged"),
+    "emb_frames_missing_total": ("Missing frames, by the E2E counter", "missing"),
+    "emb_frames_damaged_total": ("Frames with a wrong CRC or a repeated counter", "damaged"),
 }
 _WORDS = {
     "emb_mode": ("Mode of the estimator", "mode", MODES),
-    "emb_source": ("What the clamp force rests on", "source", tuple(SOURCES.values())),
+    "emb_source": ("Source of the clamp force", "source", tuple(SOURCES.values())),
     "emb_status": ("Whether the clamp force may be used", "status", tuple(STATUSES.values())),
 }
 
@@ -54,7 +57,7 @@ def exposition(listener: Listener, now_ns: int) -> str:
         rows = ((f'corner="{key}",{field}="{word}"', float(state[field] == word)) for key, (_, state) in states.items()
                 for word in words)  # fmt: skip
         lines += _family(name, "gauge", about, rows)
-    lines += _family("emb_reason", "gauge", "Whether the estimate is degraded for it", _reasons(states.values()))
+    lines += _family("emb_reason", "gauge", "Whether the estimate is degraded for this reason", _reasons(states.values()))
     for name, (about, field) in _COUNTERS.items():
         lines += _family(name, "counter", about, ((f'corner="{key}"', state[field]) for key, (_, state) in states.items()))
     return "\n".join([*lines, ""])

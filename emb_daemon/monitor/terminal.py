@@ -89,4 +89,6 @@ def listen(bus) -> tuple[Listener, int]:
         if heard_ns and now // SECOND_NS > heard_ns // SECOND_NS + 1:
             return listener, now
         if not heard_ns and now - start > _WAIT_S * SECOND_NS:
-            raise Unavailable(f"bus: no broadcast of a daemon (0x200 to 0x233) within {_WAIT_S:g} s; is one running on it?")
+            raise Unavailable(
+                f"bus: no broadcast of a daemon (0x200 to 0x233) within {_WAIT_S:g} s; is a daemon running on this bus?"
+            )

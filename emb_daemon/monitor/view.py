@@ -115,7 +115,7 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
     if not corners:
         lines += [
             Text(""),
-            Text("nothing heard yet: no EMB_c_ClampForce, PadTemp, EstimatorStatus or AdaptRequest", style="yellow"),
+            Text("nothing received yet: no EMB_c_ClampForce, PadTemp, EstimatorStatus or AdaptRequest", style="yellow"),
         ]
     room = max(1, (height - 2) // _LINES_PER_CORNER)
     for corner in corners[:room]:

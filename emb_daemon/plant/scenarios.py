@@ -171,7 +171,7 @@ def city_drive() -> Schedule:
 
 
 def two_stops() -> Schedule:
-    """From 20 and 14 m/s."""
+    """Brake stops from 20 and 14 m/s."""
     return rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0)
 
 
@@ -181,7 +181,7 @@ def cruise() -> Schedule:
 
 
 def parking() -> Schedule:
-    """Two minutes, in which the daemon may ask for its training motion."""
+    """Parked for two minutes: training motion when the daemon requests it."""
     return rest(1.0) + park(12000.0, 120.0) + rest(2.0)
 
 

@@ -101,7 +101,7 @@ def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, by_log: list[dict]) -> None:
-    section = page.section("Errors", "Estimate minus reference. Conditions overlap; figures without a sample are left out.")
+    section = page.section("Errors", "Estimate minus reference. Conditions overlap; conditions without a sample are left out.")
     for log in by_log:
         rows, name = [], Path(log["log"]).name
         for path, label in _LABELS.items():
@@ -143,8 +143,8 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
     """What park brake adaptation made of the drive."""
     section = page.section(
         "Adaptation",
-        "Learned from motor current and angle of training motions, the newest last; only an accepted one is used. Trainings "
-        "before this drive are of the same state directory.",
+        "Learned from motor current and angle in training motions, the newest last; only accepted trainings are used. "
+        "Trainings before this drive are those stored in the state directory.",
     )
     figures = (("samples", 1, 0), ("residual_ratio", 1, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1, 0))
     rows = [
@@ -183,7 +183,7 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
         traces.append(Trace(name, angle[inside], 1e-3 * force[inside], style))
     section.figure(
         xy_figure([Panel("Characteristic curve of the cold pads", "kN", traces)], "motor angle past contact / rad"),
-        "As far as the training went.",
+        "Shown up to the largest force of the training.",
     )
 
 
@@ -202,7 +202,7 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
     page = Page(f"Replay, corner {corner}", f"{', '.join(result.path.name for result in results)} · emb-daemon {__version__}")
     flagged = float(np.mean(estimates["reasons"] != 0))
     details = [
-        f"{len(estimates)} samples, {time_s[-1]:.1f} s; {100.0 * flagged:.1f} % of them with a reason not to trust them.",
+        f"{len(estimates)} samples, {time_s[-1]:.1f} s; {100.0 * flagged:.1f} % of them have a reason not to trust them.",
         f"Calibration: {described}.",
     ]
     known = np.isfinite(force_N)
@@ -211,9 +211,9 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
         of = figures(error)
         inside = 100.0 * share_inside(error, estimates["sigma"])
         headline = f"Clamp force: RMSE {of['rmse']:.0f} N, 95 % within {of['p95']:.0f} N, largest {of['max']:.0f} N"
-        details.insert(0, f"{inside:.1f} % of the errors lie inside two sigma; 95.4 % would if they were normal.")
+        details.insert(0, f"{inside:.1f} % of the errors are inside two sigma; a normal distribution has 95.4 %.")
     else:
-        headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; no reference in the log to judge it by"
+        headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; the log has no reference force"
     page.verdict(None, headline, details)
     panels = _panels(time_s, estimates, force_N)
     events, labels = _events(time_s, estimates)
@@ -224,8 +224,8 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
     )  # fmt: skip
     # The legend takes two rows, above which the tool bar stands.
     figure.update_layout(margin={"t": 108}, height=figure.layout.height + 40)
-    page.section("The drive", "Drag across any plot to zoom all of them, double-click to see everything again.").figure(
-        figure, "Curves are reduced for the screen; the smallest and largest value of every stretch are kept."
+    page.section("The drive", "Drag across any plot to zoom all of them; double-click to zoom out.").figure(
+        figure, "Curves are reduced for the screen; the smallest and the largest value of every interval are kept."
     )
     if known.any():
         _errors(page, estimates, force_N, by_log)

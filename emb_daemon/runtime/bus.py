@@ -11,7 +11,7 @@ from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
 from emb_daemon.wire.frames import FRAME, row_of
 
-#: Frames of our own that may still be on their way back; four corners send 16 in their busiest tick.
+#: Number of sent frames whose echo may still be outstanding; four corners send 16 in their busiest tick.
 _ECHOES = 256
 
 
@@ -19,15 +19,15 @@ class PythonCanBus:
     """A bus that python-can drives, frame by frame; same interface as RawCanSocket.
 
     Args:
-        ids: of the frames to receive, all of them 11 bits long; error frames come too.
-        echoes: the bus gives a sender its own frames back, which `drain` then leaves out. A frame of somebody else that is
-            equal to one just sent is taken for its echo.
+        ids: of the frames to receive, all of them 11 bits long; error frames are received too.
+        echoes: the bus returns a sender its own frames; `drain` then leaves them out. A frame of another sender that is equal
+            to one just sent is taken for its echo.
     """
 
     def __init__(self, bus, ids: list[int], echoes: bool = False):
         self._bus = bus
-        # Not python-can's own filters: where it applies them in software, recv(0) says of a frame that it leaves out what it
-        # says of an empty queue.
+        # python-can's own filters are not used: where it applies them in software, recv(0) returns None for a frame that
+        # they leave out, as for an empty queue.
         self._ids = frozenset(ids)
         self._early = deque()
         self._echoes = deque(maxlen=_ECHOES) if echoes else None
@@ -50,7 +50,7 @@ class PythonCanBus:
         return message is not None
 
     def _receive(self) -> Iterator[tuple]:
-        """python-can messages that have come, with their time on the monotonic clock in ns."""
+        """python-can messages that have arrived, with their time on the monotonic clock in ns."""
         import can
 
         offset = time.time_ns() - time.monotonic_ns()
@@ -63,7 +63,7 @@ class PythonCanBus:
                 return
             if message is None:
                 return
-            # Interfaces whose stamps are not of this machine's clock (0, or a device's own) get the time of arrival.
+            # Frames whose stamp is not of this machine's clock (0, or the device's own clock) get the time of arrival.
             now, stamp = time.monotonic_ns(), round(message.timestamp * 1e9) - offset
             yield message, stamp if 0 <= now - stamp < 1_000_000_000 else now
 
@@ -82,7 +82,7 @@ class PythonCanBus:
         return message.is_error_frame or (message.arbitration_id in self._ids and not message.is_extended_id)
 
     def _is_echo(self, message) -> bool:
-        # They come in the order in which they were sent, so the first is nearly always the one.
+        # Echoes come in the order of sending, so the first is nearly always the right one.
         if not self._echoes or (key := (message.arbitration_id, bytes(message.data))) not in self._echoes:
             return False
         self._echoes.remove(key)
@@ -118,12 +118,12 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
     chosen = _choose_options({"interface": interface, "channel": channel, **options})
     if chosen["interface"] == "socketcan":
         return open_socketcan(str(chosen["channel"]), ids)
-    # Its multicast loops back, or programs on one machine could not hear each other.
+    # Its multicast loops back, so that programs on one machine can receive each other's frames.
     return PythonCanBus(_open(chosen), ids, echoes=chosen["interface"] == "udp_multicast")
 
 
 def open_python_can(options: dict):
-    """python-can's own bus with all frames in it, by the options of `open_bus`; errors as there."""
+    """python-can's own bus, unfiltered, by the options of `open_bus`; errors as there."""
     return _open(_choose_options(options))
 
 
@@ -131,7 +131,7 @@ def _choose_options(given: dict) -> dict:
     import can
 
     try:
-        # None would hide what can.conf and the CAN_* variables say.
+        # An option of None would override can.conf and the CAN_* variables.
         return can.util.load_config(config={key: value for key, value in given.items() if value is not None})
     except (can.CanInterfaceNotImplementedError, ValueError) as error:
         raise InputError(f"bus: {error}; name one with --interface and --channel") from None

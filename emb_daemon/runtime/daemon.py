@@ -1,9 +1,9 @@
 """The loop: wake when a sample is due, drain, step, send.
 
-Deadlines are absolute and follow the senders: each corner's next sample is expected one period after its last, and the loop
-sleeps until just after that, so that one system call drains a whole sample and the answer leaves at once. Corners whose
-samples arrive together are answered together. If a sample is late the loop waits on the bus for it; if nothing is heard it
-keeps ticking by itself, so that silence is reported too.
+Deadlines are absolute and follow the senders. Each corner's next sample is expected one period after its last, and the loop
+sleeps until just after that, so that one system call drains a complete sample and the estimate leaves at once. Samples of
+several corners that arrive together are estimated together. If a sample is late the loop waits for it on the bus; if nothing
+arrives it keeps ticking by itself, so that a missing sender is reported too.
 """
 
 import math
@@ -33,17 +33,18 @@ from emb_daemon.wire.frames import ERROR, FRAME
 from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 from emb_daemon.wire.receive import RECEPTION
 
-#: Wake-up after a sample is expected: above the senders' jitter, so that the sample is complete when the loop wakes.
+#: Time from the expected sample to the wake-up: more than the senders' jitter, so that the sample is complete when the loop
+#: wakes.
 _MARGIN_NS = 200_000
-#: How long a frame may take from its stamp to the queue without the loop answering as if it did not come: a replay of the
-#: bus's log knows only the stamp.
+#: Time that a frame may take from its stamp into the queue before the loop treats it as missing. The loop waits for so long,
+#: because a replay of the recorded bus knows only the stamp and must decide the same.
 _QUEUED_NS = 1_000_000
-#: Samples expected within this time of each other are answered in one tick.
+#: Samples expected within this time of each other are estimated in one tick.
 _TOGETHER_NS = 400_000
-#: How long a disturbance of bus or loop is shown in the estimates.
+#: Time for which a disturbance of bus or loop is reported with the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
-#: How long a page that was read waits for the car to be seen at rest: reading may have kept the loop from hearing it.
+#: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
@@ -53,7 +54,7 @@ def _real_time(_time_ns: int) -> int:
 
 
 class Pacer:
-    """When to wake next, from when samples arrived."""
+    """Decides when to wake next, from the arrival times of the samples."""
 
     def __init__(self, now_ns: int):
         self._arrived_ns: dict[int, int] = {}
@@ -68,7 +69,7 @@ class Pacer:
         wakes = []
         for corner, arrived in list(self._arrived_ns.items()):
             if now_ns - arrived > (LATE_CYCLES + 1) * CYCLE_NS:
-                # Predictions answer for it, at the loop's own pace, until it is heard again.
+                # Until its next sample the corner gets predictions, at the loop's own pace.
                 del self._arrived_ns[corner]
             else:
                 # A sample that is a whole period late is lost: expect the next.
@@ -84,8 +85,9 @@ class Pacer:
 
 @entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), returns=3)
 def _scan(estimates, count, states, receptions, arrivals, reported):
-    """What the loop must know of new estimates: ``arrivals`` gets the time at which each corner's sample was complete, 0 for
-    none; ``reported`` mode and reasons. Returns bit masks of corners: estimated, lost to what is no number, changed."""
+    """What the loop needs to know of new estimates. Sets ``arrivals`` to the time at which each corner's sample was complete
+    (0: none) and ``reported`` to mode and reasons. Returns bit masks of corners: estimated; with a state that is not a number;
+    with changed mode or reasons."""
     estimated, lost, changed = 0, 0, 0
     arrivals[:] = 0
     for row in range(count):
@@ -97,7 +99,7 @@ def _scan(estimates, count, states, receptions, arrivals, reported):
             arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
         if estimate.source == contract.INVALID and not _is_number(states[corner]):
             lost |= 1 << corner
-        # What disturbs the loop is logged once, not for each corner.
+        # Disturbances of bus and loop are logged once, not for each corner.
         state = estimate.mode << 16 | estimate.reasons & 0xFFFF & ~_OF_THE_LOOP
         if state != reported[corner]:
             reported[corner] = state
@@ -107,8 +109,8 @@ def _scan(estimates, count, states, receptions, arrivals, reported):
 
 @njit
 def _is_number(state):
-    """Whether a corner's state is made of numbers. No sample mends one that is not, a restart does; where inputs make an
-    estimate invalid, a restart would mend nothing and take the other corners with it."""
+    """Whether a corner's state consists of numbers. If it does not, only a restart helps. An estimate that is invalid because
+    of its inputs is different: a restart would not help, and would interrupt the other corners."""
     total = state.force + state.contact_angle + state.factor * state.scale
     for i in range(len(state.error)):
         total += state.error[i] + state.covariance[i, i]
@@ -123,7 +125,7 @@ class Daemon:
     Args:
         setup: checked configuration.
         bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
-        state: folder of what adaptation learns; without one nothing is learned.
+        state: folder for learned values; without one nothing is learned.
 
     Attributes:
         ticks, missed: periods run, and periods in which the loop did not wake.
@@ -139,23 +141,25 @@ class Daemon:
         self._shared: SharedEstimates | None = None
         self.ticks = self.missed = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)
-        #: Since the watchdog was last thought of: ticks run and missed until then, corners estimated, and lost.
+        #: Ticks run and missed until the last decision about the watchdog; since then: corners estimated, and corners whose
+        #: state is not a number.
         self._before = (0, 0)
         self._estimated = self._lost = 0
-        # Plain flags: a signal handler that takes a lock, as an Event does, may wait for the very thread it interrupts.
+        # Plain flags: an Event takes a lock, for which a signal handler could wait forever in the thread that it interrupts.
         self._stopping = self._reload_wanted = False
         self._reader: threading.Thread | None = None
-        #: Calibrations by corner: of the files in use, of those that the reader has read, and of those that wait for the
-        #: brake's release. The reader writes the second only, and the loop takes it when the reader has ended.
+        #: Calibrations by corner: in use; read by the reader thread; waiting for the brake's release. The reader writes only
+        #: the second, and the loop takes it over when the reader has ended.
         self._calibrations = dict(setup.calibrations)
         self._read: dict[str, tuple[Calibration, Store | None]] | None = None
         self._waiting: dict[str, tuple[Calibration, Store | None]] = {}
-        #: Who asks for a page, whose page is being checked or taken, and corners that are estimated with one.
+        #: Pages: the listener that receives requests, the request that waits, the request whose page is being checked or
+        #: taken, and the corners that are estimated with a page.
         self._listener: PageListener | None = None
         self._asked: Request | None = None
         self._page: Request | None = None
         self._on_page: set[str] = set()
-        #: Calibrations by corner that a file had last: without a page they are those in use.
+        #: Calibrations by corner as last read from the files: those in use while there is no page.
         self._of_files = dict(setup.calibrations)
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
@@ -175,22 +179,23 @@ class Daemon:
         self._shared = SharedEstimates(path, self.pipeline)
 
     def take_pages(self, path: Path) -> None:
-        """Let who shares the estimates in ``path`` ask for other calibrations. Raises Unavailable if he cannot be heard."""
+        """Accept requests for other calibrations from the reader of the estimates in ``path``. Raises Unavailable if the
+        socket cannot be made."""
         self._listener = PageListener(socket_path(path), self.ask_page, self._leave_page)
 
     def ask_page(self, request: Request) -> None:
-        """Have a page checked and taken, or refused, by the loop; one at a time."""
+        """Let the loop check a page and take or refuse it; one page at a time."""
         self._asked = request
 
     def _leave_page(self) -> None:
         if self._on_page:
-            log.warning("who asked for other calibrations has gone: back to the files'")
+            log.warning("the XCP server has ended: returning to the calibrations of the files")
             self._reload_wanted = True
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, everything that a tick calls, and touch its memory."""
         scratch = Pipeline(self._setup.parameters.copy(), CORNERS, self._setup.layout)
-        # Two thirds of the compiler's work is the estimator.
+        # The estimator is two thirds of the compiler's work.
         wait = compile_beside(step, lambda: self._warm_up_answers(scratch))
         scratch.begin(0)
         _, count = scratch.collect(np.zeros(1, FRAME))
@@ -236,7 +241,7 @@ class Daemon:
             if self._reload_wanted or self._reader is not None or self._waiting or self._asked or self._page:
                 self._follow_reload()
             if watchdog_ns and now >= next_ping:
-                # One that is withheld is thought of again soon: a stall that is over is no hang.
+                # If the ping is withheld, decide again soon: the loop may only have stalled.
                 next_ping = now + (watchdog_ns if self._ping() else watchdog_ns // 4)
             if now >= next_status:
                 next_status = now + _STATUS_NS
@@ -251,7 +256,7 @@ class Daemon:
         log.info("stopped after %d ticks, %d missed", self.ticks, self.missed)
 
     def tick(self, now_ns: int, pacer: Pacer) -> None:
-        """Everything that has arrived, answered."""
+        """Take everything that has arrived, estimate, and send."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
         heard_ns = int(frames["time_ns"][-1]) if self._bus.full else now_ns - _QUEUED_NS
         while True:
@@ -268,7 +273,7 @@ class Daemon:
         self._watch_bus(frames, now_ns)
 
     def _follow(self, count: int, pacer: Pacer) -> None:
-        """Learn when the next samples are due; log what changed."""
+        """Note when the next samples are due; log changes of mode and reasons."""
         pipeline = self.pipeline
         estimated, lost, changed = _scan(
             pipeline.estimates, count, pipeline.states, pipeline.receptions, self._arrivals, self._reported
@@ -286,7 +291,7 @@ class Daemon:
         words = contract.reason_words(reasons)
         amiss = mode in (contract.DEGRADED, contract.FAULT)
         level = 30 if amiss else 20
-        # Bus and loop are reported once for all corners; here they are only referred to.
+        # Disturbances of bus and loop are logged once for all corners; here they are only mentioned.
         none = "bus or loop" if amiss else "none"
         fields = {"corner": CORNERS[corner], "mode": contract.MODES[mode], "reasons": ", ".join(words) or none}
         log.log(level, "corner %(corner)s: %(mode)s (%(reasons)s)", fields, extra={"fields": fields})
@@ -316,7 +321,7 @@ class Daemon:
         self.pipeline.disturbed[:] = bits
 
     def _follow_reload(self) -> None:
-        """Have the calibrations read, one reading at a time, and let corners go over to those that changed."""
+        """Start a reading of the calibrations, one at a time, and let corners change to those that differ."""
         if self._reader is not None and not self._reader.is_alive():
             self._reader = None
             if self._page is None:
@@ -343,14 +348,14 @@ class Daemon:
         self._reader.start()
 
     def _answer_to(self, request: Request) -> Answer | None:
-        """Go over to a page that was read, all of its corners in one tick, or refuse it; None while it may yet be taken."""
+        """Change to a page that was read, all of its corners in one tick, or refuse it; None while the decision is open."""
         now_ns, answer = time.monotonic_ns(), Answer(request.fault)
         request.read_ns = request.read_ns or now_ns
         if not request.fault:
             if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
-                answer = Answer("it took too long to be checked", later=True)
+                answer = Answer("checking it took too long", later=True)
             elif self._waiting:
-                answer = Answer("a reload waits for the brakes' release", later=True)
+                answer = Answer("a reload is waiting for the brakes to be released", later=True)
             elif request.read and (why_not := self.pipeline.why_not_at_rest()):
                 if now_ns - request.read_ns < _SETTLING_NS:
                     return None
@@ -362,7 +367,7 @@ class Daemon:
             count = len(request.page.values.get(name, ()))
             self._begin_anew(name, calibration, learned, on_page=count > 0)
             if count:
-                log.warning("corner %s: %d numbers are not the file's, and nothing is learned", name, count)
+                log.warning("corner %s: %d numbers differ from the file; adaptation is off", name, count)
         return answer
 
     def _released(self, name: str) -> bool:
@@ -374,16 +379,16 @@ class Daemon:
         try:
             setup = Setup(self._setup.path)
             if setup.calibrations.keys() != self._setup.calibrations.keys():
-                raise InputError(f"{setup.path}: corners: a reload cannot change them, restart instead")
+                raise InputError(f"{setup.path}: corners: a reload cannot change them; restart the daemon")
             calibrations = request.page.applied(setup.calibrations) if request else setup.calibrations
         except InputError as error:
             if request:
                 request.fault = str(error)
             else:
-                log.error("calibration not reloaded, the old one stays: %s", error)
+                log.error("calibration not reloaded, the old one stays in use: %s", error)
             if request or not self._on_page:
                 return
-            # A page does not stay because a file is bad.
+            # A faulty file must not keep a page in use.
             calibrations = self._of_files
         waiting = {}
         for name, calibration in calibrations.items():
@@ -399,8 +404,8 @@ class Daemon:
             self._read = waiting
 
     def _begin_anew(self, name: str, calibration: Calibration, learned: Store | None, on_page: bool = False) -> None:
-        """Estimate a corner with another calibration as after a restart: what the filter learned under the old one, and what
-        it starts from, belong to that."""
+        """Start a corner anew with another calibration, as after a restart, because everything that the filter learned belongs
+        to the old one."""
         self._calibrations[name] = calibration
         if not on_page:
             self._of_files[name] = calibration
@@ -412,18 +417,18 @@ class Daemon:
             calibration = self._adaptation.in_use(name)
         self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
         words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
-        log.info("corner %(corner)s: begins anew with calibration %(calibration)s", words, extra={"fields": words})
+        log.info("corner %(corner)s: starts anew with calibration %(calibration)s", words, extra={"fields": words})
 
     def _ping(self) -> bool:
-        """Tell the watchdog that the loop is well; False, with the reason in the log, if it is not.
+        """Ping the watchdog if a restart would not help; otherwise log the reason and return False.
 
-        Well is what a restart would not make better: most ticks are met, each corner's estimates are on their way, and none of
-        their states has been lost. An interface that is down or gone is not among it.
+        A restart would help if most ticks are missed, if a corner gets no estimates, or if its state is not a number. It would
+        not help against an interface that is down or gone.
         """
         met, missed = self.ticks - self._before[0], self.missed - self._before[1]
         silent = self._active & ~self._estimated
         amiss = [
-            f"corner {name}: estimator lost, what it knows is not a number"
+            f"corner {name}: the estimator's state is not a number"
             for index, name in enumerate(CORNERS)
             if self._lost >> index & 1
         ]
@@ -432,7 +437,7 @@ class Daemon:
             amiss.append(f"{missed} of {met + missed} periods missed")
         self._before, self._estimated, self._lost = (self.ticks, self.missed), 0, 0
         if amiss:
-            log.error("the watchdog is not pinged: %s", "; ".join(amiss))
+            log.error("not pinging the watchdog: %s", "; ".join(amiss))
         else:
             self._manager.notify("WATCHDOG=1")
         return not amiss

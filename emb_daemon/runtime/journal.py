@@ -19,7 +19,7 @@ class JournalHandler(logging.Handler):
         super().__init__()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.connect(_JOURNAL)
-        # The loop logs too: a journal that does not keep up loses lines rather than periods.
+        # The loop logs as well: if the journal does not keep up, lines are lost and not ticks.
         self._socket.setblocking(False)
 
     def emit(self, record: logging.LogRecord) -> None:

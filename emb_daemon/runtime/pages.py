@@ -1,7 +1,7 @@
-"""Trying another calibration: what a measurement tool's server asks of the daemon, over a socket beside the estimates' file.
+"""Online calibration: requests of the XCP server to the daemon, over a socket beside the file of the estimates.
 
-A `Page` says by which numbers each corner's calibration is to differ from its file. Only the daemon's user, and root, reach
-the socket. Nothing of a page is kept: it ends with the server that asked for it, with a reload, and with the daemon.
+A `Page` contains the numbers in which each corner's calibration is to differ from its file. Only the daemon's user and root
+can use the socket. A page is never stored: it ends with the server that requested it, with a reload, and with the daemon.
 """
 
 import contextlib
@@ -23,25 +23,25 @@ from emb_daemon.runtime.journal import log
 
 #: The largest request: every number of four corners.
 _MOST_BYTES = 200_000
-#: A page that could not be checked within this time is dropped, and the other side waits a little longer.
+#: A page that could not be checked within this time is dropped; the server waits for the answer a little longer.
 PATIENCE_S = 3.0
 _ANSWERED_S = PATIENCE_S + 1.0
 
 
 def tunable(calibration: Calibration) -> list[str]:
-    """Keys of the numbers that a page may set: all but adaptation's. Those are limits of what may be learned, and nothing is
-    learned on a page."""
+    """Keys of the numbers that a page may set: all except adaptation's limits, because nothing is learned while a page is in
+    use."""
     return [key for key in keys(calibration) if not key.startswith("adaptation.")]
 
 
 class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers by corner and key; of each corner that has any, the hash of the calibration that they differ from."""
+    """Numbers by corner and key, and for each of these corners the hash of the calibration of its file."""
 
     values: dict[str, dict[str, float]]
     files: dict[str, str]
 
     def applied(self, calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
-        """The calibrations of the files with the page's numbers, checked as a file is.
+        """The calibrations of the files with the page's numbers, checked like a file.
 
         Raises:
             InputError: every fault found.
@@ -54,10 +54,12 @@ class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 continue
             calibration = calibrations[name]
             if self.files.get(name) != calibration_hash(calibration):
-                faults.append(f"corner {name}: the file is not the one that the page was made from: start emb-daemon xcp anew")
+                faults.append(
+                    f"corner {name}: the calibration file has changed since the page was made: restart emb-daemon xcp"
+                )
                 continue
             known = set(tunable(calibration))
-            faults += [f"corner {name}: {key}: no number that a page may set" for key in values if key not in known]
+            faults += [f"corner {name}: {key}: not a number that a page may set" for key in values if key not in known]
             if known.issuperset(values):
                 try:
                     result[name] = moved(calibration, values, checked=True)
@@ -69,25 +71,25 @@ class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Why a page was not taken, empty if it was; ``later`` if it might be under other circumstances."""
+    """Why a page was refused, empty if it was taken; ``later``: it may be taken under other circumstances."""
 
     refused: str = ""
     later: bool = False
 
 
 class Request:
-    """A page that was asked for at ``asked_ns``, what was ``read`` for it by ``read_ns``, and who waits for the answer."""
+    """A page requested at ``asked_ns``, the calibrations ``read`` for it by ``read_ns``, and who waits for the answer."""
 
     def __init__(self, page: Page):
         self.page, self.asked_ns = page, time.monotonic_ns()
         self.read: dict = {}
         self.read_ns: int | None = None
-        #: What is wrong with the page; whoever checks it says that nothing is.
+        #: Why the page is refused; the check sets it to nothing if the page is good.
         self.fault = "could not be checked"
         self._answer: queue.SimpleQueue = queue.SimpleQueue()
 
     def answer(self, answer: Answer) -> None:
-        """Does not wait."""
+        """Give the answer; never waits."""
         self._answer.put(answer)
 
     def wait(self) -> Answer:
@@ -95,7 +97,7 @@ class Request:
 
 
 def socket_path(estimates: Path) -> Path:
-    """Of the socket beside the estimates' file."""
+    """Path of the socket beside the file of the estimates."""
     return estimates.with_name(estimates.name + ".pages")
 
 
@@ -104,8 +106,8 @@ class PageListener:
 
     Args:
         path: of the socket.
-        ask: has a request answered; called in the thread.
-        end: called in the thread when a server that asked for something has gone.
+        ask: hands a request to the daemon; called in the thread.
+        end: called in the thread when a server that had requested something has gone.
     """
 
     def __init__(self, path: Path, ask: Callable[[Request], None], end: Callable[[], None]):
@@ -115,7 +117,7 @@ class PageListener:
         try:
             with contextlib.suppress(FileNotFoundError):
                 path.unlink()
-            # From the start, so that nobody else connects in between.
+            # Set before the socket is created, so that no other user can connect in between.
             os.fchmod(self._listener.fileno(), 0o600)
             self._listener.bind(str(path))
             self._listener.listen(1)
@@ -144,7 +146,7 @@ class PageListener:
         return request.wait()
 
     def close(self) -> None:
-        """Take the socket away, and end the thread unless it hears somebody."""
+        """Remove the socket, and end the thread unless a server is connected."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -159,9 +161,9 @@ class PageClient:
         self._connection: socket.socket | None = None
 
     def ask(self, page: Page) -> Answer:
-        """The daemon's answer; one of our own if there is no daemon that hears."""
+        """The daemon's answer, or one made here if no daemon answers."""
         for _ in range(2):
-            # A connection that a daemon has left is found out by using it.
+            # Whether the daemon has closed a connection shows only when it is used.
             known = self._connection is not None
             try:
                 answered = self._exchange(msgspec.json.encode(page))

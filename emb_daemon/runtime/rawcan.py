@@ -1,7 +1,7 @@
 """Batches of CAN frames over a socket, one system call in and one out per tick.
 
 Python's socket module has neither recvmmsg nor sendmmsg; a frame at a time costs four to ten system calls more in each
-tick, which is what a small ECU cannot afford. The socket is SocketCAN's AF_CAN or, in one process, a pair of Unix sockets
+tick, too many for a small ECU. The socket is SocketCAN's AF_CAN or, in one process, a pair of Unix sockets
 that carries the same struct can_frame, followed by the sender's time stamp, which on CAN the kernel attaches.
 """
 
@@ -25,8 +25,9 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
 _MSG_DONTWAIT = 0x40
 _EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _CAN_RAW_ERR_FILTER, _ERROR_CLASSES = 2, 0x1FFF_FFFF
-#: Between stamping a frame and queueing it the kernel may be held up. A stamp that lies no further back than this before the
-#: last look into the queue is believed: the pipeline bears as much for jitter, should the clock have been set instead.
+#: The kernel may be held up between stamping a frame and queueing it. A stamp is accepted if it is no older than this before
+#: the last look into the queue. If the clock was set instead, the error is at most this long, which the pipeline tolerates as
+#: jitter.
 _IN_TRANSIT_NS = 2 * CYCLE_NS
 
 _CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
@@ -42,12 +43,12 @@ _MMSGHDR = np.dtype(
     }
 )
 _CONTROL_BYTES = 64
-#: Frames that are taken or sent at once.
+#: Largest number of frames that one call takes or sends.
 _CAPACITY = 1024
-#: Errors of a socket whose interface was deleted, and those after which the next call may go well.
+#: Errors of a socket whose interface was deleted, and errors after which the next call may succeed.
 _INTERFACE_GONE = (errno.ENODEV, errno.ENXIO)
 _PASSING = (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ECONNRESET, errno.EPIPE, errno.ENOBUFS)
-#: How often another socket is tried for while the interface is gone.
+#: Time between attempts to open another socket while the interface is gone.
 _REOPEN_NS = 100_000_000
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -78,10 +79,11 @@ class _Batch:
 def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, now_ns, frames):
     """Frames with times on the monotonic clock; returns how many there are, and the socket's drop counter or -1.
 
-    A peer that closed its end of a socket pair leaves empty messages without end: those are no frames.
+    When the peer of a socket pair has closed its end, endless empty messages follow, which are not frames.
 
-    The kernel stamps CLOCK_REALTIME, which can step; ``offset_ns`` takes it to the monotonic clock, and the result is held
-    between ``earliest_ns`` and now. Whole microseconds, as candump logs them: a log of the bus then gives the same times.
+    The kernel's stamps are of CLOCK_REALTIME, which can step. ``offset_ns`` converts them to the monotonic clock, and the
+    result is limited to between ``earliest_ns`` and now. It is rounded to whole microseconds, as candump logs them, so that a
+    log of the bus gives the same times.
     """
     drops = np.int64(-1)
     for index in range(count):
@@ -135,11 +137,11 @@ class RawCanSocket:
 
     Args:
         stamped: frames carry the sender's time stamp (`socket_pair`) instead of the kernel's.
-        reopen: gives another such socket when the interface of this one is gone, or raises Unavailable.
+        reopen: returns another such socket when the interface of this one is gone, or raises Unavailable.
 
     Attributes:
-        dropped: frames that this socket's receive buffer had no room for.
-        unsent: frames that the kernel did not take.
+        dropped: frames for which this socket's receive buffer had no room.
+        unsent: frames that the kernel did not accept.
         down: the interface is down or gone, as the last attempt to use it found.
         full: the last drain took as much as it can; more may be waiting.
     """
@@ -151,20 +153,20 @@ class RawCanSocket:
         self._sent = _Batch(frame_bytes, control=False)
         self._stamped = stamped
         self._frames = np.zeros(_CAPACITY, FRAME)
-        #: When the queue was last looked into, the last frame's time, and when to try for another socket, if this one is gone.
+        #: Time of the last look into the queue, time of the last frame, and time of the next attempt to open another socket.
         self._looked_ns = self._latest_ns = time.monotonic_ns()
         self._reopen_ns: int | None = None
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.dropped = 0
         self.unsent = 0
         self.down = self.full = False
-        # Compiled now, not when the first frame is waiting.
+        # Compile now, not when the first frame is waiting.
         self._take(0, self._looked_ns)
         _to_kernel(self._frames[:0], 0, self._sent.raw)
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until a frame is there or the time is over."""
-        # Not poll(), whose timeout is whole milliseconds.
+        # poll() is not used, because its timeout is in whole milliseconds.
         return bool(select.select([self._socket], [], [], timeout_s)[0]) if timeout_s > 0 else False
 
     def drain(self) -> np.ndarray:
@@ -179,7 +181,7 @@ class RawCanSocket:
             return self._frames[:0]
         self.down = False
         count, drops = self._take(count, time.monotonic_ns())
-        # Before the call, not after: what comes while it returns is found by the next.
+        # Taken before the call: a frame that arrives while it returns is found by the next call.
         self._looked_ns = looked
         if count:
             self._latest_ns = int(self._frames["time_ns"][count - 1])
@@ -189,19 +191,19 @@ class RawCanSocket:
 
     def _take(self, count: int, now: int) -> tuple[int, int]:
         batch = self._received
-        # The thread may be held up between two readings of clocks: what they prove of the offset is an interval, and only an
-        # offset outside of it (the clock was set, or drifts) is moved, to its edge.
+        # The thread may be held up between two readings of clocks, so they give only an interval for the offset. The offset is
+        # changed only if it is outside of this interval (the clock was set, or drifts), and then to its edge.
         real, after = time.time_ns(), time.monotonic_ns()
         self._offset_ns = min(max(self._offset_ns, real - after), real - now)
-        # A sender's own stamp is of the monotonic clock, which nobody sets.
+        # A sender's own stamp is of the monotonic clock, which is never set.
         earliest = self._latest_ns if self._stamped else max(self._latest_ns, self._looked_ns - _IN_TRANSIT_NS)
         return _from_kernel(
             batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, earliest, now, self._frames
         )
 
     def send(self, frames: np.ndarray) -> None:
-        """Hand FRAME records to the kernel without waiting; what it does not take is counted, not retried, because an
-        estimate that waits in a queue is worse than the next one."""
+        """Hand FRAME records to the kernel without waiting. Frames that it does not accept are counted and not retried,
+        because the next estimate is better than one that has waited in a queue."""
         for first in range(0, len(frames), _CAPACITY):
             batch = frames[first : first + _CAPACITY]
             _to_kernel(batch, time.monotonic_ns(), self._sent.raw)
@@ -213,7 +215,7 @@ class RawCanSocket:
             self.unsent += len(batch) - max(taken, 0)
 
     def _failed(self, code: int) -> None:
-        """Remember what an error says of the interface. Raises OSError if it is none that passes by itself."""
+        """Note what an error means for the interface. Raises OSError if the error is not one that passes by itself."""
         if code in _INTERFACE_GONE:
             self.down = True
             if self._reopen_ns is None:
@@ -225,7 +227,7 @@ class RawCanSocket:
             raise OSError(code, os.strerror(code))
 
     def _rebind(self, now_ns: int) -> None:
-        """A socket stays bound to an interface that is deleted; one of the same name needs another."""
+        """Open another socket: the old one stays bound to the deleted interface, even if one of the same name is added."""
         self._reopen_ns = None
         if self._reopen is not None:
             try:
@@ -279,7 +281,7 @@ def _bound_socket(channel: str, ids: list[int], receive_buffer: int) -> socket.s
 
 
 def connected_sockets() -> tuple[socket.socket, socket.socket]:
-    """What carries the frames of a bus with two ends on one machine."""
+    """Two connected sockets that carry the frames of a bus with two ends on one machine."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for end in ends:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)

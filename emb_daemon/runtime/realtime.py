@@ -11,7 +11,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 def lock_memory() -> str:
     libc = ctypes.CDLL(None, use_errno=True)
-    # On fault: what is mapped and never touched, such as the stacks of helper threads, need not be resident.
+    # MCL_ONFAULT: memory that is mapped but never touched, such as stacks of helper threads, need not be resident.
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         return f"memory not locked: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)"
     return "memory locked"
@@ -19,7 +19,7 @@ def lock_memory() -> str:
 
 def use_fifo(priority: int) -> str:
     try:
-        # The calling thread alone: those that it starts, to read or write a file, get the ordinary scheduler.
+        # For the calling thread only: threads that it starts, to read or write a file, get the ordinary scheduler.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"ordinary scheduling: SCHED_FIFO {priority} refused: {error.strerror} (raise LimitRTPRIO)"
@@ -35,11 +35,11 @@ def pin(cpu: int) -> str:
 
 
 def settle_memory() -> None:
-    """Move everything alive out of the collector's sight: a full collection takes ten periods, so none may run later."""
+    """Exclude all live objects from garbage collection: a full collection takes ten periods, so none may run later."""
     gc.collect()
     gc.freeze()
     gc.disable()
-    # A helper thread that parses a calibration gives way to the loop within this time.
+    # A helper thread that parses a calibration releases the interpreter to the loop within this time.
     sys.setswitchinterval(0.0002)
 
 

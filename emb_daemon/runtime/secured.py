@@ -1,4 +1,4 @@
-"""A bus on which only authentic frames are heard and every frame is authenticated, and what of that outlives a restart."""
+"""A bus that passes on only authentic frames and authenticates sent ones, and the counters that must survive a restart."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -17,20 +17,20 @@ from emb_daemon.wire.keys import cmac
 from emb_daemon.wire.secoc import LAST_TRIP, Link, Signer, Verifier
 
 _FORMAT = 1
-#: Reset counters that a sender may be ahead of what is kept of it: what can be played back to a daemon that was killed, 45 s
-#: of a corner's frames. To keep each would be a write a second to a flash memory.
+#: Reset counters that a sender may be ahead of the stored one. Frames of this time, 45 s of a corner's, can be played back to
+#: a daemon that was killed. Storing every reset counter would write to flash memory once a second.
 _RESETS_NOT_KEPT = 64
 
 
 class Freshness(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a process must not forget: its own trip counter, and (trip, reset) up to which it has heard others, by link."""
+    """What must survive a restart: the process's own trip counter, and the last (trip, reset) received, by link."""
 
     format: int = _FORMAT
     trip: Annotated[int, Meta(ge=0, le=LAST_TRIP)] = 0
     heard: dict[str, tuple[int, int]] = {}
 
     def next_trip(self) -> "Freshness":
-        """Of the process that starts now."""
+        """Trip counter of the process that starts now."""
         return msgspec.structs.replace(self, trip=self.trip + 1)
 
 
@@ -41,7 +41,7 @@ class FreshnessFile:
         self.path = Path(folder) / "freshness.json"
 
     def load(self) -> Freshness:
-        """What is kept; nothing if there is no file or a damaged one, which is set aside: old messages are then new."""
+        """The stored values; none without a file. A damaged file is set aside. Without values old messages are accepted."""
         try:
             return files.decode(files.read(self.path), Freshness, _FORMAT)
         except FileNotFoundError:
@@ -53,38 +53,38 @@ class FreshnessFile:
             raise Unavailable(f"{self.path}: not readable: {error.strerror}") from None
 
     def begin_trip(self) -> Freshness:
-        """What is kept, with a trip counter that was never used before.
+        """The stored values, with a trip counter that was never used before.
 
         Raises:
-            Unavailable: it cannot be kept; messages under a used one could be played back.
-            InputError: there is none left.
+            Unavailable: it cannot be stored; messages sent under a counter that is used twice could be played back.
+            InputError: all trip counters are used up.
         """
         kept = self.load()
         if kept.trip >= LAST_TRIP:
-            raise InputError(f"{self.path}: all trip counters are used up; expected new keys, and then no such file")
+            raise InputError(f"{self.path}: all trip counters are used up; install new keys and remove this file")
         begun = kept.next_trip()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             files.write(self.path, begun)
         except OSError as error:
-            raise Unavailable(f"{self.path}: trip counter not kept: {error.strerror}") from None
+            raise Unavailable(f"{self.path}: trip counter cannot be stored: {error.strerror}") from None
         return begun
 
     def keep(self, freshness: Freshness) -> None:
         try:
             files.write(self.path, freshness)
         except OSError as error:
-            log.error("%s: freshness not kept: %s", self.path, error.strerror)
+            log.error("%s: freshness cannot be stored: %s", self.path, error.strerror)
 
 
 class Authentication:
     """Both directions of one process.
 
     Args:
-        received, sent: its links; of one without a key nothing is believed, and nothing authenticated.
+        received, sent: its links. Messages of a link without a key are refused, or sent without authentication.
         keys: by the links' names.
-        kept: its own trip counter, and what it heard before.
-        file: where that is kept; nowhere if it reads logs.
+        kept: the process's own trip counter, and the counters received before.
+        file: where these are stored; None when logs are read.
 
     Attributes:
         keyless: links without a key.
@@ -109,7 +109,7 @@ class Authentication:
         self._writer: threading.Thread | None = None
 
     def stale(self) -> bool:
-        """Whether what is kept lies far behind what was heard."""
+        """Whether the stored counters are far behind those received."""
         for name, (trip, reset) in self._verifier.last().items():
             kept_trip, kept_reset = self._kept.heard.get(name, (0, 0))
             if trip != kept_trip or reset - kept_reset >= _RESETS_NOT_KEPT:
@@ -117,14 +117,14 @@ class Authentication:
         return False
 
     def keep(self) -> None:
-        """Begin to write down what was heard, beside the caller."""
+        """Start to store the received counters, in a thread."""
         if self._file and not (self._writer and self._writer.is_alive()):
             self._kept = msgspec.structs.replace(self._kept, heard=self._kept.heard | self._verifier.last())
             self._writer = threading.Thread(target=self._file.keep, args=(self._kept,), name="freshness")
             self._writer.start()
 
     def close(self) -> None:
-        """Write down what was heard."""
+        """Store the received counters."""
         if self._writer:
             self._writer.join()
         self.keep()
@@ -133,9 +133,9 @@ class Authentication:
 
 
 class SecuredBus:
-    """Any of our buses behind an `Authentication`; the same interface."""
+    """A bus of this package behind an `Authentication`, with the same interface."""
 
-    #: Frames between two looks at what is to be kept.
+    #: Number of frames between two checks of whether the counters must be stored.
     _FRAMES = 4096
 
     def __init__(self, bus, authentication: Authentication):
@@ -166,13 +166,17 @@ def secure(bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]
     """The daemon's end of an authenticated bus, and the corners of which a key is missing.
 
     Raises:
-        InputError: there is no state directory, no trip counter left, or the extra `secoc` is not installed.
-        Unavailable: the trip counter cannot be kept.
+        InputError: no state directory, all trip counters used up, or the extra `secoc` not installed.
+        Unavailable: the trip counter cannot be stored.
     """
     if state is None:
-        raise InputError(f"{setup.path}: secoc: freshness must outlive a restart; expected state_directory as well")
+        raise InputError(f"{setup.path}: secoc: freshness must survive a restart; expected state_directory as well")
     file = FreshnessFile(state)
     authentication = Authentication(*setup.links, setup.keys, file.begin_trip(), file)
     for link in authentication.keyless:
-        log.error("%s: no key %s: nothing under it is believed or authenticated", setup.configuration.secoc.keys, link.name)
+        log.error(
+            "%s: no key %s: its messages are neither accepted nor sent with authentication",
+            setup.configuration.secoc.keys,
+            link.name,
+        )
     return SecuredBus(bus, authentication), {link.corner for link in authentication.keyless} - {""}

@@ -1,6 +1,6 @@
 """The estimates of every tick in memory that another process reads: a ring of rows, and the parameters in use.
 
-The loop copies and waits for nobody; who reads too late loses rows, and is told how many.
+The loop writes without waiting. A reader that is too late loses rows, and gets the number of lost rows.
 """
 
 import hashlib
@@ -14,14 +14,15 @@ from emb_daemon.atomic import write_atomically
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
 from emb_daemon.wire.layout import CORNERS
 
-#: Rows in the ring: two seconds of four corners at 250 Hz, for a reader that runs when nobody else wants to.
+#: Rows in the ring: two seconds of four corners at 250 Hz, enough for a reader of lowest priority.
 ROWS = 2048
-#: The newest of them are read, so that none is written over meanwhile; more are not written before they are counted.
+#: Only the newest half is read, so that the loop does not overwrite rows that are being read. The loop updates the count
+#: after at most a quarter.
 _READABLE, _AT_ONCE = ROWS // 2, ROWS // 4
-#: Ticks after which the parameters of the next corner are told: what adaptation learns is at most a second old.
+#: Ticks between writing the parameters of one corner and of the next: learned values appear within a second.
 _PARAMETERS_TICKS = 50
 
-#: The whole file. ``written`` counts rows since the daemon's start; row ``n`` stands at ``n % ROWS``.
+#: The complete file. ``written`` counts rows since the daemon's start; row ``n`` is at index ``n % ROWS``.
 #: ``on_page`` is not 0 while a corner is estimated with another calibration than its file's (`runtime.pages`).
 SHARED = np.dtype(
     [
@@ -34,7 +35,7 @@ SHARED = np.dtype(
     ],
     align=True,
 )
-#: Of the records above, which writer and reader must agree on.
+#: Version of the records above, on which writer and reader must agree.
 LAYOUT_DIGEST = hashlib.sha256(repr((SHARED.descr, SHARED.itemsize)).encode()).hexdigest()[:16].encode()
 
 
@@ -52,8 +53,8 @@ class SharedEstimates:
     """The loop's side.
 
     Args:
-        path: the file, in a folder that is kept in memory, such as /run: on a disk, the loop would wait for it.
-        pipeline: whose rows and parameters are told.
+        path: the file, in a folder that is kept in memory, such as /run; the loop would have to wait for a disk.
+        pipeline: whose rows and parameters are shared.
     """
 
     def __init__(self, path: Path, pipeline):
@@ -61,7 +62,7 @@ class SharedEstimates:
         content = np.zeros((), SHARED)
         content["layout"], content["parameters"] = LAYOUT_DIGEST, pipeline.parameters
         self.path = path
-        # Under its name only when it is whole; who reads the file of an earlier start keeps that one.
+        # The file gets its name only when it is complete. A reader of an earlier daemon's file keeps that file open.
         write_atomically(path, content.tobytes())
         with open(path, "r+b") as file:
             memory = mmap.mmap(file.fileno(), SHARED.itemsize)
@@ -74,7 +75,7 @@ class SharedEstimates:
         self._count = self._ticks = 0
 
     def write(self, count: int) -> None:
-        """Tell the pipeline's first ``count`` rows."""
+        """Write the pipeline's first ``count`` rows."""
         for start in range(0, count, _AT_ONCE):
             end, place = min(start + _AT_ONCE, count), self._count % ROWS
             middle = min(end, start + ROWS - place)
@@ -83,7 +84,7 @@ class SharedEstimates:
                 if middle < end:
                     ring[: end - middle] = rows[middle:end]
             self._count += end - start
-            # Last: what it counts is there.
+            # Written last, when the rows that it counts are complete.
             self._written[0] = self._count
         self._ticks += 1
         if self._ticks % _PARAMETERS_TICKS == 0:
@@ -91,21 +92,21 @@ class SharedEstimates:
             shared[corner] = used[corner]
 
     def tell_page(self, on_page: bool) -> None:
-        """Tell whether a corner is estimated with another calibration than its file's."""
+        """Write whether a corner is estimated with another calibration than that of its file."""
         self._on_page[0] = on_page
 
     def close(self) -> None:
-        """Take the file away."""
+        """Remove the file."""
         self.path.unlink(missing_ok=True)
 
 
 class EstimatesReader:
-    """The other side, which may start before the daemon and outlive it.
+    """The reader's side, which may start before the daemon and end after it.
 
     Attributes:
-        connected: whether a daemon's file is read.
-        trouble: why the file that is there is not read; empty if it is, or there is none.
-        parameters: PARAMETERS array, shape (4,), as the daemon uses them; zeros before it was heard.
+        connected: whether a daemon's file is being read.
+        trouble: why an existing file is not read; empty if it is read, or if there is none.
+        parameters: PARAMETERS array, shape (4,), as the daemon uses them; zeros before the first file.
     """
 
     def __init__(self, path: Path):
@@ -124,7 +125,7 @@ class EstimatesReader:
         return self._memory is not None and bool(self._on_page[0])
 
     def look(self) -> None:
-        """Find the file of a daemon that has started or started anew; costs a system call."""
+        """Look for the file of a daemon that has started or restarted; costs a system call."""
         try:
             with open(self.path, "rb") as file:
                 status = os.fstat(file.fileno())
@@ -151,12 +152,12 @@ class EstimatesReader:
         """SAMPLE and ESTIMATE rows since the last call, and how many others were lost."""
         if self._memory is None:
             return np.zeros(0, SAMPLE), np.zeros(0, ESTIMATE), 0
-        # A row is taken one look after it was counted: on some machines the count may be seen before what it counts.
+        # A row is read one call after it was counted, because on some machines the count may be visible before the row.
         until, self._seen = self._seen, int(self._written[0])
         start = max(self._taken, self._seen - _READABLE)
         places = np.arange(start, max(until, start)) % ROWS
         samples, estimates = (ring[places] for ring in self._rings)
-        # What the loop may have written over meanwhile is no row.
+        # Rows that the loop may have overwritten meanwhile are discarded.
         torn = min(max(int(self._written[0]) - (ROWS - _AT_ONCE) - start, 0), len(places))
         lost = start - self._taken + torn
         self._taken = start + len(places)

@@ -16,7 +16,7 @@ class ServiceManager:
             self._socket.connect("\0" + address[1:] if address[0] == "@" else address)
             self._socket.setblocking(False)
         ours = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        #: Seconds within which the watchdog wants to hear from us, or None.
+        #: Watchdog's timeout in s, or None.
         self.watchdog_s = int(environment["WATCHDOG_USEC"]) / 1e6 if ours and "WATCHDOG_USEC" in environment else None
 
     def notify(self, *assignments: str) -> None:

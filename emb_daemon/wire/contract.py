@@ -1,8 +1,8 @@
 """The wire contract's codes, words and cycle: what numbers on the bus mean, in one place.
 
-Ids, bit positions, scales and ranges stand in the DBC alone and are read from it (`wire.layout`). What stands here too is
-what compiled code (`emb_daemon.jit`) freezes and what programs call by name; `wire.layout.load_layout` refuses a DBC with
-another cycle, and tests hold the shipped DBC's value names to the words here.
+Ids, bit positions, scales and ranges are defined in the DBC alone and read from it (`wire.layout`). Repeated here are the
+constants that compiled code (`emb_daemon.jit`) contains and that programs use by name; `wire.layout.load_layout` refuses a DBC
+with another cycle, and a test compares the shipped DBC's value names with the words here.
 """
 
 #: Cycle of the resolver's and the current's messages, and of the clamp force.
@@ -13,7 +13,7 @@ CYCLE_S = 0.004
 STATUS_OK, STATUS_DEGRADED, STATUS_FAULT, STATUS_NOT_AVAILABLE = 0, 1, 2, 15
 STATUSES = {STATUS_OK: "ok", STATUS_DEGRADED: "degraded", STATUS_FAULT: "fault", STATUS_NOT_AVAILABLE: "not available"}
 
-#: What the clamp force rests on (ForceSource).
+#: Source of the clamp force (ForceSource).
 FUSED, STIFFNESS_ONLY, TORQUE_ONLY, PREDICTED, INVALID = 0, 1, 2, 3, 15
 SOURCES = {FUSED: "fused", STIFFNESS_ONLY: "stiffness", TORQUE_ONLY: "torque", PREDICTED: "predicted", INVALID: "invalid"}
 
@@ -21,7 +21,7 @@ SOURCES = {FUSED: "fused", STIFFNESS_ONLY: "stiffness", TORQUE_ONLY: "torque", P
 INIT, RUNNING, ADAPTING, DEGRADED, FAULT = range(5)
 MODES = ("init", "running", "adapting", "degraded", "fault")
 
-#: What is asked of the brake controller, and how the last training ended (EMB_c_AdaptRequest).
+#: Request to the brake controller, and result of the last training (EMB_c_AdaptRequest).
 REQUEST_NONE, REQUEST_RUN, REQUEST_ABORT = range(3)
 REQUESTS = ("none", "run", "abort")
 NO_RESULT, RESULT_ACCEPTED, RESULT_REJECTED, RESULT_ABORTED = range(4)
@@ -50,8 +50,8 @@ BUS_DISTURBED = 1 << 12
 DEADLINE_MISSED = 1 << 13
 OUTSIDE_RANGE = 1 << 14
 SECOND_SENDER = 1 << 15
-#: Beyond what DegradedReasons has room for: two senders contradict each other on the resolver or the current, or the key that
-#: would prove whose they are is missing. Mode and Status say Fault, and E2E_ERROR goes with it.
+#: A bit without room in DegradedReasons: two senders contradict each other on the resolver or the current, or the key that
+#: would show who sent them is missing. Mode and Status are Fault, and E2E_ERROR is set as well.
 CONTESTED = 1 << 16
 REASONS = (
     "resolver lost", "current lost", "thermocouple lost", "wheel speed lost", "wheel pulse lost", "vehicle status lost",

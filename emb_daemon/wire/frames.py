@@ -7,7 +7,7 @@ import numpy as np
 FRAME = np.dtype([("time_ns", "i8"), ("data", "u8"), ("can_id", "u4"), ("length", "u1"), ("flags", "u1")], align=True)
 
 EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
-#: Set by `wire.secoc` alone: authentication was asked for, and this frame has none.
+#: Set by `wire.secoc` only: authentication is required, and this frame has none.
 UNAUTHENTIC = 16
 
 

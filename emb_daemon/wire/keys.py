@@ -1,4 +1,4 @@
-"""Keys of authenticated communication: a file that nobody else may read, and what is made of it."""
+"""Keys of authenticated communication: a file that only its owner may read, and the CMACs made of its keys."""
 
 import os
 import re
@@ -15,7 +15,7 @@ _EXAMPLE = "expected a name and 32 hexadecimal digits, such as EMB_FL_Auth 00112
 
 
 def key_file(name: str, relative_to: Path, environment: Mapping[str, str] = os.environ) -> Path:
-    """Where keys are: the systemd credential of that name (``LoadCredential=``), or else a file."""
+    """Path of the key file: the systemd credential of that name (``LoadCredential=``) if there is one, else the file."""
     folder = environment.get("CREDENTIALS_DIRECTORY")
     if folder and (credential := Path(folder, name)).parent == Path(folder) and credential.exists():
         return credential
@@ -26,7 +26,7 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
     """Keys of 16 bytes by name: a line each, ``#`` begins a comment.
 
     Raises:
-        InputErrors: not readable, readable by others, or not such a file; every line that is wrong. No key is ever told.
+        InputErrors: not readable, readable by others, or not a key file; every wrong line. Keys never appear in messages.
     """
     try:
         text, status = read_input(path, _MOST_BYTES).decode(), path.stat()
@@ -37,7 +37,7 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
     if status.st_mode & (0o037 if credential else 0o077):
         raise InputError(f"{path}: mode {stat.S_IMODE(status.st_mode):o}: others may read or change it; expected 600 or 400")
     if status.st_uid not in (0, os.geteuid()):
-        raise InputError(f"{path}: belongs to somebody else")
+        raise InputError(f"{path}: belongs to another user")
     keys, faults = {}, []
     for number, line in enumerate(text.splitlines(), 1):
         if not (line := line.partition("#")[0].strip()):
@@ -45,9 +45,11 @@ def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[s
         if not (match := _LINE.fullmatch(line)):
             faults.append(f"{path}:{number}: {_EXAMPLE}")
         elif match[1] in keys:
-            faults.append(f"{path}:{number}: {match[1]}: stands there twice")
+            faults.append(f"{path}:{number}: {match[1]}: occurs twice")
         elif (key := bytes.fromhex(match[2])) in keys.values():
-            faults.append(f"{path}:{number}: {match[1]}: another has the same key; expected one for each sender and receiver")
+            faults.append(
+                f"{path}:{number}: {match[1]}: another name has the same key; expected a different key for each name"
+            )
         else:
             keys[match[1]] = key
     if faults:
@@ -66,7 +68,7 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
         from cryptography.hazmat.primitives.cmac import CMAC
     except ImportError as error:
         raise InputError(f"authentication needs an extra: pip install emb_daemon[secoc] ({error})") from None
-    # Its key schedule is made once: a copy takes 1 µs, a new one 2.5 µs.
+    # The key schedule is made once: a copy takes 1 µs, a new one 2.5 µs.
     keyed = CMAC(AES(key))
 
     def of(message: bytes) -> bytes:

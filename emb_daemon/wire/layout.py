@@ -1,7 +1,7 @@
 """Signal layouts taken from the DBC, as arrays that compiled code can read.
 
-The DBC is the one place that states ids, bit positions, scales and ranges. What the code adds is the meaning: which slot a
-message fills and which signal stands in which column.
+Only the DBC states ids, bit positions, scales and ranges. The code adds the meaning: which slot a message fills and which
+signal is in which column.
 """
 
 from functools import cache
@@ -52,7 +52,7 @@ SENT_SIGNALS = 7
 
 #: Where AUTOSAR E2E profile 1A has its fields: first bit and length.
 _HEADER = {"CRC": (0, 8), "Counter": (8, 4), "Status": (12, 4)}
-#: Messages that the estimator counts its cycles by.
+#: Messages by whose Counter the estimator counts cycles.
 _EVERY_CYCLE = ("_Resolver", "_Current", "_ClampForce")
 
 SIGNAL = np.dtype(
@@ -165,7 +165,7 @@ def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> 
 
 
 def _frame_faults(message) -> list[str]:
-    """Deviations from what a DBC may not choose: classic frames with an E2E header, each at its cycle."""
+    """Deviations from what every DBC must have: classic frames with an E2E header, each at its cycle."""
     faults = []
     if message.frame_id > 0x7FF or message.is_extended_frame or message.length != 8:
         faults.append(f"{message.name}: expected an 11-bit id and 8 bytes")
@@ -184,7 +184,7 @@ def _frame_faults(message) -> list[str]:
 def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
     """The LAYOUT (shape (1,)) of the messages that concern ``corners``, all others being foreign.
 
-    Signals of a DBC of one's own are converted from its units into those of the shipped one.
+    Signals of another DBC are converted from its units into those of the shipped one.
 
     Raises:
         InputErrors: the DBC lacks messages, signals, units or cycle times, or contradicts the contract; every fault is listed.

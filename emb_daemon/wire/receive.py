@@ -1,4 +1,4 @@
-"""Reception: a frame changes the receiver's data wholly or not at all."""
+"""Reception: the receiver takes a frame completely or not at all."""
 
 import numpy as np
 
@@ -8,27 +8,27 @@ from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, UNAUTHENTIC
 from emb_daemon.wire.layout import OURS, SIGNALS, SLOTS, unpack
 
-#: Verdicts on a frame, in the order in which they are tested; whether it is authentic comes first.
+#: Verdicts on a frame, in the order of the tests, except that NOT_AUTHENTIC is tested first.
 ACCEPTED, IGNORED, SECOND_SENDER, BAD_LENGTH, BAD_CRC, BAD_COUNTER, BAD_STATUS, BAD_RANGE, NOT_AUTHENTIC = range(9)
 VERDICTS = ("accepted", "foreign", "second sender", "length", "CRC", "counter", "sender's status", "range", "authentication")
 
-#: Counter steps tolerated after a gap: one frame lost, plus those that the time passed accounts for.
+#: Counter steps tolerated after a gap, in addition to those that the elapsed time explains: one frame lost.
 _TOLERATED_LOSS = 2
-#: Frames over which a sender must have been late throughout before its schedule is believed to be later: at first, and once
-#: it is known. A bus or sender that was held up for less catches up and is not early; clocks that run apart are followed.
+#: Number of frames that must all be late before the sender's schedule is moved later: at first, and once the schedule is
+#: known. A bus or sender that was held up for less catches up, and its frames then do not count as early; a sender's clock
+#: that runs slower than ours is followed.
 _FIRST_WINDOW, _WINDOW = 128, 1024
-#: Cycles behind its schedule from which a sender has a new one: a second of the resolver's, longer than any bus holds it up.
+#: Cycles behind its schedule after which a sender gets a new one: a second of the resolver's, longer than a bus holds it up.
 _NEW_SCHEDULE = 250
 _NEVER = np.iinfo(np.int64).min // 2
 _LONG = np.iinfo(np.int64).max
 
-#: Per slot: ``values``, ``time_ns`` and ``counter`` of the last accepted frame, and whether its sender says that they are
-#: ``degraded``; ``sequence_ns`` and ``sequence`` of the last
-#: frame that stood in sequence, which its sender's schedule had for ``due_ns``; ``later_ns`` the least lateness among the
-#: ``seen`` frames of the present ``window``; ``candidate`` the counter of the last frame
-#: that did not stand in sequence, or -1, and ``candidate_ns`` when it came; ``refused_ns`` when a frame was last refused for
-#: its form or sequence; ``range_ns`` when one was last refused for a value out of range; ``data`` of the last frame in
-#: sequence, and ``contested_ns`` when another claimed to be that frame; ``count[verdict]``.
+#: Per slot. Of the last accepted frame: ``values``, ``time_ns``, ``counter``, and whether its sender reported ``degraded``.
+#: Of the last frame in sequence: ``sequence_ns`` and ``sequence`` (time and counter), ``due_ns`` (its time by the schedule),
+#: ``data``. ``later_ns``: least lateness among the ``seen`` frames of the present ``window``. ``candidate`` and
+#: ``candidate_ns``: counter (-1: none) and time of the last frame out of sequence. ``refused_ns``: when a frame was last
+#: refused for its form or sequence; ``range_ns``: for a value out of range; ``contested_ns``: when another frame last claimed
+#: to be the one in sequence. ``count[verdict]``: number of frames.
 RECEPTION = np.dtype(
     [
         ("values", "f8", (SIGNALS,)),
@@ -44,7 +44,7 @@ RECEPTION = np.dtype(
 
 
 def new_reception() -> np.ndarray:
-    """Receivers of all slots, shape (SLOTS,), that have heard nothing."""
+    """Receivers of all slots, shape (SLOTS,), that have not received anything."""
     reception = np.zeros(SLOTS, RECEPTION)
     for field in ("time_ns", "sequence_ns", "due_ns", "candidate_ns", "refused_ns", "range_ns", "contested_ns"):
         reception[field] = _NEVER
@@ -55,12 +55,13 @@ def new_reception() -> np.ndarray:
 
 @njit
 def _in_sequence(counter, time_ns, reception, cycle_ns):
-    """Whether a counter follows the last one, and no sooner than its sender can have sent it.
+    """Whether a counter follows the last one, and not earlier than its sender can have sent it.
 
-    Time passed explains lost frames; a counter that stands still or runs ahead of the clock is a repetition, or sent by
-    somebody else. So is one that comes half a cycle before its time: a bus holds frames up, and they may then come in a
-    burst, but none comes early. Two frames that follow each other after half a cycle or more, with none in sequence between
-    them, are a sender that has started anew. After a whole turn of silence the counter may stand where it stood.
+    The elapsed time explains lost frames. A counter that repeats or runs ahead of the clock is a repeated frame, or comes from
+    another sender. So does a frame that comes half a cycle before its time: a bus delays frames, which may then come in a
+    burst, but never makes them early. Two frames out of sequence that follow each other after half a cycle or more, with no
+    frame in sequence between them, come from a sender that has restarted. After a silence of one turn of the counter, the
+    counter may be the same as before.
     """
     if reception.sequence < 0:
         return _start_schedule(counter, time_ns, reception, cycle_ns)
@@ -87,10 +88,10 @@ def _in_sequence(counter, time_ns, reception, cycle_ns):
 
 @njit
 def _start_schedule(counter, time_ns, reception, cycle_ns):
-    """Take this frame for the first of its sender's schedule; always True.
+    """Begin the sender's schedule with this frame; always True.
 
-    One frame tells little of a schedule: it may itself be the first of a burst that was held up, so how early others may come
-    is left open for a turn of the counter, until a first window has shown it.
+    A single frame does not determine a schedule, because it may be the first of a delayed burst. The schedule therefore begins
+    one turn of the counter earlier, which allows frames to come earlier by that much, until the first window has shown it.
     """
     reception.sequence = counter
     reception.sequence_ns = time_ns
@@ -102,7 +103,7 @@ def _start_schedule(counter, time_ns, reception, cycle_ns):
 
 @njit
 def _follow_schedule(due, time_ns, reception):
-    """A frame that comes sooner than the schedule moves it at once, one that comes later only with a whole window of them."""
+    """A frame before its time moves the schedule at once. Late frames move it only when all of a window are late."""
     reception.due_ns = min(due, time_ns)
     reception.later_ns = min(reception.later_ns, time_ns - reception.due_ns)
     reception.seen += 1
@@ -114,8 +115,8 @@ def _follow_schedule(due, time_ns, reception):
 
 @njit
 def _contests(frame, reception, cycle_ns):
-    """Whether a frame claims to be the last one in sequence and says something else. No sender does that: there are two, and
-    which of them is genuine nobody can tell."""
+    """Whether a frame has the counter of the last one in sequence but other content. One sender never does that, so there are
+    two, and the receiver cannot know which is genuine."""
     same = np.int64(counter_of(frame.data)) == reception.sequence and frame.time_ns - reception.sequence_ns < cycle_ns
     return same and (np.uint64(frame.data) >> np.uint64(12)) != (reception.data >> np.uint64(12))
 
@@ -147,9 +148,9 @@ def _verdict(frame, slot, reception, layout):
 
 @njit
 def receive(frame, receptions, layout):
-    """Judge one FRAME record and, if it is accepted, take its signals.
+    """Check one FRAME record and, if it is accepted, store its signals.
 
-    Returns (slot, verdict); the slot is negative for a frame that is none of ours.
+    Returns (slot, verdict); the slot is negative for a frame that the daemon does not receive.
     """
     if frame.flags & (EXTENDED | REMOTE | ERROR | FD) or frame.can_id > 2047:
         return -1, IGNORED

@@ -1,6 +1,6 @@
-"""Secure onboard communication: whose a message is, and that it is no old one.
+"""Secure onboard communication: proves who sent a message, and that it is not an old one played back.
 
-AUTOSAR SecOC in the shape of its profile 1 (AES-128-CMAC, truncated; 8 bits of freshness on the wire), as a secured PDU
+AUTOSAR SecOC in the form of its profile 1 (AES-128-CMAC, truncated; 8 bits of freshness on the wire), as a secured PDU
 collection with message linking, because resolver and current leave no room in their frames: an authentication frame follows
 each *set* of messages, shares their Counter, and carries the first 36 bits of the CMAC over
 
@@ -8,13 +8,13 @@ each *set* of messages, shares their Counter, and carries the first 36 bits of t
     payloads of the set (8 bytes each)
     freshness value (56 bits: trip counter, reset counter, message counter)
 
-most significant byte first. The message counter, 8 bits long, is on the wire; when it is used up the reset counter goes on,
-and a freshness frame says so, itself authenticated with message counter 0. A sender's trip counter goes on with each of its
-starts. So no freshness value comes twice under one key, and a receiver that missed frames, however many, is in step again
-with the next freshness frame. Source: AUTOSAR CP R22-11, SWS SecureOnboardCommunication: profile 1, secured PDU collection,
-freshness management.
+most significant byte first. The message counter, 8 bits long, is on the wire. When it has reached its end, the sender
+increments the reset counter and sends a freshness frame, which is itself authenticated with message counter 0. A sender
+increments its trip counter at each start. Therefore no freshness value occurs twice under one key, and a receiver that missed
+frames, however many, is in step again with the next freshness frame. Source: AUTOSAR CP R22-11, SWS
+SecureOnboardCommunication: profile 1, secured PDU collection, freshness management.
 
-The CMAC is passed in; nothing here knows keys or a cryptographic library.
+The CMAC is passed in; this module uses neither keys nor a cryptographic library.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -36,23 +36,23 @@ from emb_daemon.wire.layout import CORNERS, load_database
 #: The 16 bytes of a message's AES-128-CMAC, under one sender's key.
 Mac = Callable[[bytes], bytes]
 
-#: The set that the freshness frame alone makes.
+#: Number of the set that consists of the freshness frame alone.
 FRESHNESS_SET = 15
-#: The largest message, trip and reset counters. A reset takes 0.7 s of a corner's frames: a trip lasts 130 days, and then
-#: nothing is authenticated until the next start.
+#: The largest message, trip and reset counters. One value of the reset counter lasts 0.7 s of a corner's frames. A trip can
+#: therefore last 130 days; after that nothing is authenticated until the next start.
 LAST_MESSAGE, LAST_TRIP, LAST_RESET = 0xFF, 0xFF_FFFF, 0xFF_FFFF
 _TAG_BITS = 36
 #: Payloads of a set, as on the wire.
 _ONE, _TWO = Struct("<Q"), Struct("<QQ")
-#: With a Counter that no message has.
+#: A Counter that no message has.
 _NO_PAYLOAD = 0xF00
-#: Flags of a frame of ours whose CRC is still missing.
+#: Flag of a frame to be sent whose CRC is not yet computed.
 _BARE = 255
-#: A frame waits so long for its authentication: eight cycles, as a bus that was held up delivers; more frames of one message
-#: than that are a flood.
+#: Time for which a frame is held until its authentication arrives: eight cycles, which covers the burst of a delayed bus. If
+#: more than eight frames of one message are waiting, this is a flood.
 _HELD_NS, _MOST_HELD = 8 * CYCLE_NS, 8
-#: CMACs that one sender's frames may cost in one cycle: a flood of authentication frames must not keep the loop from its work.
-#: A sender that is alone on the bus needs one for each set, three at most.
+#: Largest number of CMACs that are computed for one sender in one cycle, so that a flood of authentication frames cannot hold
+#: up the loop. Without an attack a sender needs one CMAC for each set, at most three in a cycle.
 _MOST_TRIES = 32
 
 #: Messages that a sender authenticates, set by set, by the name of its authentication message.
@@ -71,10 +71,10 @@ _FRESHNESS = {"Counter": (8, 4), "TripCounter": (16, 24), "ResetCounter": (40, 2
 
 
 class Link(NamedTuple):
-    """What one sender authenticates for one receiver, under one key of its own.
+    """The messages that one sender authenticates for one receiver, under a key of their own.
 
-    ``name`` is that of the authentication message, and of the key; ``corner`` is empty for the vehicle's; ``sets`` are CAN ids
-    of the messages of each set.
+    ``name`` is the name of the authentication message and of the key; ``corner`` is empty for the vehicle; ``sets`` are the
+    CAN ids of the messages of each set.
     """
 
     name: str
@@ -120,7 +120,7 @@ def load_links(path: Path | None = None, corners: Iterable[str] = CORNERS) -> tu
 
 
 def freshness_value(trip: int, reset: int, message: int) -> bytes:
-    """The 56 bits that no two authentications under one key share."""
+    """The 56 bits that are different for each authentication under one key."""
     return (trip << 32 | reset << 8 | message).to_bytes(7, "big")
 
 
@@ -136,7 +136,7 @@ def _data_id(link: Link, which: int) -> int:
 
 @entry(Array(FRAME), int)
 def _protect(frames, count):
-    """CRCs of those of ``frames[:count]`` that are marked as without one."""
+    """Fill in the CRCs of those of ``frames[:count]`` that are marked as lacking it."""
     for index in range(count):
         frame = frames[index]
         if frame.flags == _BARE:
@@ -145,7 +145,7 @@ def _protect(frames, count):
 
 
 class _Outgoing:
-    """One link's sender: its counters, and payloads of sets that are not complete."""
+    """Sender's side of one link: its counters, and payloads of sets that are not yet complete."""
 
     def __init__(self, link: Link, mac: Mac):
         self.link, self.mac = link, mac
@@ -157,9 +157,9 @@ class Signer:
     """Puts authentication frames among the frames that a process sends.
 
     Args:
-        links: of which it is the sender; one without a key is not authenticated.
+        links: those of which the process is the sender; messages of a link without a key are sent without authentication.
         macs: by the links' names.
-        trip: its trip counter, one more than at its last start.
+        trip: trip counter of the process, one more than at its last start.
     """
 
     def __init__(self, links: Iterable[Link], macs: Mapping[str, Mac], trip: int):
@@ -171,7 +171,7 @@ class Signer:
                 for which, ids in enumerate(link.sets):
                     self._places |= {can_id: (outgoing, which, position) for position, can_id in enumerate(ids)}
         self._frames, self._freshness = np.zeros(64, FRAME), np.zeros(1, FRAME)
-        # Compiled now, not when the first frame waits.
+        # Compile now, not when the first frame is waiting.
         _protect(self._frames, 0)
 
     def sign(self, frames: np.ndarray) -> np.ndarray:
@@ -187,7 +187,7 @@ class Signer:
             outgoing, which, position = place
             payloads = outgoing.payloads[which]
             payloads[position] = row[1]
-            # Those of another sample are still to be replaced.
+            # The set is complete when all of its payloads have the same Counter.
             if len(payloads) == 1 or not any((payload ^ row[1]) & 0xF00 for payload in payloads):
                 self._authenticate(outgoing, which, row[0], payloads, signed)
                 payloads[:] = [_NO_PAYLOAD] * len(payloads)
@@ -196,7 +196,7 @@ class Signer:
         return self._frames[: len(signed)]
 
     def _authenticate(self, outgoing: _Outgoing, which: int, time_ns: int, payloads: list[int], signed: list[tuple]) -> None:
-        """Add the frames that follow a set; the CRC of authentication frames is still missing."""
+        """Add the frames that follow a set; `sign` fills in the CRC of authentication frames."""
         if outgoing.message == LAST_MESSAGE:
             if outgoing.reset == LAST_RESET:
                 return
@@ -204,7 +204,7 @@ class Signer:
             outgoing.message = 0
             data = outgoing.reset % COUNTER_MODULO << 8 | self._trip << 16 | outgoing.reset << 40
             self._freshness[0] = (time_ns, data, outgoing.link.freshness_id, 8, _BARE)
-            # Before the others: this CRC is part of what is authenticated.
+            # Its CRC is needed now, because it is part of what is authenticated.
             _protect(self._freshness, 1)
             signed += self._freshness.tolist()
             self._append(outgoing, FRESHNESS_SET, time_ns, [signed[-1][1]], signed)
@@ -219,8 +219,8 @@ class Signer:
 
 
 class _Incoming:
-    """One link's receiver: the last freshness value that was authentic, and frames that wait for their authentication, by set
-    and place in it, as rows of FRAME."""
+    """Receiver's side of one link: the last authentic freshness value, and the frames that wait for their authentication, as
+    rows of FRAME by set and by place in the set."""
 
     def __init__(self, link: Link, mac: Mac | None, last: tuple[int, int]):
         self.link, self.mac = link, mac
@@ -233,21 +233,22 @@ class _Incoming:
 
 
 class Verifier:
-    """Lets authentic frames alone through, before anybody looks at their counters and times.
+    """Passes only authentic frames on, before `receive` looks at their counters and times.
 
-    A frame of a set is held until its authentication comes, and then given on with that one's time: before, nobody could know
-    that it had come. One that none comes for, or a rival with the same Counter, is given on marked UNAUTHENTIC, which
-    `receive` refuses. All depends on the frames and their order alone, so that a log gives what the bus gave.
+    The verifier holds a frame until the authentication of its set arrives. It then passes the frame on with the arrival time
+    of the authentication, because only from then on the frame can be used. A frame without authentication in time, and a frame
+    whose set was completed by another frame of the same Counter, are passed on marked UNAUTHENTIC; `receive` refuses them. The
+    result depends only on the frames and their order, so a recorded log gives the same result as the bus.
 
     Args:
-        links: of which the process is the receiver; of one without a key every frame is refused.
+        links: those of which the process is the receiver; every frame of a link without a key is refused.
         macs: by the links' names.
-        last: (trip, reset) by the links' names, up to which every freshness value was heard.
+        last: (trip, reset) by the links' names: the last ones received, so that only later freshness values are accepted.
     """
 
     def __init__(self, links: Iterable[Link], macs: Mapping[str, Mac], last: Mapping[str, tuple[int, int]]):
         self._incoming = [_Incoming(link, macs.get(link.name), last.get(link.name, (0, 0))) for link in links]
-        #: By CAN id: the link, and where its frames are held; nowhere those that authenticate others.
+        #: By CAN id: the link, and the place where its frames are held; authentication frames are not held.
         self._places: dict[int, tuple[_Incoming, list[tuple] | None]] = {}
         for incoming in self._incoming:
             link = incoming.link
@@ -256,14 +257,14 @@ class Verifier:
             self._places[link.authentication_id] = incoming, None
 
     def last(self) -> dict[str, tuple[int, int]]:
-        """(trip, reset) last heard, by the links' names."""
+        """(trip, reset) last received, by the links' names."""
         return {incoming.link.name: (incoming.trip, incoming.reset) for incoming in self._incoming}
 
     def verify(self, frames: np.ndarray) -> np.ndarray:
-        """The frames (FRAME array) that ``frames``, in order of arrival, and those still held make known."""
+        """The frames (FRAME array) to pass on now: of ``frames``, in order of arrival, and of those held before."""
         known: list[tuple] = []
         for row in frames.tolist():
-            # What is no classic data frame of eight bytes is refused for that.
+            # `receive` refuses what is not a classic data frame of eight bytes.
             place = self._places.get(row[2]) if row[4] == 0 and row[3] == 8 else None
             if place is None:
                 known.append(row)
@@ -279,7 +280,7 @@ class Verifier:
 
 
 def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
-    """Give on the frames that an authentication frame is right about, or a refusal."""
+    """Pass on the frames that an authentication frame proves authentic, or refuse it."""
     time_ns, data = row[:2]
     slots = incoming.held.get(data >> 16 & 15)
     genuine = _authentic(incoming, slots, data, time_ns) if slots else None
@@ -297,18 +298,18 @@ def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
 
 
 def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns: int) -> Sequence[tuple] | None:
-    """Those of the held frames, one of each place of the set, that ``data`` authenticates; moves the link's freshness."""
+    """The held frames that ``data`` authenticates, one for each place of the set; advances the link's freshness."""
     which, message = data >> 16 & 15, data >> 20 & LAST_MESSAGE
     freshness_alone = which == FRESHNESS_SET
     if incoming.mac is None or freshness_alone != (message == 0) or not (freshness_alone or incoming.in_step):
         return None
     if abs(time_ns - incoming.since_ns) >= CYCLE_NS:
         incoming.tries, incoming.since_ns = 0, time_ns
-    # A message counter that does not go on is the next reset's, whose freshness frame was lost.
+    # A message counter that is not larger than the last one belongs to the next reset, whose freshness frame was lost.
     trip, reset = incoming.trip, incoming.reset + (message <= incoming.message)
     choices = [[slot[0] for slot in slots if len(slot) == 1]]
     if len(choices[0]) != len(slots):
-        # The newest first: what was sent with this frame came just before it.
+        # The newest first: the frames of this set arrived just before their authentication.
         choices = product(*[[held for held in slot[::-1] if not (held[1] ^ data) & 0xF00] for slot in slots])
     for frames in choices:
         if freshness_alone:

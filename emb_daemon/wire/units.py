@@ -19,7 +19,7 @@ UNITS = {
     "K": ("degC", 1.0, -273.15), "degF": ("degC", 5.0 / 9.0, -160.0 / 9.0), "°F": ("degC", 5.0 / 9.0, -160.0 / 9.0),
     "m/s": ("m/s", 1.0, 0.0), "km/h": ("m/s", 1.0 / 3.6, 0.0), "kph": ("m/s", 1.0 / 3.6, 0.0), "mph": ("m/s", 0.44704, 0.0),
     "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "daN": ("N", 10.0, 0.0), "lbf": ("N", _POUND, 0.0), "lb": ("N", _POUND, 0.0),
-    # What a load cell calls the mass that would weigh so much.
+    # Load cells state a force as the mass of that weight.
     "kgf": ("N", _GRAVITY, 0.0), "kg": ("N", _GRAVITY, 0.0), "g": ("N", 1e-3 * _GRAVITY, 0.0),
     "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "N·m": ("Nm", 1.0, 0.0), "N.m": ("Nm", 1.0, 0.0),
     "kNm": ("Nm", 1e3, 0.0), "mNm": ("Nm", 1e-3, 0.0), "Nmm": ("Nm", 1e-3, 0.0), "N mm": ("Nm", 1e-3, 0.0),
@@ -29,7 +29,7 @@ UNITS = {
     "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
 }  # fmt: skip
 
-#: Of an axis whose travel is measured, and not its motor.
+#: For an axis whose travel is measured instead of its motor's angle.
 TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", "m/min", "in/s")
 
 

@@ -139,7 +139,9 @@ def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | N
             blocks.append(_block("CHARACTERISTIC", head, "REF_MEMORY_SEGMENT calibration"))
         for name in calibrations:
             members = [f"{name}.page.{key}" for corner, key in written if corner == name]
-            blocks.append(_group(f"{name}.page", "of the files, or of the working page", "REF_CHARACTERISTIC", members))
+            blocks.append(
+                _group(f"{name}.page", "calibration on the page in use: files or working page", "REF_CHARACTERISTIC", members)
+            )
         segment = memory_segment(pages.SEGMENT_ADDRESS, pages.NUMBER_BYTES * len(written))
     file = _FRAME.format(
         name=NAME, about=", ".join(calibrations), version=__version__, address=VERSION_ADDRESS,
