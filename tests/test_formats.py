@@ -229,10 +229,12 @@ def test_a_dbc_of_other_people_may_overlap_and_be_utf8(tmp_path, capsys):
     more = ' SG_ Overlap : 20|16@1+ (1,0) [0|0] "" T\n SG_ Place : 0|16@1+ (1,0) [0|0] "°" T\n'
     broken = _TRUCK_DBC.replace("\nBO_ 2566844926", more + "\nBO_ 2566844926").replace('"rpm"', '"U/min"')
     (tmp_path / "truck.dbc").write_text(broken, encoding="utf-8")
-    mapping = _TRUCK_MAPPING + "  EMB_FL_Resolver.MotorAngle: {signal: EEC1.Place}\n"
-    (tmp_path / "truck.yaml").write_text(mapping)
     speed = Decoder().columns(Mapping(tmp_path / "truck.yaml").read(path), "EMB_FL_Resolver")["MotorSpeed"]
     assert speed[10:-10] == pytest.approx(800.0 * math.pi / 30.0, abs=0.02)
+    mapping = _TRUCK_MAPPING + "  EMB_FL_Resolver.MotorAngle: {signal: EEC1.Place}\n"
+    (tmp_path / "truck.yaml").write_text(mapping)
+    angle = Decoder().columns(Mapping(tmp_path / "truck.yaml").read(path), "EMB_FL_Resolver")["MotorAngle"]
+    assert angle == pytest.approx(math.radians(10.0), abs=1e-3)
     for wrong, said in (("EEC1.EnginSpeed", "did you mean EEC1.EngineSpeed"), ("CCVS1.Breke", "did you mean CCVS1.Brake")):
         (tmp_path / "truck.yaml").write_text(mapping.replace("EEC1.EngineSpeed", wrong))
         assert main(["check", "--mapping", str(tmp_path / "truck.yaml")]) == 2
