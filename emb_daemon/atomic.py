@@ -7,6 +7,16 @@ import tempfile
 from pathlib import Path
 
 
+@contextlib.contextmanager
+def naming(path: Path):
+    """Within it an OSError, as of a full disk, is one of ``path`` and not of a part that is written beside it."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Replace ``path`` by ``content``: a reader, or a kill at any moment, finds the old file or the new one.
 
@@ -16,6 +26,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "expected a regular file or none", str(path))
+    with naming(path):
+        _write_beside(path, content)
+
+
+def _write_beside(path: Path, content: bytes) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -47,8 +47,9 @@ def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     path = tmp_path / "state.json"
     write_atomically(path, b"old")
     monkeypatch.setattr(os, "fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "No space left on device")))
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="No space") as caught:
         write_atomically(path, b"new")
+    assert caught.value.filename == str(path), "the user's file, not a part of it"
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 

@@ -11,8 +11,10 @@ import pytest
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames, read_log
+from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
 
 _THEIR_DBC = """VERSION ""
@@ -169,6 +171,99 @@ def test_a_log_without_the_mapped_frames_is_named(log, tmp_path):
     (tmp_path / "mapping.yaml").write_text(_MAPPING)
     with pytest.raises(InputError, match=r"no value of Actuator\.Position"):
         Mapping(tmp_path / "mapping.yaml").read(log)
+
+
+#: A truck's DBC as it is sold: groups whose sender is 254, anyone.
+_TRUCK_DBC = """VERSION ""
+BU_: T
+BO_ 2364540158 EEC1: 8 T
+ SG_ EngineSpeed : 24|16@1+ (0.125,0) [0|8031.875] "rpm" T
+
+BO_ 2566844926 CCVS1: 8 T
+ SG_ Speed : 8|16@1+ (0.00390625,0) [0|250.996] "km/h" T
+ SG_ Brake : 28|2@1+ (1,0) [0|3] "" T
+"""
+_TRUCK_MAPPING = """format: 1
+dbc: truck.dbc
+signals:
+  EMB_FL_Resolver.MotorSpeed: {signal: EEC1.EngineSpeed}
+  VEH_WheelSpeed.WheelSpeedFL: {signal: CCVS1.Speed, unit: rad/s, scale: 0.5}
+"""
+
+
+def _truck(folder, senders=(0x00,), priority=3) -> str:
+    """A second of a truck's bus: 800 rpm of each sender, and from the middle on a wheel speed that is not available."""
+    (folder / "truck.dbc").write_text(_TRUCK_DBC)
+    (folder / "truck.yaml").write_text(_TRUCK_MAPPING)
+    lines = []
+    for tick in range(100):
+        stamp, speed = f"({tick / 100:.6f}) can0", "000A" if tick < 50 else "FFFF"
+        lines += [f"{stamp} {(priority << 26) | 0xF00400 | sender:08X}#0A00FF0019FFFFFF" for sender in senders]
+        lines.append(f"{stamp} 18FEF131#FF{speed}FFFFFFFFFF")
+    (folder / "truck.log").write_text("\n".join(lines) + "\n")
+    return str(folder / "truck.log")
+
+
+@pytest.mark.parametrize("priority", [3, 6])
+def test_a_j1939_group_is_read_whoever_sends_it(tmp_path, priority):
+    """SAE J1939-21: priority and sender are no part of what a frame means; J1939-71: 0xFFFF is no speed of 65535."""
+    path = _truck(tmp_path, priority=priority)
+    frames = Mapping(tmp_path / "truck.yaml").read(path)
+    speed = Decoder().columns(frames, "EMB_FL_Resolver")["MotorSpeed"]
+    assert speed[10:-10] == pytest.approx(800.0 * math.pi / 30.0, abs=0.02)
+    wheel = Decoder().columns(frames, "VEH_WheelSpeed")
+    assert wheel["WheelSpeedFL"] == pytest.approx(5.0, abs=0.05)
+    assert 1e-9 * (wheel["time_ns"][-1] - frames["time_ns"][0]) < 0.75, "what is not available is not carried on"
+
+
+def test_a_j1939_group_of_two_senders_is_not_mixed(tmp_path):
+    path = _truck(tmp_path, senders=(0x00, 0x21))
+    with pytest.raises(InputError, match="EEC1 comes from several senders, as 0xcf00400, 0xcf00421"):
+        Mapping(tmp_path / "truck.yaml").read(path)
+    (tmp_path / "truck.dbc").write_text(_TRUCK_DBC.replace("2364540158", str(0x8CF00421)))
+    assert len(Mapping(tmp_path / "truck.yaml").read(path)) > 200
+
+
+def test_a_dbc_of_other_people_may_overlap_and_be_utf8(tmp_path, capsys):
+    path = _truck(tmp_path)
+    more = ' SG_ Overlap : 20|16@1+ (1,0) [0|0] "" T\n SG_ Place : 0|16@1+ (1,0) [0|0] "°" T\n'
+    broken = _TRUCK_DBC.replace("\nBO_ 2566844926", more + "\nBO_ 2566844926").replace('"rpm"', '"U/min"')
+    (tmp_path / "truck.dbc").write_text(broken, encoding="utf-8")
+    speed = Decoder().columns(Mapping(tmp_path / "truck.yaml").read(path), "EMB_FL_Resolver")["MotorSpeed"]
+    assert speed[10:-10] == pytest.approx(800.0 * math.pi / 30.0, abs=0.02)
+    mapping = _TRUCK_MAPPING + "  EMB_FL_Resolver.MotorAngle: {signal: EEC1.Place}\n"
+    (tmp_path / "truck.yaml").write_text(mapping)
+    angle = Decoder().columns(Mapping(tmp_path / "truck.yaml").read(path), "EMB_FL_Resolver")["MotorAngle"]
+    assert angle == pytest.approx(math.radians(10.0), abs=1e-3)
+    for wrong, said in (("EEC1.EnginSpeed", "did you mean EEC1.EngineSpeed"), ("CCVS1.Breke", "did you mean CCVS1.Brake")):
+        (tmp_path / "truck.yaml").write_text(mapping.replace("EEC1.EngineSpeed", wrong))
+        assert main(["check", "--mapping", str(tmp_path / "truck.yaml")]) == 2
+        assert said in capsys.readouterr().err
+    (tmp_path / "truck.yaml").write_text(mapping)
+    (tmp_path / "truck.dbc").write_text(broken.replace('0|16@1+ (1,0) [0|0] "°', '60|16@1+ (1,0) [0|0] "°'), encoding="utf-8")
+    assert main(["check", "--mapping", str(tmp_path / "truck.yaml")]) == 2
+    assert "EEC1.Place: the rig's DBC contradicts itself" in capsys.readouterr().err
+
+
+def test_a_multiplexer_of_an_unknown_number_is_no_value(tmp_path):
+    (tmp_path / "x.dbc").write_text(
+        'VERSION ""\nBU_: T\nBO_ 256 M: 8 T\n SG_ Which M : 0|8@1+ (1,0) [0|0] "" T\n'
+        ' SG_ Angle m1 : 8|16@1+ (0.01,0) [0|0] "rad" T\n'
+    )
+    (tmp_path / "m.yaml").write_text("format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: M.Angle}\n")
+    lines = [f"({0.002 * tick:.6f}) can0 100#{1 + tick % 2:02X}{'D007' if tick % 2 == 0 else 'FFFF'}" for tick in range(200)]
+    (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
+    angle = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Resolver")["MotorAngle"]
+    assert len(angle) > 90 and angle == pytest.approx(20.0, abs=0.01)
+
+
+@pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", ".mf4", ".log"])
+def test_a_log_is_known_by_how_it_begins(log, tmp_path, ending):
+    frames = read_frames(log)[:400]
+    write_frames(tmp_path / f"x{ending}", frames)
+    for name in ("x.txt", "x.csv", "x"):
+        (tmp_path / name).write_bytes((tmp_path / f"x{ending}").read_bytes())
+        assert np.array_equal(read_frames(tmp_path / name)["data"], frames["data"])
 
 
 def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path, monkeypatch):

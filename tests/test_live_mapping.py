@@ -62,6 +62,22 @@ def test_frames_of_another_rig_become_samples_at_our_rate(tmp_path, rate_Hz):
     assert samples["has_status"][100] and not np.isfinite(log.force_N).any(), "the estimator never sees a reference"
 
 
+def test_a_j1939_group_is_heard_of_its_first_sender(tmp_path):
+    """800 rpm of one engine's controller, which another's 900 do not change; 0xFFFF is no speed."""
+    message = 'VERSION ""\nBU_: T\nBO_ 2364540158 EEC1: 8 T\n SG_ EngineSpeed : 24|16@1+ (0.125,0) [0|8031.875] "rpm" T\n'
+    (tmp_path / "truck.dbc").write_text(message)
+    signals = "signals:\n  EMB_FL_Resolver.MotorSpeed: {signal: EEC1.EngineSpeed}\n"
+    (tmp_path / "mapping.yaml").write_text("format: 1\ndbc: truck.dbc\n" + signals)
+    bus, rows = MappedBus(_Silent(), Mapping(tmp_path / "mapping.yaml")), []
+    for tick in range(1, 101):
+        for sender, raw in ((0x00, 6400 if tick % 10 else 0xFFFF), (0x21, 7200)):
+            data = bytes(3) + raw.to_bytes(2, "little") + bytes(3)
+            frame = can.Message(arbitration_id=0xCF00400 | sender, is_extended_id=True, data=data)
+            rows += bus.heard(frame, tick * 10_000_000)
+    samples = log_of(np.array(rows, FRAME)).samples
+    assert len(samples) > 80 and samples["speed"] == pytest.approx(800.0 * np.pi / 30.0, abs=0.03)
+
+
 def test_a_mapping_of_columns_is_no_bus(tmp_path):
     with pytest.raises(InputError, match="expected one with `dbc` for a live bus"):
         MappedBus(_Silent(), Mapping(foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)))

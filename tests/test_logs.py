@@ -14,7 +14,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs import apart, read
 from emb_daemon.logs.candump import format_candump, parse_candump
 from emb_daemon.logs.columns import Decoder, References
-from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.read import read_frames, read_log
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _messages = st.builds(
@@ -119,6 +119,8 @@ def test_a_line_cut_off_at_the_end_is_left_out_with_a_word(tmp_path, capsys):
     path.write_text(_GOOD * 3 + "(2.000000) can0 10")
     assert len(read_frames(path)) == 3
     assert f"{path}: line 4 is cut off" in capsys.readouterr().err
+    path.write_text(path.read_text().rsplit("\n", 1)[0] + "\n(1790")
+    assert len(read_log(path).channels) == 3, "the channel of what is left, too"
 
 
 @pytest.mark.parametrize("name", ["random_6.5mm.log", "a.b.c.log.gz", "plain.log", "UPPER.LOG", "dots...log"])

@@ -50,13 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
         result = identify(campaign, show)
     for fault in campaign.faults:
         print(fault, file=sys.stderr)
-    try:
-        save_calibration(result.calibration, arguments.output)
-        if arguments.report:
-            arguments.report.mkdir(parents=True, exist_ok=True)
-            build(result).write(arguments.report / "report.html")
-    except OSError as error:
-        raise InputError(f"{error.filename or arguments.output}: cannot be written: {error.strerror}") from None
+    save_calibration(result.calibration, arguments.output)
+    if arguments.report:
+        arguments.report.mkdir(parents=True, exist_ok=True)
+        build(result).write(arguments.report / "report.html")
     _print(result.validations, result.thermal.figures)
     print(words(result.attribution))
     missing = [fault for fault in campaign.faults if not fault.startswith("thermal")]
@@ -83,6 +80,8 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     check_output(arguments.output, [arguments.campaign, arguments.mapping])
     if arguments.report and arguments.report.exists() and not arguments.report.is_dir():
         raise InputError(f"{arguments.report}: is a file, expected a folder for the report")
+    if arguments.report and arguments.report.resolve() == arguments.output.resolve():
+        raise InputError(f"{arguments.report}: is the calibration's file, expected a folder for the report")
 
 
 def _print(validations: list, temperatures: dict[str, float]) -> None:

@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        # A file that cannot be used is the user's; a full disk or a device that is gone may be better later.
+        # A file that cannot be used is the user's; what is no file's may be better later.
         print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
     except MemoryError:

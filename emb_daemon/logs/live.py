@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs import j1939
 from emb_daemon.logs.columns import absent_raw
-from emb_daemon.logs.mapping import Mapping, Source
+from emb_daemon.logs.mapping import Mapping, Source, alone
 from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
 from emb_daemon.runtime.bus import PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
@@ -136,26 +137,38 @@ class _Signals:
         mapping.require_frames()
         self.messages = {name: _message(name, mapping) for name in names}
         self._readers: dict[tuple[int, bool], list[tuple]] = {}
+        #: The same of J1939's groups, and who was the first to send one: others' frames of it are of something else.
+        self._groups: dict[int, list[tuple]] = {}
+        self._senders: dict[int, int] = {}
         for our in self.messages.values():
             for value in our.signals.values():
                 if isinstance(value, _Value):
                     source, theirs = value.source, mapping.message_of(value.source)
-                    readers = self._readers.setdefault((theirs.frame_id, theirs.is_extended_frame), [])
-                    readers.append((mapping.channels[source.bus], theirs, source.signal, value))
+                    signal = theirs.get_signal_by_name(source.signal)
+                    reader = (mapping.channels[source.bus], alone(theirs, source.signal), theirs, signal, value)
+                    self._readers.setdefault((theirs.frame_id, theirs.is_extended_frame), []).append(reader)
+                    if j1939.is_group(theirs):
+                        self._groups.setdefault(j1939.group_of(theirs.frame_id), []).append(reader)
 
     def take(self, message, time_ns: int) -> bool:
         """Whether a frame of the rig (python-can Message) holds any of the signals; then they have its values."""
         if message.is_error_frame or message.is_remote_frame:
             return False
-        decoded: dict[int, dict] = {}
-        for channel, theirs, name, value in self._readers.get((message.arbitration_id, message.is_extended_id), ()):
-            if channel is not None and channel != str(message.channel):
-                continue
-            if id(theirs) not in decoded:
-                decoded[id(theirs)] = theirs.decode(bytes(message.data), decode_choices=False, allow_truncated=True)
-            if math.isfinite(raw := float(decoded[id(theirs)].get(name, math.nan))):
+        can_id = message.arbitration_id
+        readers = self._readers.get((can_id, message.is_extended_id), ())
+        if in_group := not readers and bool(self._groups) and message.is_extended_id:
+            group, sender = j1939.group_of(can_id), can_id & j1939.SENDER
+            readers = self._groups.get(group, ())
+            if readers and self._senders.setdefault(group, sender) != sender:
+                return False
+        of_channel = [reader for reader in readers if reader[0] in (None, str(message.channel))]
+        for _, read, theirs, signal, value in of_channel:
+            raw = read(bytes(message.data))
+            if in_group or theirs.protocol == "j1939":
+                raw = float(j1939.known(signal, raw))
+            if math.isfinite(raw):
                 value.take(raw, time_ns)
-        return bool(decoded)
+        return bool(of_channel)
 
 
 def _message(name: str, mapping: Mapping) -> _Message:

@@ -5,7 +5,8 @@ A foreign log has neither our ids nor E2E protection nor our sampling rate; `log
 """
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
@@ -15,8 +16,9 @@ from msgspec import Meta, field
 from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions
-from emb_daemon.logs.read import Recorded, read_log
+from emb_daemon.logs.read import Recorded, ids_in, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
@@ -150,7 +152,7 @@ class Mapping:
         self.path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
-        self.databases = {name: load_database(self.path.parent / bus.dbc) for name, bus in buses.items()}
+        self.databases = {name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()}
         self.channels = {name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()}
         self._ours = our_messages()
         self._faults: list[str] = []
@@ -171,7 +173,7 @@ class Mapping:
             return self._fault(name, "expected Message.Signal of what the daemon receives, such as EMB_FL_Resolver.MotorAngle")
         ours = {signal.name: signal for signal in self._ours[message_name][0].signals}.get(signal_name)
         if ours is None or signal_name in HEADER:
-            return self._fault(name, f"{message_name} has no such signal to map")
+            return self._fault(name, f"{message_name} has no such signal to map; it has {self._signals_of(message_name)}")
         signals = self.messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
@@ -188,7 +190,10 @@ class Mapping:
         try:
             stated = self._their_unit(mapped.bus, mapped.signal)
         except KeyError:
-            return self._fault(name, f"{mapped.signal}: the rig's DBC has no such message and signal")
+            text = f"{mapped.signal}: the rig's DBC has no such message and signal"
+            return self._fault(name, text + self._like(mapped.bus, mapped.signal))
+        if self.databases and (fault := self._misfit(mapped.bus, mapped.signal)):
+            return self._fault(name, f"{mapped.signal}: the rig's DBC contradicts itself: {fault}")
         unit = (stated if mapped.unit is None else mapped.unit).strip()
         if unit in TRAVELS and ours.unit in ("rad", "rad/s"):
             return self._fault(
@@ -205,6 +210,15 @@ class Mapping:
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
         return None
 
+    def _signals_of(self, message: str) -> str:
+        return ", ".join(signal.name for signal in self._ours[message][0].signals if signal.name not in HEADER)
+
+    def _like(self, bus: str | None, signal: str) -> str:
+        """What the rig's DBC has that is called most like it, in words; empty if nothing is."""
+        known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
+        like = get_close_matches(signal, known, 3)
+        return f"; did you mean {' or '.join(like)}?" if like else ""
+
     def _their_unit(self, bus: str | None, signal: str) -> str:
         """Of a signal as the rig describes it, empty if it does not.
 
@@ -213,8 +227,20 @@ class Mapping:
         """
         if not self.databases:
             return ""
-        message, _, name = signal.rpartition(".")
-        return self.databases[bus].get_message_by_name(message).get_signal_by_name(name).unit or ""
+        return self._message(bus, signal).get_signal_by_name(signal.rpartition(".")[2]).unit or ""
+
+    def _misfit(self, bus: str | None, signal: str) -> str:
+        """Why a signal of the rig's cannot be read, empty if it can."""
+        from cantools.database import Error
+
+        try:
+            alone(self._message(bus, signal), signal.rpartition(".")[2])
+        except Error as error:
+            return str(error)
+        return ""
+
+    def _message(self, bus: str | None, signal: str):
+        return self.databases[bus].get_message_by_name(signal.rpartition(".")[0])
 
     def _check_complete(self) -> None:
         """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
@@ -259,7 +285,7 @@ class Mapping:
 
     def message_of(self, source: Source):
         """The rig's message (cantools) that has a signal."""
-        return self.databases[source.bus].get_message_by_name(source.message)
+        return self._message(source.bus, source.name)
 
     def taken(self, layout: np.ndarray) -> list[str]:
         """A fault for each message of the rig's DBC with an id that the daemon of a LAYOUT sends with."""
@@ -306,7 +332,10 @@ class Mapping:
         self._check_rate(path, messages)
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
-            raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed")
+            found = f"; found {ids_in(recorded.frames)}" if self.databases else ""
+            raise InputError(
+                f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
+            )
         return frames, digest
 
     def _check_rate(self, path: Path, messages: dict) -> None:
@@ -340,12 +369,13 @@ class Mapping:
         for (bus, name), signals in by_message.items():
             message = self.databases[bus].get_message_by_name(name)
             rows = self._rows(path, recorded, message, self.channels[bus])
-            decoded = [
-                message.decode(payload, decode_choices=False, allow_truncated=True) for payload in recorded.payloads(rows)
-            ]
-            columns = {
-                signal: np.array([row.get(signal.rpartition(".")[2], np.nan) for row in decoded], float) for signal in signals
-            }
+            in_group = j1939.is_group(message) and not np.any(recorded.frames["can_id"][rows] == message.frame_id)
+            payloads = recorded.payloads(rows)
+            readers = {signal: alone(message, signal.rpartition(".")[2]) for signal in signals}
+            columns = {signal: np.array([read(payload) for payload in payloads]) for signal, read in readers.items()}
+            if in_group or message.protocol == "j1939":
+                parameters = {signal: message.get_signal_by_name(signal.rpartition(".")[2]) for signal in columns}
+                columns = {signal: j1939.known(parameters[signal], values) for signal, values in columns.items()}
             # Parts of a multiplexed message are messages of their own.
             for part in [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]:
                 heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
@@ -358,11 +388,19 @@ class Mapping:
         """Of a message's frames.
 
         Raises:
-            InputError: the log has nothing of the channel, or two channels carry the message and the mapping names none.
+            InputError: the log has nothing of the channel, or two channels or senders carry the message and nothing names one.
         """
         frames = recorded.frames
         flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
-        mine = (frames["can_id"] == message.frame_id) & (flags == EXTENDED * message.is_extended_frame)
+        of_kind = flags == EXTENDED * message.is_extended_frame
+        mine = of_kind & (frames["can_id"] == message.frame_id)
+        if not mine.any() and j1939.is_group(message):
+            mine = of_kind & (j1939.group_of(frames["can_id"]) == j1939.group_of(message.frame_id))
+            if len(senders := np.unique(frames["can_id"][mine])) > 1:
+                raise InputError(
+                    f"{path}: {message.name} comes from several senders, as {', '.join(map(hex, senders.tolist()))}; give "
+                    "it the right one's id in the DBC"
+                )
         channels = recorded.channels
         if channel is not None:
             if channel not in (known := np.unique(channels).tolist()):
@@ -374,6 +412,31 @@ class Mapping:
                 f"name the right one in {self.path} (`buses:`, `channel`)"
             )
         return np.flatnonzero(mine)
+
+
+def alone(message, name: str) -> Callable[[bytes], float]:
+    """What reads one signal of a message (cantools) out of a payload, whatever overlaps with it in other people's DBC files;
+    NaN of a payload that is too short for it, and of one that a multiplexer's number gives to others.
+
+    Raises:
+        cantools.database.Error: the message has no room for it.
+    """
+    from cantools.database import DecodeError
+    from cantools.database.can import Message
+
+    if not message.is_multiplexed():
+        signal = message.get_signal_by_name(name)
+        message = Message(
+            message.frame_id, message.name, message.length, [signal], is_extended_frame=message.is_extended_frame
+        )
+
+    def read(payload: bytes) -> float:
+        try:
+            return float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
+        except DecodeError:
+            return np.nan
+
+    return read
 
 
 def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bool:

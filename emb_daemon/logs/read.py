@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,12 @@ _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".
 _APART = ("BLFReader", "MF4Reader")
 #: Endings of log files, before ``.gz``.
 LOG_ENDINGS = (".log", *_PYTHON_CAN)
+#: What a log begins with, whatever the file is called: its ending.
+_BEGINNINGS = {
+    b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
+}  # fmt: skip
+#: Ids listed of a log where those that were looked for are not in it.
+_LISTED = 8
 
 
 def _most_bytes() -> int:
@@ -111,11 +118,8 @@ def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[
         print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
     elif bad_line:
         raise InputError(f"{path}:{bad_line}: not a candump line, expected '(seconds.fraction) interface id#data'")
-    return (
-        frames,
-        octets,
-        lambda: np.array([line.split(b" ", 2)[1].decode() for line in text.splitlines() if line][: len(frames)]),
-    )
+    lines = islice(filter(None, text.splitlines()), len(frames))
+    return frames, octets, lambda: np.array([line.split(b" ", 2)[1].decode() for line in lines])
 
 
 def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
@@ -129,18 +133,26 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
-        hint = "; a table of signals needs --mapping" if log_ending(path) == ".csv" else ""
+        hint = "; a table of signals needs --mapping of its columns (without dbc)" if log_ending(path) == ".csv" else ""
         text = str(error) or type(error).__name__
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {text}{hint}") from None
     return frames, octets, lambda: channels
+
+
+def ids_in(frames: np.ndarray) -> str:
+    """The most frequent ids of FRAME rows, in words."""
+    found, counts = np.unique(frames["can_id"], return_counts=True)
+    often = found[np.argsort(-counts, kind="stable")]
+    listed = ", ".join(f"{can_id:#x}" for can_id in np.sort(often[:_LISTED]))
+    return f"{listed} and {len(found) - _LISTED} more" if len(found) > _LISTED else listed
 
 
 def read_frames(path: str | Path) -> np.ndarray:
     """All frames of a log as a FRAME array; ``time_ns`` is the log's own clock.
 
     They stand in file order; those of a log whose resolver has another rate than ours are brought to it
-    (`resample.at_our_rate`), with a word on stderr. The format goes by the last ending alone (before ``.gz``), so that names
-    with dots in them are fine.
+    (`resample.at_our_rate`), with a word on stderr. The format goes by how the file begins or, where that tells nothing, by
+    the last ending alone (before ``.gz``), so that names with dots in them are fine.
 
     Raises:
         InputError: missing, damaged, empty or unknown file; names the file and the line where there are lines.
@@ -164,12 +176,12 @@ def read_log(path: str | Path) -> Recorded:
         InputError: as `read_frames`.
     """
     path = Path(path)
-    ending = log_ending(path)
-    if ending not in LOG_ENDINGS:
-        known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
-        raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns")
     raw = read_file(path)
     content = unpack_gzip(path, raw)
+    ending = next((known for beginning, known in _BEGINNINGS.items() if content.startswith(beginning)), log_ending(path))
+    if ending not in LOG_ENDINGS:
+        known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
+        raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
     parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     frames, octets, channels = parsed
     if not len(frames):

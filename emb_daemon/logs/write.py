@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.atomic import write_atomically
-from emb_daemon.errors import InputError
+from emb_daemon.atomic import naming, write_atomically
 from emb_daemon.interface.signals import OUTPUTS
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import DEPTHS_MM, References, latest
@@ -75,7 +74,7 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
         pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(quoting_style="none"))
     else:
         pyarrow.parquet.write_table(table, sink)
-    _write(path, sink.getvalue().to_pybytes())
+    write_atomically(path, sink.getvalue().to_pybytes())
 
 
 def _unit_and_comment(name: str) -> tuple[str, str]:
@@ -106,7 +105,7 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
         signals.append(
             Signal(values, columns["time_s"] - start_s, name=name, unit=unit, comment=comment, conversion=conversion)
         )
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with naming(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
         with MDF(version="4.10") as file:
             file.header.start_time = datetime.datetime.fromtimestamp(start_s, datetime.UTC)
             file.append(signals, acq_name="emb_daemon", comment="estimates of emb_daemon replay", common_timebase=True)
@@ -117,10 +116,10 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
 def write_frames(path: Path, frames: np.ndarray) -> None:
     """A CAN log of FRAME rows, by ending."""
     if path.suffix.lower() == ".log":
-        return _write(path, format_candump(frames).encode())
+        return write_atomically(path, format_candump(frames).encode())
     import can
 
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with naming(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
         # python-can takes every dot in a name for part of the format.
         part = Path(folder) / f"frames{path.suffix.lower()}"
         try:
@@ -138,10 +137,3 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
         except ImportError as error:
             raise needs_extra(path, error) from None
         os.replace(part, path)
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_atomically(path, content)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None

@@ -9,15 +9,13 @@ import numpy as np
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.logs.columns import Decoder, References, crc_is_right
-from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.read import ids_in, read_frames
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.frames import EXTENDED, FRAME
 from emb_daemon.wire.layout import CORNERS
 
 #: Samples that a pipeline takes in one call; a log is collected piece by piece.
 CAPACITY = 1 << 14
-#: Ids that a message about a log lists, the most frequent.
-_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -118,16 +116,12 @@ def _why_empty(frames: np.ndarray, corner: str, resolver_id: int) -> str:
     mine = frames["can_id"] == resolver_id
     if (frames["flags"][mine] & EXTENDED == 0).any():
         return f"no resolver sample of corner {corner} that passes its CRC and counter check"
-    found, counts = np.unique(frames["can_id"], return_counts=True)
     decoder = Decoder()
-    if others := [name for name in CORNERS if decoder.can_id(f"EMB_{name}_Resolver") in found]:
+    if others := [name for name in CORNERS if np.any(frames["can_id"] == decoder.can_id(f"EMB_{name}_Resolver"))]:
         return f"nothing of corner {corner}; it holds {', '.join(others)} (--corner)"
-    often = found[np.argsort(-counts, kind="stable")]
-    listed = ", ".join(f"{can_id:#x}" for can_id in np.sort(often[:_LISTED]))
-    rest = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
     return (
-        f"no frame of id {resolver_id:#x}, the resolver of corner {corner}; found {listed}{rest}; a rig with other ids needs "
-        "a mapping file (--mapping)"
+        f"no frame of id {resolver_id:#x}, the resolver of corner {corner}; found {ids_in(frames)}; a rig with other ids "
+        "needs a mapping file (--mapping)"
     )
 
 

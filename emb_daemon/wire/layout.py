@@ -127,8 +127,11 @@ def signal_columns(database, message: str, names: tuple[str, ...]):
     return columns
 
 
-def load_database(path: Path):
-    """A cantools database: ARXML, KCD or SYM by ending, or a DBC.
+def load_database(path: Path, strict: bool = True):
+    """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252).
+
+    Args:
+        strict: whether signals of a message may neither overlap nor reach beyond it, as those of other people's files do.
 
     Raises:
         InputError: the file cannot be read or is no DBC.
@@ -137,7 +140,14 @@ def load_database(path: Path):
 
     ending = path.suffix.lower()[1:]
     try:
-        return cantools.database.load_file(path, database_format=ending if ending in ("arxml", "kcd", "sym") else "dbc")
+        if ending in ("arxml", "kcd", "sym"):
+            return cantools.database.load_file(path, database_format=ending, strict=strict)
+        content = path.read_bytes()
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("cp1252", errors="replace")
+        return cantools.database.load_string(text, "dbc", strict=strict)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected a DBC") from None
     except Exception as error:
