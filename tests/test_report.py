@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.report.figures import Panel, Trace, decimate, time_figure
+from emb_daemon.report.figures import BAND, Panel, Trace, decimate, time_figure
 from emb_daemon.report.page import FAIL, Cell, Page
 
 
@@ -23,6 +23,16 @@ def test_decimation_keeps_gaps():
     y[4000:6000] = np.nan
     x, few = decimate(np.arange(10_000), y, 100)
     assert np.isnan(few[(x > 4200) & (x < 5800)]).all() and np.isfinite(few[(x < 3800) | (x > 6200)]).all()
+
+
+def test_an_axis_holds_every_error_and_not_the_uncertainty_of_the_first_moments():
+    time_s = np.arange(5000) / 250.0
+    sigma, error = np.full(5000, 40.0), 30.0 * np.sin(time_s)
+    sigma[:40], error[2500] = 15e3, 900.0
+    traces = [Trace("", time_s, -2.0 * sigma, BAND), Trace("two sigma", time_s, 2.0 * sigma, BAND), Trace("", time_s, error)]
+    low, high = time_figure([Panel("error", "N", traces)]).layout.yaxis.range
+    assert -200.0 < low < -80.0
+    assert 900.0 < high < 1200.0
 
 
 def test_page_escapes_what_it_is_given_and_holds_the_library_once(tmp_path):

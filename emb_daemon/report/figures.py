@@ -15,6 +15,8 @@ GRID = "#e6e9ee"
 SCREEN_POINTS = 3000
 #: Samples of a figure's traces that the page holds beside them, to be shown where one zooms: six megabytes.
 DETAIL_SAMPLES = 1_000_000
+#: Quantiles of a band's edges that an axis reaches to: the widest hundredth is of a start.
+_IN_BAND = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,26 @@ def _draw(figure, row: int, panel: Panel, shown: set[str], detail: "_Detail | No
         if not opens_band:
             shown.add(trace.name)
         band_open = opens_band
-    figure.update_yaxes(title_text=panel.unit, row=row, col=1)
+    figure.update_yaxes(title_text=panel.unit, range=_extent(panel), row=row, col=1)
+
+
+def _extent(panel: Panel) -> list[float] | None:
+    """Range of a panel's axis if it has a band: all of its lines, and the band but for its widest samples; else plotly's.
+
+    Before the contact angle is known, a standard deviation reaches to the largest force, and would leave of everything after
+    it a straight line."""
+    if not any(trace.style is BAND for trace in panel.traces):
+        return None
+    edges = []
+    for trace in panel.traces:
+        y = np.asarray(trace.y, dtype=float)
+        y = y[np.isfinite(y)]
+        if len(y):
+            edges += [*np.quantile(y, _IN_BAND)] if trace.style is BAND else [y.min(), y.max()]
+    if not edges:
+        return None
+    margin = 0.05 * (max(edges) - min(edges)) or 1.0
+    return [float(min(edges) - margin), float(max(edges) + margin)]
 
 
 class _Detail:
