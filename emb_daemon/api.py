@@ -1,4 +1,4 @@
-"""The estimator for Python programs: over logs, and inside somebody else's control loop.
+"""The estimator for Python programs: over logs, and inside a control loop of your own.
 
 import emb_daemon
 
@@ -31,8 +31,8 @@ _NAN = float("nan")
 
 
 class Answer(NamedTuple):
-    """One estimate: force and its standard deviation in N, what they rest on, pad temperatures in degC (NaN before they are
-    known), and why not to trust them."""
+    """One estimate: force and its standard deviation in N, source and mode, pad temperatures in degC (NaN before they are
+    known), and the reasons not to trust it."""
 
     force_N: float
     sigma_N: float
@@ -50,7 +50,7 @@ class Answer(NamedTuple):
 
 
 def shipped_calibration() -> Calibration:
-    """The calibration that comes with the package: of a simulated rig, for trying things out."""
+    """The calibration that ships with the package: that of a simulated rig, for first experiments."""
     return load_calibration(resource("config/calibration.yaml"))
 
 
@@ -58,7 +58,7 @@ def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.nda
     """Estimates of a log as the daemon would have made them, one row per resolver sample.
 
     Args:
-        calibration: or a file's path; None takes `shipped_calibration`.
+        calibration: a calibration or the path of a file; None: `shipped_calibration`.
 
     Returns:
         Structured array (`estimator.records.ESTIMATE`), shape (samples,): ``force``, ``sigma``, ``stiffness_force``,
@@ -73,15 +73,15 @@ def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.nda
 
 
 def table(log: Log, estimates: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns by name, with units in the names: what `replay` writes, and what the log's reference instruments measured.
+    """Columns by name, with units in the names: the columns that `replay` writes, and the log's reference signals.
 
-    ``pandas.DataFrame(table(...))``, ``polars.DataFrame(table(...))`` and ``pyarrow.table(table(...))`` take it as it is.
+    ``pandas.DataFrame(table(...))``, ``polars.DataFrame(table(...))`` and ``pyarrow.table(table(...))`` accept it.
 
     Args:
         estimates: of `run`, shape (samples,).
 
     Raises:
-        InputError: the estimates are of another log.
+        InputError: the estimates belong to another log.
     """
     if len(estimates) != len(log.samples):
         raise InputError(f"estimates: expected {len(log.samples)}, one for each sample of {log.path}, found {len(estimates)}")
@@ -114,24 +114,24 @@ def log_of_arrays(
     corner: str = "FL",
     **columns: np.ndarray | float,
 ) -> Log:
-    """Measurements of any sampling rate as a log for `run`, brought to the daemon's rate as a mapping file's are.
+    """Measurements of any sampling rate as a log for `run`, resampled to the daemon's rate as with a mapping file.
 
     Args:
-        time_s: of each sample, shape (n,). What was recorded twice is left out, and stamps that come in bunches are spread
-            evenly, as of a file; both are said on stderr.
-        angle_rad: motor angle, multi-turn, any zero; without one it is the speed added up.
-        speed_rad_per_s: motor speed; without one it is the angle's change.
+        time_s: of each sample, shape (n,). Samples that were recorded twice are left out, and stamps that come in bunches are
+            spread evenly, as for a file; a note on stderr says so.
+        angle_rad: motor angle, multi-turn, any zero; if None, the integral of the speed.
+        speed_rad_per_s: motor speed; if None, the derivative of the angle.
         current_A: torque-producing current; None if it was not measured.
-        current_mean_s: time before its sample over which the current is a mean; None is the sampling period, 0 a current of
-            the moment.
-        ambient_C: as in `Estimator.step`; the park brake is taken to be released.
+        current_mean_s: time before its sample over which the current is a mean; None: the sampling period; 0: the current is
+            instantaneous.
+        ambient_C: as in `Estimator.step`; the park brake counts as released.
         columns: ``inner_backplate_C``, ``outer_backplate_C``, ``caliper_C``, ``wheel_speed_rad_per_s``, ``wheel_pulse``, and
             of reference instruments ``force_N``, ``brake_torque_Nm``; arrays of shape (n,), with NaN where nothing was
-            measured, or constants. One backing plate stands for both.
+            measured, or constants. If only one backing plate is given, it is used for both.
 
     Raises:
         InputError: neither angle nor speed, an unknown column, another number of values than times, no backing plate, times
-            that go back by more than a second, do not pass, or are no numbers.
+            that go back by more than a second, are all the same, or are not numbers.
     """
     corner_index(corner)
     columns |= {"angle_rad": angle_rad, "speed_rad_per_s": speed_rad_per_s, "current_A": current_A}
@@ -156,7 +156,7 @@ def log_of_arrays(
 
 
 def _in_time(time_s: np.ndarray, columns: dict) -> tuple[np.ndarray, np.ndarray]:
-    """`in_time` of times in s and of what was measured at them."""
+    """`in_time` of times in s and of the values measured at them."""
     measured = {name: np.asarray(values, float) for name, values in columns.items() if values is not None and np.ndim(values)}
     for name, values in measured.items():
         if values.shape != time_s.shape:
@@ -181,8 +181,8 @@ def _finite(value: float | None) -> float | None:
 class Estimator:
     """One corner's estimator, for a program that has its own bus, clock or simulation.
 
-    It is the daemon's: the same inputs give the same answers. Calls after the first take some microseconds; the first
-    compiles, or loads from the cache.
+    It is the daemon's estimator: the same inputs give the same estimates. The first call compiles, or loads from the cache;
+    later calls take some microseconds.
     """
 
     def __init__(self, calibration: Calibration | str | Path | None = None):
@@ -194,7 +194,7 @@ class Estimator:
         self._sample["brake_torque"] = np.nan
 
     def reset(self) -> None:
-        """Forget everything: the next call is the first."""
+        """Return to the initial state: the next call counts as the first."""
         self._state = new_state()
 
     def step(
@@ -211,22 +211,22 @@ class Estimator:
         wheel_pulse: float | None = None,
         vehicle_speed_m_per_s: float = 0.0,
     ) -> Answer:
-        """Take one sample and answer it.
+        """Take one sample and return its estimate.
 
         Args:
-            angle_rad: motor angle, multi-turn, any zero; the pads are released and the motor stands for the first 0.1 s, or
-                the contact counts as unknown until both are seen.
-            speed_rad_per_s: motor speed, both at the sample.
+            angle_rad: motor angle at the sample, multi-turn, any zero. For the first 0.1 s the pads must be released and the
+                motor must stand; otherwise the contact is unknown until both are seen.
+            speed_rad_per_s: motor speed at the sample.
             current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
-            dt_s: time since the last sample; without meaning at the first call.
+            dt_s: time since the last sample; ignored at the first call.
             backplates_C: inner and outer backing plate; None if unknown, and the pads' temperatures then stay unknown.
-            caliper_C: taken for the mean of the backing plates if None.
+            caliper_C: if None, the mean of the backing plates is used.
             wheel_speed_rad_per_s, wheel_pulse: speed of the disc, and 96 counts per turn modulo 4096; None if unknown.
 
-        What may be None may also be NaN or infinite: it is then missing.
+        An argument that may be None may also be NaN or infinite; both mean missing.
 
         Raises:
-            ValueError: another argument is no finite number, or ``dt_s`` is not above zero. Nothing has changed then.
+            ValueError: another argument is not finite, or ``dt_s`` is not above zero. The state is then unchanged.
         """
         required = {"angle_rad": angle_rad, "speed_rad_per_s": speed_rad_per_s, "dt_s": dt_s, "ambient_C": ambient_C}
         for name, value in (required | {"vehicle_speed_m_per_s": vehicle_speed_m_per_s}).items():

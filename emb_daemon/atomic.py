@@ -1,4 +1,4 @@
-"""Files that are whole at every moment."""
+"""Files that are complete at every moment."""
 
 import contextlib
 import errno
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def naming(path: Path):
-    """Within it an OSError, as of a full disk, is one of ``path`` and not of a part that is written beside it."""
+    """Inside this context an OSError, such as for a full disk, names ``path`` and not the temporary file."""
     try:
         yield
     except OSError as error:

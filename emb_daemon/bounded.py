@@ -1,4 +1,4 @@
-"""Files of others, read so that none can hold the reader up or take the machine's memory."""
+"""Reads files of others so that none can block the reader or use up the machine's memory."""
 
 import errno
 import os
@@ -9,12 +9,12 @@ from emb_daemon.errors import InputErrors
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Content of a regular file; nobody needs to write to it for the call to end.
+    """Content of a regular file; never blocks.
 
     Raises:
         OSError: not readable, not a regular file, or larger than ``most_bytes``; ``strerror`` says which.
     """
-    # A pipe without a writer would keep an open() waiting for one.
+    # open() of a pipe would wait for a writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
         mode = os.fstat(handle).st_mode

@@ -18,10 +18,9 @@ class InputErrors(InputError):
 
 
 class InvalidValue(InputError, ValueError):
-    """Values that contradict each other, found where an object is made of them; read from a file, it becomes a fault with its
-    line."""
+    """Values that contradict each other, found when an object is made of them. For a file it becomes a fault with a line."""
 
 
 class Unavailable(Exception):
-    """Something outside is not there now and may be later, such as a CAN interface. The command line prints it and ends
-    with exit status 1, upon which a service manager tries again."""
+    """Something outside of the program, such as a CAN interface, is missing now and may be there later. The command line
+    prints it and ends with exit status 1, after which a service manager tries again."""

@@ -1,10 +1,10 @@
-"""How kernels come to run: from a library that was compiled ahead, through numba, or as plain Python.
+"""How kernels run: from a library that was compiled ahead, through numba, or as plain Python.
 
 Everything that compiled code consists of is declared here: `njit` for what kernels call, `entry` for what Python calls in a
 tick. With NUMBA_DISABLE_JIT=1 the same functions run as plain Python over the same records, which is how tests compare them.
 With a library (`emb_daemon.ahead.library.load`, before anything here is imported) the entry points are its functions, numba is
-not imported, and what else is called runs as plain Python: so does everything where numba is not installed, fast enough to
-read and check files.
+not imported, and all other functions run as plain Python. If numba is not installed everything runs as plain Python, which is
+fast enough to read and check files.
 """
 
 import functools
@@ -69,8 +69,9 @@ else:
 
 
 def entry(*takes, returns: int = 0):
-    """A function that Python calls in a tick, or in its stead with arguments that ``takes`` describes (see
-    `emb_daemon.ahead.signature`); ``returns`` whole numbers. Unlike `njit`'s it is in a library that is compiled ahead."""
+    """A function that Python calls in a tick. ``takes`` describes its arguments (see `emb_daemon.ahead.signature`),
+    ``returns`` is the number of integers that it returns. Unlike functions of `njit` it is callable in a library compiled
+    ahead."""
 
     def declare(function):
         name = name_in_c(function)
@@ -84,5 +85,5 @@ def entry(*takes, returns: int = 0):
 
 
 def fields(kind: str, names: str) -> list[tuple[str, str]]:
-    """Fields of a record that compiled code reads: several of one ``kind`` (``f8``, ``i8``, ``?``), names apart by a blank."""
+    """Fields of a record for compiled code: all of one ``kind`` (``f8``, ``i8``, ``?``), names separated by blanks."""
     return [(name, kind) for name in names.split()]

@@ -1,4 +1,4 @@
-"""numba as `emb_daemon.jit` uses it: compiled code is kept on disk, for the next start.
+"""numba for `emb_daemon.jit`: compiled code is stored on disk for the next start.
 
 numba's disk cache is keyed on the file of the compiled function alone, so a change in a kernel that it calls, or in a
 record layout, would go unnoticed. The cache folder is therefore named after all sources that compiled code can depend on.
@@ -60,15 +60,15 @@ class _Compilations(event.Listener):
 
 
 def compiled_for_the_next_start() -> bool:
-    """Whether this process has compiled what another start would find in the cache."""
+    """Whether this process has compiled code that another start would load from the cache."""
     return _compilations.count > 0 and _private is None
 
 
 def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
     """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
 
-    Only where ``function`` is not in the cache, a second CPU is there, and no other thread that may hold a lock. Returns
-    what waits for the end of it.
+    Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Returns a
+    function that waits for the end of the work.
     """
     possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
     if _private is not None or not possible:
@@ -94,7 +94,7 @@ njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=
 
 
 def depend_on(source: Path) -> None:
-    """Keep what is compiled from here on apart from what was compiled without this file, or with another version of it."""
+    """Cache code compiled from here on separately from code compiled without this file, or with another version of it."""
     folder = Path(config.CACHE_DIR) / hashlib.sha256(source.read_bytes()).hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     config.CACHE_DIR = str(folder)

@@ -1,8 +1,8 @@
 """From frames to samples to estimates to frames: the path that the daemon and replay share.
 
-Everything here is driven by frames and by time as data. The daemon passes the frames it has drained and the time of its
-tick; replay passes a log. The same frames in the same order give the same payloads, because the sample time is counted in
-cycles of the resolver message (the Counter says how many passed) and jitter of arrival does not reach the estimator.
+The input is frames and times as data. The daemon passes the frames that it has drained and the time of its tick; replay passes
+a log. The same frames in the same order give the same payloads, because the sample time is counted in cycles of the resolver
+message, by its Counter, so that jitter of arrival does not reach the estimator.
 """
 
 from typing import NamedTuple
@@ -22,28 +22,28 @@ from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import LAYOUT, pack
 from emb_daemon.wire.receive import ACCEPTED, RECEPTION, SECOND_SENDER, new_reception, receive
 
-#: A resolver sample waits this long for its current before it is answered without: senders put both on the bus together, and
-#: half a cycle leaves as much for the answer.
+#: Time for which a resolver sample waits for its current before the estimate is made without it. Senders put both on the bus
+#: together; half a cycle leaves as much time for the estimate.
 _PAIRING_NS = CYCLE_NS // 2
-#: Without a resolver sample for this many cycles the daemon predicts, once a cycle; two frames lost in a row are
-#: made up for by the next.
+#: Without a resolver sample for this number of cycles the daemon predicts, once a cycle. Two lost frames in a row need no
+#: prediction, because the next sample covers them.
 LATE_CYCLES = 3
-#: Deviation of arrival from the counter's clock up to which the counter is believed: two cycles, the longest that a bus
-#: which keeps its schedule holds a frame up.
+#: Largest difference between arrival and the counter's clock at which the counter is used: two cycles, the longest delay of a
+#: bus that keeps its schedule.
 _JITTER_NS = 2 * CYCLE_NS
-#: Samples on which counter and clock must have agreed before the counter is believed against the clock.
+#: Number of samples on which counter and clock must have agreed before the counter takes precedence over the clock.
 _AGREED = 3
-#: Cycles of its message after which the absence of an input is reported, and the age up to which an input still feeds the
-#: models: so many cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
+#: Number of cycles of its message after which an input is reported as lost, and the age up to which the models use its last
+#: value: the same number of cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
 _REPORTED_CYCLES, _USABLE_NS = 25, 2_500_000_000
-#: How long a frame that was refused, or somebody else's of our messages, shows in the reasons: ten EMB_c_EstimatorStatus.
+#: Time for which a refused frame, or a second sender of the daemon's messages, is reported: ten EMB_c_EstimatorStatus.
 _SHOWN_NS = 1_000_000_000
 
-#: What is known of a corner between two samples: the resolver sample that waits for its current, and the last one answered.
-#: ``cycle`` counts cycles since the first sample, ``announced`` those up to the last row, ``predicted`` rows since then;
-#: ``clock_ns`` the last sample's time by the sender's counter, ``late_ns`` how late it came if that is to be made up for,
-#: ``agreed`` how many samples in a row counter and clock agreed on; ``second_sender_ns`` when somebody else
-#: last sent one of our messages; ``unproven`` where authentication is asked for and a key is missing.
+#: State of a corner between two samples: the resolver sample that waits for its current, and the last one estimated.
+#: ``cycle``: cycles since the first sample; ``announced``: cycles up to the last row; ``predicted``: rows since then;
+#: ``clock_ns``: the last sample's time by the sender's counter; ``late_ns``: its delay, if later samples are to make up for
+#: it; ``agreed``: number of samples in a row on which counter and clock agreed; ``second_sender_ns``: when another node last
+#: sent one of the daemon's messages; ``unproven``: authentication is required and a key is missing.
 CORNER = np.dtype(
     [
         *fields("?", "active started"),
@@ -55,18 +55,18 @@ CORNER = np.dtype(
     align=True,
 )
 
-#: E2E counters of what is sent, by message and corner; ``values`` of the message that is being encoded.
+#: E2E counters of sent messages, by message and corner; ``values`` of the message that is being encoded.
 TRANSMISSION = np.dtype([("counter", "i8", (4, 4)), ("values", "f8", (wire.SENT_SIGNALS,))], align=True)
 
-#: Which predictions `_overdue` makes.
+#: Predictions that `_overdue` makes.
 _NONE, _ALL, _NEWEST = range(3)
 
-#: Rows that one frame can give besides predictions: each corner's overdue sample, and the sample that the frame completes.
+#: Largest number of rows from one frame, without predictions: each corner's overdue sample, and the sample that it completes.
 _ROWS_A_FRAME = 8
 
 
 class Buffers(NamedTuple):
-    """Everything that turning frames into samples reads and writes, allocated once; `Pipeline` says what each holds."""
+    """All buffers for turning frames into samples, allocated once; see `Pipeline` for their content."""
 
     layout: np.ndarray
     receptions: np.ndarray
@@ -86,12 +86,13 @@ class Pipeline:
         corners: names of the corners to estimate.
         layout: LAYOUT array, shape (1,).
         capacity: rows that one call of `consume` can hold.
-        adaptation: `adapt.adaptation.Adaptation` that learns into ``parameters``; without it nothing is asked for or learned.
+        adaptation: `adapt.adaptation.Adaptation` that learns into ``parameters``; without it nothing is requested or learned.
 
     Attributes:
         states: STATE array, shape (4,): the estimators.
         samples, estimates: SAMPLE and ESTIMATE rows of the last call, row by row.
-        disturbed: reason bits, shape (4,), that the loop raises on estimates: what bus and clock know and frames do not.
+        disturbed: reason bits, shape (4,), that the loop adds to estimates, because frames do not show them: bus and
+        deadlines.
     """
 
     def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096, adaptation=None):
@@ -115,7 +116,7 @@ class Pipeline:
         self._buffers = Buffers(self.layout, self.receptions, self.corners, self.disturbed, self.samples)
 
     def begin(self, time_ns: int) -> None:
-        """State when listening began, so that silence can be told from the very start."""
+        """Set the time at which reception began, so that missing inputs are reported from the start."""
         self.corners["sample_ns"] = time_ns
 
     def begin_anew(self, corner: int, parameters: np.void) -> None:
@@ -126,7 +127,7 @@ class Pipeline:
             self.corners[name][corner] = 0
 
     def why_not_at_rest(self) -> str:
-        """What keeps the car from being seen to stand with its brakes released, in words; empty if nothing does."""
+        """Why the car is not known to stand with its brakes released, in words; empty if it is."""
         status, wheels = self.receptions[wire.VEHICLE_STATUS], self.receptions[wire.WHEEL_SPEED]
         for index in np.flatnonzero(self.corners["active"]):
             corner, name = self.corners[index], wire.CORNERS[index]
@@ -146,7 +147,7 @@ class Pipeline:
         return ""
 
     def distrust(self, corners) -> None:
-        """Call the estimates of these corners a fault: whose they or their inputs are nobody can prove."""
+        """Mark the estimates of these corners as Fault, because they or their inputs cannot be authenticated."""
         for name in corners:
             self.corners["unproven"][wire.CORNERS.index(name)] = True
 
@@ -157,9 +158,10 @@ class Pipeline:
         return _collect(self._buffers, frames, start, _ALL if predictions else _NONE, 0)
 
     def overdue(self, time_ns: int, count: int = 0) -> int:
-        """Add rows for what is overdue at ``time_ns`` after the first ``count``; returns how many there are then.
+        """Add rows for samples and predictions that are overdue at ``time_ns``, after the first ``count``; returns the new
+        count.
 
-        A corner that owes several predictions gives the newest alone: the others are out of date."""
+        If several predictions of a corner are due, only the newest is made, because the others are out of date."""
         return _overdue(self._buffers, time_ns, _NEWEST, count)
 
     def answer(self, count: int) -> None:
@@ -212,7 +214,7 @@ def _collect(b, frames, start, predictions, count):
 
 @njit
 def _paired(b, index):
-    """Whether the current that belongs to the pending resolver sample has come."""
+    """Whether the current that belongs to the pending resolver sample has arrived."""
     corner, current = b.corners[index], b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
     return current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
 
@@ -252,9 +254,9 @@ def _overdue(b, time_ns, predictions, count):
 def _cycles(corner, counter, time_ns):
     """Cycles from the corner's last sample to this one, at least 1; moves the corner's clock.
 
-    The Counter says how many cycles passed, modulo 15, whatever delays the frame had. It is believed as long as frames
-    that come late are made up for by later ones. A log at a reduced rate counts frames instead of cycles, and a sender can
-    pause: there lateness stays or grows, and the time of arrival is believed, until both agree again.
+    The Counter gives the number of cycles modulo 15, whatever the delay of the frame. It is used as long as delays of frames
+    are made up for by later ones. In a log at a reduced rate the Counter counts frames instead of cycles, and a sender can
+    pause: then the delay stays or grows, and the time of arrival is used until both agree again.
     """
     step = (counter - corner.counter) % COUNTER_MODULO
     if step == 0:
@@ -268,7 +270,7 @@ def _cycles(corner, counter, time_ns):
     if counted:
         corner.agreed = min(corner.agreed + 1, _AGREED)
         corner.late_ns = 0
-        # The senders' clocks are not ours: follow them slowly.
+        # The senders' clocks differ from this machine's; follow them slowly.
         corner.clock_ns += step * CYCLE_NS + late // 16
         return step
     recovering = corner.late_ns == 0 or late < corner.late_ns - CYCLE_NS // 2
@@ -285,7 +287,7 @@ def _cycles(corner, counter, time_ns):
 
 @njit
 def _complete(b, index, count):
-    """Make the pending resolver sample a row; returns the new count."""
+    """Turn the pending resolver sample into a row; returns the new count."""
     corner = b.corners[index]
     row = b.samples[count]
     base = wire.CORNER_MESSAGES * index
@@ -295,8 +297,8 @@ def _complete(b, index, count):
     row.dt = cycles * CYCLE_S
     row.angle = corner.pending_angle
     row.speed = corner.pending_speed
-    # How wrong a value is whose sender calls it degraded, nobody says. The force has another source than the current; where
-    # the resolver is degraded too, or any other signal, there is no choice.
+    # The error of a value that its sender reports as degraded is unknown. Instead of the current the force can use the
+    # stiffness path. If the resolver is degraded as well, or for any other signal, there is no alternative.
     degraded_alone = b.receptions[base + wire.CURRENT].degraded and not b.receptions[base + wire.RESOLVER].degraded
     row.has_current = _paired(b, index) and not degraded_alone
     row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
@@ -333,7 +335,7 @@ def _complete(b, index, count):
 
 @njit
 def _head(b, row, index, age):
-    """Fill what a row says of itself, ``age`` cycles after the corner's last sample, and its reasons outside the estimator."""
+    """Fill time, counter and corner of a row, ``age`` cycles after the corner's last sample, and reasons from outside."""
     corner = b.corners[index]
     now = corner.sample_ns + age * CYCLE_NS
     row.corner = index
@@ -341,7 +343,7 @@ def _head(b, row, index, age):
     row.counter = corner.counter if corner.started else 15
     row.age_cycles = age
     row.cycle = corner.cycle + age
-    # A sample that comes after predictions may lie before the last of them: that cycle was announced.
+    # A sample after predictions may be older than the last of them, whose cycle has already been announced.
     row.elapsed_cycles = max(row.cycle - corner.announced, 0)
     corner.announced = max(row.cycle, corner.announced)
 
@@ -377,7 +379,7 @@ def _head(b, row, index, age):
 
 @entry(Array(ESTIMATE), int, Array(TRANSMISSION), Array(LAYOUT), Array(LIMITS), Array(FRAME), returns=1)
 def _broadcast(estimates, count, transmission, layout, limits, frames):
-    """Encode estimates; cycles that pass a message's period make it due. Returns the number of frames."""
+    """Encode estimates; a message is due when its period has passed. Returns the number of frames."""
     wires, counters, values = layout[0], transmission[0].counter, transmission[0].values
     sent = 0
     for number in range(count):

@@ -22,7 +22,7 @@ from emb_daemon.wire.layout import CORNERS
 #: Stands for every corner in a log.
 ALL = "all"
 
-#: Pause between two logs of which the second's clock does not go on from the first's.
+#: Pause between two logs, if the second's clock does not continue the first's.
 _PAUSE_NS = 1_000_000_000
 
 
@@ -30,7 +30,7 @@ _PAUSE_NS = 1_000_000_000
 class Result:
     """One corner of a replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock.
 
-    Those in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which goes on from log to log.
+    Times in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which continues from log to log.
     """
 
     path: Path
@@ -41,16 +41,16 @@ class Result:
     force_N: np.ndarray
 
     def reasons(self) -> dict[str, float]:
-        """Share of the samples that each reason stands beside, the most frequent first."""
+        """Share of the samples with each reason, the most frequent first."""
         bits = self.estimates["reasons"]
         shares = {word: float(np.mean(bits >> bit & 1)) for bit, word in enumerate(REASONS)}
         return dict(sorted(((word, share) for word, share in shares.items() if share), key=lambda item: -item[1]))
 
     def since(self, time_ns: int) -> "Result":
-        """What came at ``time_ns`` on the log's clock or later.
+        """The part from ``time_ns`` on the log's clock on.
 
         Raises:
-            InputError: nothing did.
+            InputError: there is none.
         """
         rows = self.time_ns >= time_ns
         if not rows.any():
@@ -59,7 +59,7 @@ class Result:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def figures(self) -> dict:
-        """Error figures against the log's reference instruments, as far as it has any."""
+        """Error figures against the log's reference instruments, if it has any."""
         return {
             "log": str(self.path),
             "corner": CORNERS[self.samples["corner"][0]],
@@ -78,16 +78,17 @@ class Replay:
     Args:
         calibration: of the corners' actuators.
         corner: FL, FR, RL, RR, or ``all`` for every corner in the first log.
-        measured_torque: heat the pads with the rig's brake torque sensor instead of the estimated force.
-        state: folder from which learned values are restored and in which adaptation keeps them; without one, nothing is
+        measured_torque: use the rig's brake torque sensor for the heat model instead of the estimated force.
+        state: folder from which learned values are restored and in which adaptation stores them; without one, nothing is
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
-        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation begins with the
-            log, or the contact angle would be unknown.
+        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always begins
+        with the
+            log, because otherwise the contact angle would be unknown.
 
     Attributes:
-        corners: that are estimated; of ``all`` known with the first log.
-        adaptation: what learns, if there is a state folder.
+        corners: those that are estimated; for ``all`` known from the first log on.
+        adaptation: the adaptation, if there is a state folder.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class Replay:
         return int(frames["time_ns"][0]) + round(1e9 * self._start_s)
 
     def _on_the_drive(self, frames: np.ndarray, path: Path) -> int:
-        """Put a log's times on the drive's clock, in place; returns what was added."""
+        """Convert a log's times to the drive's clock, in place; returns the difference."""
         if self._pipeline is None:
             self._build(corners_in(frames, path))
         first = int(frames["time_ns"][0])
@@ -151,7 +152,7 @@ class Replay:
             yield sent[sent["time_ns"] >= since]
 
     def run(self, path: Path) -> Result:
-        """Replay one log; of several corners, the first's result.
+        """Replay one log; returns the result of the first corner.
 
         Raises:
             InputError: unreadable, or without a usable resolver sample of a corner.
@@ -159,13 +160,13 @@ class Replay:
         return self.run_corners(path)[0]
 
     def run_corners(self, path: Path) -> list[Result]:
-        """Replay one log; a result for each corner, errors as in `run`."""
+        """Replay one log; returns a result for each corner. Errors as in `run`."""
         frames = self._read(path)
         shift = self._on_the_drive(frames, path)
         pipeline = self._pipeline
         samples = collect(frames, pipeline)
         if len(self.corners) == 1:
-            # Views: rows of a long log are half a kilobyte each.
+            # Views, because a row of a long log is half a kilobyte.
             mine: dict = {self.corners[0]: slice(None)}
         else:
             mine = {corner: samples["corner"] == corner_index(corner) for corner in self.corners}

@@ -9,7 +9,7 @@ _PACKAGE = Path(__file__).parent
 def resource(name: str) -> Path:
     """Path of a shipped file such as ``dbc/emb.dbc``.
 
-    A wheel carries them inside the package, a checkout beside it.
+    In a wheel they are inside the package, in a checkout next to it.
 
     Raises:
         FileNotFoundError: the installation is incomplete.

@@ -1,4 +1,4 @@
-"""The estimator inside somebody else's control loop: a force controller that has no force sensor.
+"""The estimator inside a control loop of your own: a force controller without a force sensor.
 
 The brake is a toy (a spring with friction) so that the loop fits on a screen; put your plant, HIL or drive in its place.
 
@@ -31,7 +31,7 @@ class ToyBrake:
         self.force += self.share * (sum(a * x ** (n + 1) for n, a in enumerate(self.curve)) - self.force)
         mean = 0.5 * (before + self.force)
         torque = self.motor.inertia_kg_m2 * (speed - self.speed) / DT_S + self.motor.gear_gain_m_per_rad * mean
-        # Friction turns over within the presliding angle.
+        # Friction changes its direction over the presliding angle.
         self.turned += (math.copysign(1.0, speed) - self.turned) * (
             1.0 - math.exp(-abs(speed) * DT_S / self.friction.presliding_angle_rad)
         )

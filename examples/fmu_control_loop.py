@@ -1,4 +1,4 @@
-"""A force controller around the estimator as an FMU, the way a simulation tool runs it: no Python is in the FMU.
+"""A force controller around the estimator as an FMU, as a simulation tool runs it; the FMU contains no Python.
 
 emb-daemon compile
 emb-daemon export --calibration config/calibration.yaml --output brake.fmu

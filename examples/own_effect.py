@@ -1,6 +1,6 @@
 """An effect of one's own in one file: the caliper warms up and widens, so the pads touch later.
 
-Run it as you run emb-daemon; every command, the estimator and the calibration file then know the effect:
+Run it like emb-daemon; all commands, the estimator and calibration files then include the effect:
 
 python examples/own_effect.py diagnose FIT_LOG --calibration FILE --validate LOG --output DIR
 """
@@ -17,7 +17,7 @@ STATE = np.dtype([("known", "?"), ("start_C", "f8")], align=True)
 
 @njit
 def term(p, s, m):
-    """What the pads' way has gained (so, lost) by the growth of the caliper since power-on, m."""
+    """Growth of disc and pads against the caliper since power-on, m; negative, because the caliper widens."""
     if p.widening_um_per_K == 0.0 or not m.has_thermocouple:
         return 0.0
     if not s.known:

@@ -842,7 +842,7 @@ def test_the_file_restores_all_that_learning_changed(learned):
         ("noise.stiffness_N", lambda value: 0.01 * value, "noise.stiffness_N"),
         ("noise.stiffness_relative", lambda value: 0.0, "noise.stiffness_relative"),
         ("contact.clearance_rad", lambda value: value + 10.0, "clearance"),
-        ("motor.inertia_kg_m2", lambda value: 1e-4, "not learned"),
+        ("motor.inertia_kg_m2", lambda value: 1e-4, "not a learned value"),
     ],
 )
 def test_a_file_with_impossible_values_and_a_right_checksum_is_refused(learned, caplog, keys, change, word):

@@ -566,7 +566,7 @@ def test_arrays_are_a_log(truth):
     ):
         with pytest.raises(InputError, match=expected):
             emb_daemon.log_of_arrays(**{"time_s": time_s, "angle_rad": motion[0]} | wrong)
-    with pytest.raises(InputError, match="expected one of them"):
+    with pytest.raises(InputError, match="expected at least one of them"):
         emb_daemon.log_of_arrays(time_s, current_A=motion[2])
 
 

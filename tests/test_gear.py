@@ -202,7 +202,7 @@ def test_the_brakes_motor_finds_its_way_back_through_the_gear(shipped):
         ((1.0, 10.0, 20.0), (0.0, 0.4, 0.8), "angle_rad: expected the released position"),
         ((0.0, 10.0), (0.0, 0.4), "three points"),
         ((0.0, 10.0, 20.0), (0.0, 0.4), "3 angle_rad and 2 travel_mm"),
-        ((0.0, 10.0, 60.0), (0.0, 4.0, 24.0), "gear_gain_m_per_rad: 3.98e-05 is no mean of travel"),
+        ((0.0, 10.0, 60.0), (0.0, 4.0, 24.0), "gear_gain_m_per_rad: 3.98e-05 is not a mean slope of travel"),
         ((0.0, 10.0, 20.0), (0.0, 0.398, 0.796), "motor.travel: ends at 0.796 mm; clearance and the largest force"),
     ],
 )

@@ -138,7 +138,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(rig, tmp_pat
     campaign = _campaign(tmp_path, rig, "curves: [{log: RIG/static/curve_6p5mm.log.gz}]\n")
     (tmp_path / "file").write_text("")
     for arguments, expected in (
-        (["--output", str(tmp_path)], "is no regular file"),
+        (["--output", str(tmp_path)], "is not a regular file"),
         (["--output", str(campaign)], "is one of the inputs"),
         (["--output", str(tmp_path / "none" / "c.yaml")], "no such folder"),
         (["--output", str(tmp_path / "c.yaml"), "--report", str(tmp_path / "file")], "expected a folder"),

@@ -118,7 +118,7 @@ def test_a_page_is_used_as_a_file_with_its_numbers_would_be(daemon, folder, capl
     daemon.pipeline.states[0]["force"] = 123.0
     assert ask(daemon, page(values)) == Answer()
     assert in_use(daemon) == of(values) and daemon.pipeline.states[0]["force"] == 0.0, "as after a restart"
-    assert "2 numbers are not the file's" in caplog.text
+    assert "2 numbers differ from the file" in caplog.text
     reader = EstimatesReader(folder / "estimates")
     reader.look()
     assert reader.on_page
@@ -137,8 +137,8 @@ def test_a_page_is_used_as_a_file_with_its_numbers_would_be(daemon, folder, capl
     (page({"adaptation.parking_force_N": 1.0}), "adaptation.parking_force_N: not a number that a page may set"),
     (page({"motor.colour": 1.0}), "motor.colour: not a number that a page may set"),
     (page({CLEARANCE: 7.0}, "RR"), "corner RR: not estimated"),
-    (page({CLEARANCE: 7.0}, file="another"), "corner FL: the file is not the one that the page was made from"),
-    (Page({"FL": {CLEARANCE: 7.0}}, {}), "corner FL: the file is not the one that the page was made from"),
+    (page({CLEARANCE: 7.0}, file="another"), "corner FL: the calibration file has changed since the page was made"),
+    (Page({"FL": {CLEARANCE: 7.0}}, {}), "corner FL: the calibration file has changed since the page was made"),
 ])  # fmt: skip
 def test_what_no_file_may_hold_is_refused_and_nothing_changes(daemon, caplog, request_, said):
     answer = ask(daemon, request_)
@@ -238,7 +238,7 @@ def test_a_reload_that_waits_comes_first(daemon, folder):
     clamped(daemon.pipeline)
     daemon.reload()
     follow(daemon, lambda: daemon._waiting)
-    assert "a reload waits" in ask(daemon, page({CLEARANCE: 7.0}, file=calibration_hash(load_calibration(
+    assert "a reload is waiting" in ask(daemon, page({CLEARANCE: 7.0}, file=calibration_hash(load_calibration(
         folder / "calibration.yaml")))).refused  # fmt: skip
 
 

@@ -105,7 +105,7 @@ def test_bounds_and_units():
 )
 @pytest.mark.parametrize("use", [value_of, parameter, lambda calibration, key: moved(calibration, {key: 1.0})])
 def test_an_unknown_key_names_near_ones(use, key, near):
-    with pytest.raises(InputError, match="no number of the calibration") as caught:
+    with pytest.raises(InputError, match="not a number of the calibration") as caught:
         use(_CALIBRATION, key)
     assert str(caught.value).startswith(f"{key}: ") and near in str(caught.value)
 

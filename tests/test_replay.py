@@ -124,7 +124,7 @@ def test_what_is_no_regular_file_is_not_replaced(two_corners, capsys, option):
     link.symlink_to(pipe)
     for path in (pipe, link, two_corners):
         assert main(["replay", str(two_corners / "FL.log"), option, str(path)]) == 2
-        assert "no regular file" in capsys.readouterr().err
+        assert "not a regular file" in capsys.readouterr().err
     assert pipe.is_fifo() and link.is_symlink()
 
 

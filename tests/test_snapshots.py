@@ -105,7 +105,7 @@ def test_what_is_no_file_holds_nobody_up(tmp_path):
 
 def test_a_state_directory_is_one_daemons(tmp_path):
     held = hold(tmp_path / "state")
-    with pytest.raises(Unavailable, match="another process"):
+    with pytest.raises(Unavailable, match="another running process"):
         hold(tmp_path / "state")
     os.close(held)
     os.close(hold(tmp_path / "state"))
@@ -170,7 +170,7 @@ def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name
     content = json.loads(path.read_bytes())["content"]
     path.write_bytes(files.encode(content | {"state": content["state"] | {name: value}}))
     restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
-    assert f"{name}: beyond what this brake can have" in caplog.text and not loop.adaptation._resumable
+    assert f"{name}: impossible for this brake" in caplog.text and not loop.adaptation._resumable
 
 
 def test_a_snapshot_from_the_future_is_not_used(driven, tmp_path, caplog):

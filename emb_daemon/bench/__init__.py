@@ -1,1 +1,1 @@
-"""Whether a machine can hold the loop, measured on that machine."""
+"""Measures whether a machine meets the timing budgets of the daemon."""

@@ -1,7 +1,7 @@
 """The simulated car in a process of its own, on an inherited socket; measures when the daemon's answers leave.
 
 Run as ``python -m emb_daemon.bench.car CORNERS SECONDS PRIORITY FD...``; prints a line when it is ready, waits for the
-daemon's first frame, and prints a JSON line at the end. All buses get the same frames; the car listens to the first alone.
+daemon's first frame, and prints a JSON line at the end. All buses get the same frames; the car listens to the first only.
 """
 
 import json
@@ -24,12 +24,12 @@ from emb_daemon.runtime.realtime import settle_memory, use_fifo
 from emb_daemon.wire.layout import CORNERS
 
 _CLAMP_FORCE = 0x200
-#: A cycle's frames leave this long after its computation began, as a timer lets them: not when the computation happens to end.
+#: Time from the beginning of a cycle's computation until its frames leave, as by a timer; independent of how long it takes.
 _COMPUTING_NS = 500_000
 
 
 class _Buses:
-    """Several buses that get the same frames; what comes from the first is heard."""
+    """Several buses that get the same frames; frames are received from the first only."""
 
     def __init__(self, descriptors: list[int]):
         self._descriptor = descriptors[0]
@@ -37,7 +37,7 @@ class _Buses:
         self._epoch_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        # Not poll(), which counts in ms: a car that is late by as much would be the daemon's latency.
+        # poll() is not used: it counts in ms, and the car's delay would count as the daemon's latency.
         return bool(select.select([self._descriptor], [], [], timeout_s)[0])
 
     def drain(self) -> np.ndarray:
@@ -51,7 +51,7 @@ class _Buses:
         early = (self._epoch_ns - now) % CYCLE_NS
         if early < 2 * _COMPUTING_NS:
             time.sleep(1e-9 * early)
-        # The first last: its answers are timed from here.
+        # The first bus last, because its answers are timed from here.
         for bus in (*self._others, self._first):
             bus.send(frames)
 

@@ -1,4 +1,4 @@
-"""A loop that does nothing 250 times a second: what the machine itself misses.
+"""A loop that does nothing 250 times a second, to show which deadlines the machine itself misses.
 
 Run as ``python empty.py SECONDS PRIORITY``, without the package; prints a JSON line.
 """

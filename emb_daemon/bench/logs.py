@@ -1,4 +1,4 @@
-"""The log path: read, decode, estimate; and the step beside the same in plain Python."""
+"""Speed of reading, decoding and estimating logs; and of the step, compiled and in plain Python."""
 
 import os
 import subprocess
@@ -27,12 +27,12 @@ _REPEATS = 7
 #: Length of the log.
 _SECONDS = 120.0
 _ONE_BY_ONE = 20_000
-#: Samples that plain Python steps through.
+#: Number of samples for plain Python.
 _PLAIN = 2000
 
 
 def medians_s(*functions: Callable[[], object]) -> list[float]:
-    """Median CPU time of each: what else the machine does is not theirs, and meets them alike because they take turns."""
+    """Median CPU time of each task. They take turns, so that other load of the machine affects all of them alike."""
     taken = np.zeros((_REPEATS, len(functions)))
     for repeat in range(_REPEATS):
         for column, function in enumerate(functions):
@@ -86,7 +86,7 @@ def _decoders(frames: np.ndarray) -> tuple[float, float]:
     known = [message.frame_id for message in database.messages]
     some = frames[np.isin(frames["can_id"], known)][:_ONE_BY_ONE]
     pairs = [(int(frame["can_id"]), int(frame["data"]).to_bytes(8, "little")) for frame in some]
-    # One for each turn: a frame that comes twice is refused.
+    # One for each turn, because a repeated frame is refused.
     pipelines = iter([Pipeline(np.zeros(4, PARAMETERS), ("FL",), capacity=_ONE_BY_ONE) for _ in range(_REPEATS)])
 
     def bulk() -> None:
@@ -100,11 +100,11 @@ def _decoders(frames: np.ndarray) -> tuple[float, float]:
 
 
 def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict:
-    """The compiled step over SAMPLE rows, PARAMETERS of shape (1,), beside the same in plain Python.
+    """Time of the compiled step over SAMPLE rows, with PARAMETERS of shape (1,), and of the same in plain Python.
 
     Returns:
-        ``compiled_us`` and ``plain_us`` of one step, and ``plain_difference`` as `difference` has it. Plain Python may be
-        off by the last bit: its x ** 2 goes through pow(), which need not round as a product does.
+        ``compiled_us`` and ``plain_us`` of one step, and ``plain_difference`` as `difference` has it. Plain Python may
+        differ in the last bit, because its x ** 2 is pow(), which may round differently from a product.
     """
     compiled = estimate(samples, parameters)
     [taken] = medians_s(lambda: estimate(samples, parameters))

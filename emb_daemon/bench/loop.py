@@ -1,4 +1,4 @@
-"""The daemon at its cadence: what a tick costs in parts, what is missed, how soon a sample is answered, memory, start."""
+"""Measures the running daemon: parts of a tick, missed ticks, latency of an estimate, memory, start."""
 
 import json
 import os
@@ -20,12 +20,12 @@ from emb_daemon.runtime.rawcan import connected_sockets
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import CORNERS
 
-#: The daemon's own; the car comes before it, as the senders on a bus do.
+#: Priority of the daemon; the car's is higher, because senders on a bus do not wait for the daemon.
 _PRIORITY = 60
 _CAR_PRIORITY = 65
 _PATIENCE_S = 300.0
-#: Of the time by which the loop overslept, the share that the process may have worked and still count as held up: a helper
-#: thread that keeps the loop from waking works throughout.
+#: A late wake-up counts as held up by the machine if the process worked for at most this share of the delay. A helper thread
+#: that had kept the loop from waking would have worked throughout.
 _IDLE = 0.1
 
 
@@ -55,7 +55,7 @@ class _Child:
         self.ready = {"wall_s": wall, "cpu_s": float(cpu)}
 
     def result(self, patience_s: float = _PATIENCE_S) -> dict:
-        """What it prints at its end, which is waited for."""
+        """Waits for the end of the process; returns what it printed."""
         return json.loads(self._process.communicate(timeout=patience_s)[0])
 
     def stop(self) -> dict:
@@ -76,11 +76,11 @@ def _configured(corners: int) -> Iterator[list]:
 
 
 def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict:
-    """Run the real daemon for the brakes of a simulated car, each in a process of its own, and beside them an empty loop and,
-    where it is installed, cyclictest.
+    """Run the real daemon and a simulated car, each in a process of its own, together with an empty loop and, if it is
+    installed, cyclictest.
 
     More than four ``corners`` are several daemons of four in one process, each on its own bus. ``kernels`` is the library that
-    the daemon uses; empty: it uses numba; None: what it would use by itself. ``share`` is where it tells its estimates.
+    the daemon uses; empty: it uses numba; None: what it would use by itself. ``share``: file in which it shares its estimates.
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
@@ -112,7 +112,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     finally:
         for child in filter(None, (car, served)):
             child.kill()
-        # Not before: a bus goes on without the car, a socket without its other end does not.
+        # Not earlier: a bus continues without the car, but a socket fails without its other end.
         for end in (end for pair in pairs for end in pair):
             end.close()
     return {
@@ -127,12 +127,12 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
 
 
 def held_up(late_ns: int, worked_ns: int) -> bool:
-    """Whether the machine kept asleep a loop that woke ``late_ns`` too late, by what its whole process worked meanwhile."""
+    """Whether the machine caused a wake-up ``late_ns`` too late, by the CPU time of the whole process meanwhile."""
     return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
 
 
 def measure_start(cold: bool = False) -> dict:
-    """``wall_s`` and ``cpu_s`` from start to ready by numba, with the kernels that are in the cache or ``cold`` with none."""
+    """``wall_s`` and ``cpu_s`` from start to ready with numba, with cached kernels or, if ``cold``, without."""
     ours, theirs = connected_sockets()
     with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
@@ -145,7 +145,7 @@ def measure_start(cold: bool = False) -> dict:
 
 
 def cyclictest(seconds: float) -> dict | None:
-    """Wake-up latency that rt-tests' cyclictest sees at 250 Hz; None where it is not installed or not allowed."""
+    """Wake-up latency by rt-tests' cyclictest at 250 Hz; None if it is not installed or not permitted."""
     command = ["cyclictest", "-q", "-t1", f"-p{_PRIORITY}", "-i4000", f"-D{max(1, round(seconds))}", "-h5000"]
     try:
         output = subprocess.run(command, capture_output=True, text=True, check=True, timeout=seconds + 30).stdout

@@ -1,4 +1,4 @@
-"""What a bench's figures say: every budget with its margin, and all of it as text."""
+"""Evaluates the figures of a bench: every budget with its margin, and all figures as text."""
 
 import math
 
@@ -6,8 +6,9 @@ import math
 def verdict(result: dict) -> list[dict]:
     """Each budget: ``measured``, ``limit``, ``unit``, and ``met``, whether the machine holds it.
 
-    Budgets of the loop are for the run with four corners, or the last one if there was none. ``sense`` says which side of the
-    limit is good, ``margin`` how far, as a share of the limit. A figure that could not be measured is NaN and not met.
+    Budgets of the loop apply to the run with four corners, or to the last run if there was none. ``sense`` says which side of
+    the limit is good, ``margin`` the distance to it, as a share of the limit. A figure that could not be measured is NaN and
+    not met.
     """
     loop = next((loop for loop in result["loops"] if loop["corners"] == 4), result["loops"][-1])
     logs, step, answers, empty = result["logs"], result["logs"]["step"], loop["answers"], loop["empty_loop"]
@@ -88,7 +89,7 @@ def _loop(loop: dict) -> list[str]:
 
 
 def _kernels(measured: dict) -> list[str]:
-    """The daemon with kernels from numba's cache beside the same with a library."""
+    """The daemon with kernels from numba's cache, compared with the daemon with a library."""
     rows = [
         ("start to ready, s", lambda loop: f"{loop['ready']['wall_s']:.2f}"),
         ("of them on a CPU, s", lambda loop: f"{loop['ready']['cpu_s']:.2f}"),

@@ -2,11 +2,11 @@
 
 Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD...``. Prints a line when it is ready, with the CPU time that
 took, and, after SIGTERM, a JSON line with what its ticks cost. SHARE is as in ``emb-daemon run --share``, empty for none.
-Several descriptors make as many daemons, one after the other in each tick of one loop: that is no service of this package,
-whose process has four corners at most, and says what more corners cost.
+With several descriptors there are as many daemons, which run one after the other in each tick of one loop. This only measures
+the cost of more corners; the daemon of this package has at most four in one process.
 """
 
-# Before anything is imported that has kernels.
+# Before modules with kernels are imported.
 from emb_daemon.ahead import library
 
 if refusal := library.load():
@@ -33,17 +33,17 @@ from emb_daemon.runtime.journal import set_up_logging
 from emb_daemon.runtime.rawcan import RawCanSocket
 from emb_daemon.runtime.realtime import set_up, settle_memory
 
-#: Parts of a tick: what they are called, whose method does them.
+#: Parts of a tick: name, and object and method that do them.
 _PARTS = (("drain", "bus", "drain"), ("decode", "pipeline", "collect"), ("step", "pipeline", "answer"),
           ("encode", "pipeline", "broadcast"), ("send", "bus", "send"))  # fmt: skip
 #: Ticks after which memory counts as settled: a second.
 _SETTLED = 250
-#: Ticks that are kept, enough for an hour.
+#: Number of recorded ticks, enough for an hour.
 _ROOM = 1_000_000
 
 
 class Pacer(loop.Pacer):
-    """Remembers which deadline the loop sleeps for, 0 while a sample is overdue, and the process's CPU time before."""
+    """Records the deadline for which the loop sleeps (0 while a sample is overdue), and the process's CPU time before."""
 
     deadline_ns = 0
     worked_ns = 0
@@ -56,7 +56,7 @@ class Pacer(loop.Pacer):
 
 
 class Ledger:
-    """What ticks that answered a sample cost, in parts, how late those that slept woke, and whose fault a missed one is."""
+    """Records the cost of ticks with a sample, by parts, the delay of wake-ups, and the cause of missed ticks."""
 
     def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
         self._daemons = daemons
@@ -105,13 +105,13 @@ class Ledger:
         if corners["cycle"].sum() > cycles and self._used < _ROOM:
             self._rows[self._used] = [*self._spent, taken]
             self._used += 1
-            # The car that ends, at a priority above the daemon's, is no load that a daemon has.
+            # The ending car, at a priority above the daemon's, is a load that a real daemon does not have.
             self._ended = self._stand()
             if self._used == _SETTLED:
                 self._begun, self._settled_KiB = self._ended, resident_KiB()
 
     def _attribute(self, now_ns: int, pacer: Pacer) -> None:
-        """Count missed periods in which the machine is known not to have woken the loop: nothing of the process ran."""
+        """Count missed periods that the machine caused: the loop was not woken, and nothing of the process ran."""
         missed, self._missed = self._daemons[0].missed - self._missed, self._daemons[0].missed
         if missed and pacer.deadline_ns and held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
             self._held_up += missed
@@ -121,8 +121,8 @@ class Ledger:
         return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, self._held_up
 
     def figures(self) -> dict:
-        """From when memory settled to the last sample: share of a core, ticks, those missed, those of them that the machine
-        held up, memory at both ends; since the start: costs, us."""
+        """From the time when memory has settled to the last sample: share of a core, ticks, missed ticks, those held up by the
+        machine, memory at both ends. Since the start: costs, us."""
         (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._stand()
         *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
@@ -145,12 +145,12 @@ def _quantiles(us: np.ndarray) -> dict[str, float]:
 
 
 def _shared(*shape: int) -> np.ndarray:
-    """Zeros in shared memory, ns: it counts as none of the daemon's, and what nothing was written to costs nothing."""
+    """Zeros in shared memory, ns. It does not count as the daemon's memory, and unwritten pages cost nothing."""
     return np.frombuffer(mmap.mmap(-1, 8 * math.prod(shape)), np.int64).reshape(shape)
 
 
 def resident_KiB() -> int:
-    """Of this process, without the memory that it shares."""
+    """Resident memory of this process, without shared memory."""
     held = ("RssAnon:", "RssFile:")
     lines = Path("/proc/self/status").read_text().splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith(held))

@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _ask(corners: list[str]) -> None:
-    """What years may have taught is not forgotten by a slip of the finger.
+    """Ask before deleting: the values may have taken years to learn.
 
     Raises:
         InputError: nobody is there to answer, or the answer is no.

@@ -38,12 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.bench.loop import machine, measure_loop, measure_start
     from emb_daemon.bench.report import text, verdict
 
-    # Fills the cache, so that no measured start compiles but the cold one.
+    # Fill the cache, so that only the cold start compiles.
     measure_start()
     result = {
         "machine": machine(),
         "loops": [measure_loop(corners, arguments.seconds) for corners in arguments.corners],
-        # The daemon with both, one after the other: what a library changes.
+        # The daemon with both, one after the other, to compare them.
         "kernels": {code: measure_loop(4, arguments.seconds, path) for code, path in (("numba", ""), ("ahead", str(kernels)))}
         if kernels
         else None,

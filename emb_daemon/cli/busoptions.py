@@ -1,4 +1,4 @@
-"""Bus options: python-can's own, so that users know them already."""
+"""Bus options, the same as those of python-can's tools."""
 
 import argparse
 import json
@@ -8,7 +8,7 @@ from emb_daemon.errors import InputError
 
 
 def add_bus_arguments(parser: argparse.ArgumentParser) -> None:
-    """-i, -c, -b, --fd and --bus-kwargs, as python-can's own tools have them."""
+    """Add -i, -c, -b, --fd and --bus-kwargs, as in python-can's tools."""
     group = parser.add_argument_group("bus", "python-can's options; can.conf and CAN_* variables count too")
     group.add_argument("-i", "--interface", help="socketcan, virtual, udp_multicast or another of python-can's")
     group.add_argument("-c", "--channel", help="such as can0")
@@ -36,7 +36,7 @@ def _can_id(text: str) -> int:
 
 
 def host_and_port(text: str) -> tuple[str, int]:
-    """Of HOST:PORT, as --udp has it; raises InputError of anything else."""
+    """Host and port of HOST:PORT; raises InputError for anything else."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 0xFFFF:
         raise InputError(f"--udp {text}: expected HOST:PORT, such as 127.0.0.1:5555")
@@ -44,7 +44,7 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 
 def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
-    """Raises InputError if an id of `add_id_arguments` is not the server's alone."""
+    """Raises InputError if an id of `add_id_arguments` is also used by another message."""
     for name in ("request_id", "response_id"):
         if getattr(arguments, name) in taken or arguments.request_id == arguments.response_id:
             raise InputError(

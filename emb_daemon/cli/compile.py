@@ -24,11 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
     machine = arguments.target.partition("-")[0]
     if machine not in TARGETS:
         raise InputError(f"--target {arguments.target}: expected {' or '.join(TARGETS)}")
-    # What numba has optimised is for this processor, and what it finds in its cache has no text any more.
+    # Code that numba has optimised is for this processor only, and code from its cache has no LLVM text.
     os.environ |= {"NUMBA_OPT": "0", "NUMBA_DISABLE_JIT": "0"}
     with tempfile.TemporaryDirectory() as empty:
         os.environ["NUMBA_CACHE_DIR"] = empty
-        # Before they are imported: what changes meanwhile is not in the library.
+        # Taken before the import: later changes of the sources are not in the library.
         sources = installed_digest()
         from emb_daemon.ahead.build import build
         from emb_daemon.jit import ENTRIES

@@ -195,7 +195,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     return 0
 
 
-#: What runs each command, and what it does.
+#: Function and description of each command.
 _COMMANDS = {
     "ingest": (_ingest, "read log files into a data set by unit, corner and day; each once, damaged ones are listed"),
     "replay": (_replay, "compute estimates, figures and integrity of every drive, equal to those of emb-daemon replay"),

@@ -9,8 +9,8 @@ from emb_daemon.cli.outputs import check_output
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 
-#: Exit status of a calibration that is written although a log that it rests on is missing or could not serve. Thermocouples in
-#: the pads are another rig's, which many have not.
+#: Exit status if the calibration is written although a log for it is missing or could not be used. Logs with thermocouples in
+#: the pads may be missing, because many users have no such rig.
 INCOMPLETE = 3
 EXAMPLE = "emb-daemon identify campaign.yaml --output calibration.yaml --report report"
 
@@ -74,7 +74,7 @@ def _example(folder: Path) -> int:
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
-    """Minutes of work must not end in a file that cannot be written."""
+    """Check the output paths before minutes of work."""
     if not arguments.campaign or not arguments.output:
         raise InputError("identify: expected CAMPAIGN.yaml and --output CALIBRATION.yaml, or --example DIR")
     check_output(arguments.output, [arguments.campaign, arguments.mapping])

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-#: What a command that opens logs says of them.
+#: Help text of LOG.
 LOG_HELP = (
     ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .txt, .tsv, .parquet, .mat, .npz "
     "and measurements (.mf4)"
@@ -23,7 +23,7 @@ def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False
 
 
 def open_mapping(path: Path):
-    """A `logs.mapping.Mapping`; what its rig does not measure is said on stderr."""
+    """A `logs.mapping.Mapping`; prints to stderr which signals its rig does not measure."""
     from emb_daemon.logs.mapping import Mapping
 
     mapping = Mapping(path)
@@ -33,7 +33,7 @@ def open_mapping(path: Path):
 
 
 def log_reader(mapping: Path | None) -> Callable:
-    """What gives a log's FRAME array by its path.
+    """Function that reads a log's FRAME array from its path.
 
     Raises:
         InputErrors: the mapping file is faulty.

@@ -9,7 +9,7 @@ import sys
 from emb_daemon import __version__
 from emb_daemon.errors import InputError, Unavailable
 
-#: Command: what it does. The module of the same name in this package has EXAMPLE, add_arguments and run.
+#: Commands and their descriptions. The module of the same name in this package has EXAMPLE, add_arguments and run.
 COMMANDS = {
     "demo": "run a simulated car and the real daemon in one process: live view, summary, picture",
     "run": "run the daemon: estimate from a CAN bus, broadcast 250 times a second",
@@ -39,9 +39,9 @@ _EXTRAS = dict.fromkeys(("matplotlib", "plotly", "pyarrow", "scipy"), "offline")
     "isotp": "workshop",
     "mcap": "live",
 }
-#: Commands that end in one of them and begin with long work.
+#: Commands that begin with long work and need one of these libraries at the end.
 _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": ("scipy", "plotly"), "fleet": ("distributed",)}
-#: Commands of a box without a compiler; all others need numba.
+#: Commands that work on a box without a compiler; all others need numba.
 _WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "xcp", "a2l", "adaptation")
 
 
@@ -57,11 +57,11 @@ def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if what it needs is not
-    there now."""
+    """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if something that it needs
+    is missing now."""
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
-        # A terminal without our characters shows others; it is no reason to end.
+        # Characters that the terminal's encoding lacks are replaced; they must not end the program.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        # A file that cannot be used is the user's; what is no file's may be better later.
+        # An error with a file name is the user's; another one may be gone later.
         print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
     except MemoryError:

@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
-    """Serve browsers, Prometheus and PlotJuggler, and record, until somebody ends it."""
+    """Serve browsers, Prometheus and PlotJuggler, and record, until the user ends it."""
     from emb_daemon.monitor.recording import Recording
     from emb_daemon.monitor.web import Datagrams, Web, hand_out
 

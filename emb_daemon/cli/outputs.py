@@ -1,4 +1,4 @@
-"""What can be refused of an output before the work."""
+"""Checks of an output before the work."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,7 +7,7 @@ from emb_daemon.errors import InputError
 
 
 def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
-    """Refuse a file that cannot be written, that writing would replace although it is no file, or that is an input.
+    """Refuse a path that cannot be written, that is not a regular file, or that is an input.
 
     Raises:
         InputError: with the path and what was expected.

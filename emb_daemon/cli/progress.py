@@ -1,4 +1,4 @@
-"""A bar for work that takes minutes."""
+"""A progress bar for work that takes minutes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress(text: str = "") -> Iterator[Callable[[float, str], None]]:
-    """Yields what is told the share that is done (0 to 1) and what is being done; only a terminal sees it."""
+    """Yields a function that takes the finished share (0 to 1) and a text; shown only on a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -10,7 +10,7 @@ from emb_daemon.cli.outputs import check_output
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
-#: Least share of a log's samples with which a reason is told in its summary; tables have them all.
+#: Least share of a log's samples for a reason in the summary; tables contain all reasons.
 _SEEN = 0.001
 EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml --output estimates.csv"
 
@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _secure(arguments: argparse.Namespace, read):
-    """``read`` of authentic frames alone, and what authenticates frames, as the daemon does both."""
+    """(``read``, restricted to authentic frames; function that authenticates frames), as in the daemon."""
     from emb_daemon.runtime.secured import Authentication, Freshness, FreshnessFile
     from emb_daemon.wire.keys import load_keys
     from emb_daemon.wire.secoc import load_links
@@ -116,7 +116,7 @@ def _secure(arguments: argparse.Namespace, read):
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """What can be refused before the work."""
+    """Check the arguments before the work."""
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
     from emb_daemon.replay import ALL
 
@@ -154,7 +154,7 @@ def _write_table(path: Path, results: list) -> None:
     columns = {
         name: np.concatenate([table.get(name, none) for table, none in zip(tables, empty, strict=True)]) for name in names
     }
-    # Corners of one log stand one after the other; a drive's clock tells the order of all.
+    # The corners of a log follow one another; the drive's clock gives the order of all rows.
     order = np.argsort(np.concatenate([result.estimates["time_ns"] for result in results]), kind="stable")
     write_table(path, {name: values[order] for name, values in columns.items()})
 

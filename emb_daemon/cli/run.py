@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     sys.modules.setdefault("asammdf", None)
     from emb_daemon.ahead import library
 
-    # Before anything is imported that has kernels. Said at once: where the library is needed, numba's import may fail.
+    # Before modules with kernels are imported. Logged at once: if the library is needed, numba's import may fail.
     if refusal := library.load():
         print(refusal, file=sys.stderr)
     from emb_daemon.adapt.memory import hold, state_directory
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     log.info("%s", library.description())
     state = state_directory(configuration.state_directory, arguments.config.parent)
     if state:
-        # Two daemons would write what they learned over each other's.
+        # Two daemons would overwrite each other's learned values.
         hold(state)
     bus, keyless = _open_bus(arguments, setup, state)
     daemon = Daemon(setup, bus, ServiceManager(), state)
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         _start_again()
     if arguments.share and configuration.xcp.calibrate:
         daemon.take_pages(arguments.share)
-    # Not before: a signal that comes while kernels are compiled ends the process at once.
+    # Not earlier: while kernels are compiled a signal ends the process at once.
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
     signal.signal(signal.SIGINT, lambda *_: daemon.stop())
     realtime = configuration.realtime
@@ -97,6 +97,6 @@ def _open_bus(arguments: argparse.Namespace, setup, state: Path | None):
 
 def _start_again() -> None:
     """Replace this process by the same command."""
-    # A handler does not survive, and without one the signal ends the process; to be ignored does survive.
+    # A handler does not survive exec, and without one the signal would end the process. Ignoring it does survive.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])

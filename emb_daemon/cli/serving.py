@@ -1,4 +1,4 @@
-"""What the programs beside the daemon do until they are stopped."""
+"""Main loop of the servers that run beside the daemon."""
 
 import signal
 import sys
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Server(Protocol):
-    """``step`` answers what was asked meanwhile and waits a moment; ``trouble`` says what keeps it from that, or nothing."""
+    """``step`` answers pending requests and waits a moment; ``trouble``: what prevents that, or empty."""
 
     trouble: str
 
@@ -14,7 +14,7 @@ class Server(Protocol):
 
 
 def stop_signals() -> list[bool]:
-    """Empty until SIGTERM or SIGINT."""
+    """A list that is empty until SIGTERM or SIGINT."""
     stopped: list[bool] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.append(True))
@@ -22,7 +22,7 @@ def stop_signals() -> list[bool]:
 
 
 def serve(server: Server, greeting: str) -> None:
-    """Print that it is there, and step it until SIGTERM or SIGINT; a trouble is printed to standard error when it changes."""
+    """Print ``greeting`` and step the server until SIGTERM or SIGINT; print its trouble to standard error when it changes."""
     stopped, told = stop_signals(), ""
     print(greeting, flush=True)
     while not stopped:

@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     corners = CORNERS[: arguments.corners]
     seeds = [arguments.seed + index for index in range(len(corners))]
     plants = np.array([plant_from_calibration(calibration, seed) for seed in seeds])
-    # What the daemon broadcasts; the car itself reacts to EMB_c_AdaptRequest only.
+    # The daemon's broadcasts, although the car itself reacts to EMB_c_AdaptRequest only.
     ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]

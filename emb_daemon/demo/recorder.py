@@ -1,4 +1,4 @@
-"""What the demonstration remembers: the car's truth, and the daemon's broadcasts as they came from the bus."""
+"""Records the demonstration: the car's truth, and the daemon's broadcasts as received from the bus."""
 
 import time
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, PAD_TEMP, default_layout
 
-#: An answer that is this late belongs to a later sample with the same counter.
+#: Age from which an estimate belongs to a later sample with the same counter.
 _LATEST_CYCLES = COUNTER_MODULO - 1
 #: Frames of a corner in one cycle at most: a force, and the slower messages.
 _FRAMES_PER_CYCLE = 6
@@ -22,14 +22,14 @@ _FRAMES_PER_CYCLE = 6
 
 @dataclass(frozen=True)
 class Comparison:
-    """One corner's estimates beside the truth of the samples that they name.
+    """One corner's estimates, with the truth of the samples that they refer to.
 
     Attributes:
         time_s: of the samples, from the start; shape (n,), as all below.
         force_N, sigma_N, true_N: estimate, its standard deviation, simulated truth.
         response_s: from a sample's frames on the bus to its estimate on the bus.
         usable: the estimate's Status was not NotAvailable or Fault.
-        samples: how many resolver samples reached the bus.
+        samples: number of resolver samples that reached the bus.
     """
 
     time_s: np.ndarray
@@ -57,28 +57,28 @@ class Recorder:
         self.sent_ns = np.zeros(cycles, np.int64)
         self.cycles = 0
         self.frames = np.zeros(cycles * len(corners) * _FRAMES_PER_CYCLE, FRAME)
-        #: Cycles that the car had sent when a frame came.
+        #: Number of cycles that the car had sent when a frame arrived.
         self.frame_cycle = np.zeros(len(self.frames), np.int64)
         self.count = 0
         self._ids = default_layout()[0]["sent_id"]
-        #: What the live view knows of the frames, and how many of them.
+        #: Listener of the live view, and number of frames that it has received.
         self._listener, self._listened = Listener(), 0
 
     def sent(self, time_ns: int, truth: np.ndarray) -> None:
-        """A cycle of the car has left at ``time_ns``, or was lost if that is 0."""
+        """Note a cycle of the car that left at ``time_ns``, or was lost (0)."""
         self.truth[self.cycles] = truth
         self.sent_ns[self.cycles] = time_ns
         self.cycles += 1
 
     def heard(self, frames: np.ndarray) -> None:
-        """Frames came from the bus."""
+        """Note frames that were received from the bus."""
         room = min(len(frames), len(self.frames) - self.count)
         self.frames[self.count : self.count + room] = frames[:room]
         self.frame_cycle[self.count : self.count + room] = self.cycles
         self.count += room
 
     def states(self) -> list[dict]:
-        """What the broadcasts say now, by corner (`monitor.listener.Corner.state`)."""
+        """Present state by the broadcasts, by corner (`monitor.listener.Corner.state`)."""
         count = self.count
         self._listener.hear(self.frames[self._listened : count])
         self._listened = count
@@ -105,7 +105,7 @@ class Recorder:
         return frames, at, status, 1e-9 * (frames["time_ns"] - self.sent_ns[at])
 
     def compare(self, row: int) -> Comparison:
-        """One corner from beginning to end; answers to a sample only, not predictions in its absence."""
+        """One corner over the complete drive; estimates of samples only, without predictions."""
         frames, at, status, response = self._match(row, 0, self.count)
         corner = self.corners[row]
         columns = Decoder().columns(frames, f"EMB_{corner}_ClampForce")

@@ -27,7 +27,7 @@ from emb_daemon.wire.layout import CORNERS
 
 _VIEW_S, _LINE_S = 0.25, 3.0
 _DAEMON_PRIORITY = 60
-#: Of the brakes' tolerances and of all noise.
+#: Seed of the brakes' tolerances and of all noise.
 _SEED = 1
 
 
@@ -82,7 +82,7 @@ class Session:
         """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
         drive = (self._stop.is_set, self.seconds, self.recorder.sent, self.recorder.heard)
         daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")
-        # The car goes first: a real one waits for nobody.
+        # The car has priority, because a real car does not wait for the daemon.
         car = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY + 1, self.live.run, *drive), name="car")
         daemon.start()
         car.start()

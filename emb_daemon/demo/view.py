@@ -13,7 +13,7 @@ from emb_daemon.monitor.view import STATUS_COLOURS, number
 from emb_daemon.wire.contract import PARK_RELEASED
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
-#: Columns of a corner: heading, how it is set, and whether a terminal of 80 characters has room for it; width for all.
+#: Columns of a corner: heading, alignment, and whether they fit a terminal of 80 characters; width of all.
 _COLUMNS = (
     ("", "left", True), ("clamp force", "right", True), ("", "left", False), ("± 2σ", "right", True), ("true*", "right", True),
     ("source", "left", True), ("status", "left", True), ("mode", "left", False), ("surface", "right", False),
@@ -34,7 +34,7 @@ def phase(truth: np.void) -> str:
 
 
 def health(recorder: Recorder, daemon, live) -> str:
-    """Loop health in one line: response from sample to estimate as the bus sees it, missed periods, late cycles of the car."""
+    """Loop health in one line: time from sample to estimate on the bus, missed periods, late cycles of the car."""
     responses = recorder.recent_responses(0)
     if not len(responses):
         return "no estimate yet"

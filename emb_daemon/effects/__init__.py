@@ -1,4 +1,4 @@
-"""Effects that the thesis's models lack, one file each, and their registry.
+"""Effects that the thesis does not model, one file each, and their registry.
 
 An effect's file holds its parameters (a numpy record, exactly neutral at zero), its state, the compiled term that the
 running estimator calls (composed by hook in `paths`), and an `Effect` that says where it enters and what physics allows.
@@ -11,8 +11,8 @@ import numpy as np
 from emb_daemon.effects import terms
 from emb_daemon.effects.base import Effect
 
-#: Simpler causes first: of two that a log cannot tell apart, diagnose takes the one that stands first. Also the order in
-#: which the terms of one hook are added.
+#: Simpler causes first: of two that a log cannot distinguish, diagnose takes the first in this list. The terms of one hook
+#: are added in the same order.
 _NAMES = (
     "disc_thickness_variation",
     "disc_thermal_expansion",
@@ -41,7 +41,7 @@ REGISTRY: tuple[Effect, ...] = tuple(import_module(f"{__name__}.{name}").EFFECT 
 
 
 def parameter_record(effects: tuple[Effect, ...]) -> np.dtype:
-    """Parameters of all effects, by name, and of the terms that no catalogue holds."""
+    """Parameters of all effects, by name, and of the terms that are not in the catalogue."""
     return np.dtype([*((effect.name, effect.parameter_record) for effect in effects), ("terms", terms.PARAMETERS)], align=True)
 
 

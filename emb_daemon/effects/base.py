@@ -1,4 +1,4 @@
-"""The shape that every effect has, and the places in the physics where one can enter."""
+"""Structure of an effect, and the hooks in the physics at which effects add."""
 
 import inspect
 from collections.abc import Callable
@@ -14,12 +14,13 @@ class Hook:
     """A quantity of the estimator's physics to which terms of effects add.
 
     Attributes:
-        unit: of the quantity, hence of what a term returns.
-        start: what the quantity is without any effect; None where the caller brings it (see ``value``).
-        arguments: what a term may ask for by name, beside its parameters ``p``, its state ``s`` and ``value``, which is the
-            quantity with the terms of all effects before it in the registry. ``m`` is the SAMPLE; the others are in SI units.
+        unit: of the quantity, and therefore of a term's return value.
+        start: the quantity without any effect; None if the caller passes it (see ``value``).
+        arguments: names of arguments that a term may have, in addition to its parameters ``p``, its state ``s`` and
+            ``value``: the quantity with the terms of all effects before it in the registry. ``m`` is the SAMPLE; the others
+            are in SI units.
         path: ``stiffness``, ``torque`` or ``thermal``.
-        channel: residual in which a change of it shows.
+        channel: residual in which a change of the quantity shows.
         like: base parameter (key of the calibration) that changes the same quantity, or None: its regressor times a signal is
             what any function of that signal would do here. ``like_per_unit`` of it make one unit of the quantity.
     """
@@ -36,11 +37,11 @@ _GEAR = ("m", "travel", "mean_speed", "friction_mean", "past_contact", "force", 
 
 #: By name, in the order in which a sample passes through them.
 HOOKS = {
-    # What disc and pads have gained since power-on in the pads' way.
+    # Growth of disc and pads since power-on, along the pads' travel.
     "thickness": Hook(
         "m", 0.0, ("m", "disc", "disc_known", "power", "dt"), "stiffness", "stiffness", "contact.clearance_rad"
     ),
-    # What the spindle is ahead of the measured motor angle.
+    # Angle by which the spindle is ahead of the measured motor angle.
     "motor_angle": Hook("rad", 0.0, ("m", "dt"), "stiffness", "stiffness", "contact.clearance_rad"),
     # Factor on the static clamp force, after ``travel`` rad in contact.
     "stiffness": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
@@ -48,7 +49,7 @@ HOOKS = {
     "force": Hook("N", None, ("travel", "dt"), "stiffness", "stiffness"),
     # Factor on the relaxation time of the clamp force.
     "relaxation_time": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
-    # Factor on the torque constant. Its terms are also asked with dt 0, and must then leave their state as it is.
+    # Factor on the torque constant. Its terms are also called with dt 0, and must then not change their state.
     "torque_constant": Hook(
         "1", 1.0, ("m", "disc", "disc_known", "dt"), "torque", "torque", "motor.torque_constant_Nm_per_A"
     ),
@@ -64,21 +65,21 @@ HOOKS = {
     "backplate": Hook("K", None, ("side", "dt"), "thermal", "temperature"),
     # Factor on the pads' coefficient of friction at their ``surface`` temperature, degC.
     "pad_friction": Hook("1", 1.0, ("surface",), "thermal", "brake_torque"),
-    # Change of the disc temperature over ``dt`` by what the disc model lacks.
+    # Change of the disc temperature over ``dt`` that the disc model lacks.
     "disc": Hook("K", 0.0, ("heat_capacity", "disc", "ambient", "dt"), "thermal", "temperature"),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect. ``low`` and ``high`` bound it; ``prior`` is the size physics leads one to expect.
+    """One parameter of an effect. ``low`` and ``high`` bound it; ``prior`` is the size expected from physics.
 
     The term is linear, or nearly so, in its amplitudes and vanishes with them. A parameter with ``starts`` shapes the
-    term instead (a time constant, an order) and says nothing while the amplitudes are zero; the starts cover its range.
+    term instead (a time constant, an order) and has no effect while the amplitudes are zero; the starts cover its range.
 
     Attributes:
-        drawn: range from which blind trials draw it; None: not drawn. An effect takes part if all its parameters do.
-        group: amplitudes of one group stand or fall together (cosine and sine of one order).
+        drawn: range from which blind trials draw it; None: not drawn. Effects are drawn if all their parameters are.
+        group: amplitudes of one group are accepted or rejected together (cosine and sine of one order).
     """
 
     name: str
@@ -94,10 +95,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Placebo:
-    """What must destroy the finding: with it, the effect may not explain half of what it explains.
+    """A disturbance that must destroy the finding: with it, the effect must explain less than half of what it explains.
 
     Attributes:
-        text: what is disturbed, as the report says it.
+        text: what is disturbed, in the report's words.
         samples: (SAMPLE rows, episode of each row, random generator) → disturbed rows, over which the term then runs.
         signal: (the effect's ``signal`` at each sample, episode, random generator) → disturbed signal, which the term then
             follows; for effects that enter where a base parameter does (`Hook.like`) in proportion to their signal.
@@ -116,12 +117,12 @@ class Placebo:
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A shape that is looked for over all of its range: the order of a cosine and sine over the motor angle.
+    """A shape that is searched over its whole range: the order of a cosine and sine over the motor angle.
 
     Attributes:
         order, cosine, sine: names of the parameters.
         whole: the order is a whole number, chosen and not fitted.
-        grows_with: signal that the harmonic's amplitude is proportional to, or None.
+        grows_with: signal to which the harmonic's amplitude is proportional, or None.
     """
 
     order: str
@@ -133,22 +134,22 @@ class Harmonic:
 
 @dataclass(frozen=True)
 class Effect:
-    """What the estimator, the calibration and diagnose need to know of an effect.
+    """Description of an effect for the estimator, the calibration and diagnose.
 
     Attributes:
         hook: where it enters, one of `HOOKS`.
-        term: what it adds there, compiled (`emb_daemon.jit.njit`), exactly zero at zero amplitudes. Its arguments are asked
-            for by name: ``p`` its parameters, ``s`` its state, ``value``, what the hook offers, and where terms may add, too,
-            the ``signals`` that they see (`effects.terms.SIGNALS`).
+        term: function that gives the amount to add, compiled (`emb_daemon.jit.njit`), exactly zero at zero amplitudes. The
+            names of its arguments select what it gets: ``p`` its parameters, ``s`` its state, ``value``, the arguments of the
+            hook and, at hooks that are ports of terms, their ``signals`` (`effects.terms.SIGNALS`).
         equation: the term as an engineer writes it.
         source: paper, standard or textbook.
-        state: numpy dtype of what the running term remembers, or None.
-        signal: what the effect is a function of; evidence is plotted over it.
-        manoeuvre: what a driver of the rig does to make it visible and tell it from others.
-        placebos: what must destroy the finding.
-        harmonic: how its shape is looked for, if it is a harmonic of the motor angle.
-        beside: effect of which it is one more element, and without which it is not looked for.
-        bare: whether it is looked for only on an actuator that clamps nothing.
+        state: numpy dtype of the term's state, or None.
+        signal: signal of which the effect is a function; evidence is plotted over it.
+        manoeuvre: what to do on the rig to make the effect visible and to distinguish it from others.
+        placebos: disturbances that must destroy the finding.
+        harmonic: how its shape is searched, if it is a harmonic of the motor angle.
+        beside: effect of which it is an additional element, and without which it is not tried.
+        bare: whether it is tried only on an actuator that clamps nothing.
     """
 
     name: str
@@ -210,13 +211,13 @@ def plain(function: Callable) -> Callable:
 
 
 def of_another_episode(signal: np.ndarray, episode: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Each episode gets another one's mean: temperatures mostly rise in a log, so one shifted in time is much the same."""
+    """Each episode gets the mean of another one. Temperatures mostly rise in a log, so a shift in time would change little."""
     count = np.maximum(np.bincount(episode), 1)
     return random.permutation(np.bincount(episode, signal) / count)[episode]
 
 
 def at_another_time(*fields: str) -> Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]:
-    """Some fields of the samples as they were a quarter to three quarters of the log earlier, as if it were a circle."""
+    """Shifts some fields of the samples by a quarter to three quarters of the log, cyclically."""
 
     def disturb(samples: np.ndarray, _episode: np.ndarray, random: np.random.Generator) -> np.ndarray:
         shift = int(len(samples) * random.uniform(0.25, 0.75))

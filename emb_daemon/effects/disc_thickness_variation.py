@@ -16,14 +16,14 @@ from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 ORDERS = 4
 #: Those that discs commonly have.
 _COMMON_ORDERS = 2
-#: What a wheel speed may be off by where the counter does not correct it: a hundredth, and half a count of the wire, rad/s.
+#: Error of the wheel speed while the counter does not correct it: a hundredth, and half a count on the bus, rad/s.
 _SPEED_ERROR, _SPEED_ERROR_RAD_PER_S = 0.01, 0.025
-#: Phase, rad, that the disc may be off by: from here the mean thickness is the better guess; and half of what the counter
-#: counts before it begins anew, from where nothing tells its turn.
+#: Phase error, rad, from which the mean thickness is the better estimate; and half of the counter's range, from which the turn
+#: is unknown.
 _GUESSED_RAD, _LOST_RAD = 1.0, pi * PULSE_MODULO / PULSES_PER_TURN
 
-#: ``unseen``: phase (rad) by which the wheel may be off since the counter was last heard; ``sigma``: thickness (m, standard
-#: deviation) that this leaves open.
+#: ``unseen``: possible phase error (rad) since the last value of the counter; ``sigma``: standard deviation of the thickness
+#: (m) that follows.
 _STATE = np.dtype([("wheel", WHEEL), ("unseen", "f8"), ("sigma", "f8")], align=True)
 
 
@@ -48,7 +48,7 @@ def term(p, s, m):
         angle = track(s.wheel, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
         s.unseen = 0.0
     elif s.wheel.known and m.has_wheel_speed:
-        # The counter is silent or was: the speed carries the wheel on.
+        # Without new values of the counter the wheel speed continues the angle.
         s.wheel.turned += m.wheel_speed * m.dt
         s.unseen += (_SPEED_ERROR * m.wheel_speed + _SPEED_ERROR_RAD_PER_S) * m.dt
         angle = s.wheel.turned
@@ -67,7 +67,7 @@ def term(p, s, m):
 
 
 def _from_anywhere(samples, episode, random):
-    """Each episode begins at another place of the disc."""
+    """Placebo: each episode begins at another angle of the disc."""
     disturbed = samples.copy()
     offset = random.integers(0, PULSES_PER_TURN, episode[-1] + 1)[episode]
     disturbed["wheel_pulse"] = np.mod(samples["wheel_pulse"] + offset, PULSE_MODULO)
@@ -75,7 +75,7 @@ def _from_anywhere(samples, episode, random):
 
 
 def _of_another_size(samples, _episode, random):
-    """A wheel that turns at another ratio: orders that no disc has."""
+    """Placebo: a wheel that turns at another ratio, which gives orders that no disc has."""
     ratio = random.choice((0.63, 1.41, 2.57, 3.37))
     disturbed = samples.copy()
     known = samples["has_wheel_pulse"]

@@ -24,7 +24,7 @@ def term(p, m, travel):
 
 
 def _off(order: float) -> tuple[float, ...]:
-    """Orders of no simple ratio to the one found: what is no ripple is there as well."""
+    """Placebo: orders without a simple ratio to the one found; anything that is not a ripple shows there as well."""
     return 0.73 * order, 1.37 * order
 
 

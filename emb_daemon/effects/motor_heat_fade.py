@@ -1,7 +1,7 @@
 """Torque constant falling as the motor heats itself: the winding warms with the square of its current, and warms the magnets.
 
-No sensor is near. What the current has left in winding and housing is followed by one lag, whose time constant comes from the
-data; what surrounds the motor is for `torque_constant_fade`.
+No sensor is near the magnets. The heat of the current in winding and housing is modelled by one lag, whose time constant is
+fitted; heat from the surroundings of the motor is in `torque_constant_fade`.
 """
 
 from math import exp

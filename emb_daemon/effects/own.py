@@ -1,4 +1,4 @@
-"""An effect from outside the package, for a program that tries one out before it moves in."""
+"""An effect from outside of the package, for programs that try one out."""
 
 import inspect
 import sys
@@ -10,9 +10,9 @@ from emb_daemon.jit import depend_on
 
 
 def extend(effect: Effect) -> None:
-    """Add ``effect`` to the registry: estimator, calibration files and diagnose of this process know it from now on.
+    """Add ``effect`` to the registry, for the estimator, calibration files and diagnose of this process.
 
-    The estimator's records and hooks are made of the registry when they are imported, so this comes before.
+    Must be called before the estimator is imported, because its records and hooks are made from the registry then.
 
     Raises:
         RuntimeError: the estimator is imported already.

@@ -10,7 +10,7 @@ STATE = np.dtype([("energy_MJ", "f8")], align=True)
 
 @njit
 def term(p, s, power, dt):
-    """Thickness in m that both pads have gained (so, lost) since power-on by friction of ``power`` W."""
+    """Thickness in m by which both pads have grown (wear is negative) since power-on by friction of ``power`` W."""
     if p.wear_um_per_MJ == 0.0:
         return 0.0
     s.energy_MJ += 1e-6 * power * dt

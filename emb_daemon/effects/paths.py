@@ -1,4 +1,4 @@
-"""The effects at work: where each hook stands in the physics, as `estimator.step` calls it.
+"""The hooks at their places in the physics, as `estimator.step` calls them.
 
 A hook's function is written from the registry when this module is imported: one line for each effect that enters there, in the
 order of the registry, which compiled code then calls directly. numba keeps it on disk under the digest of all sources
@@ -28,18 +28,18 @@ def _source(name: str, hook: Hook) -> str:
 
 def _compose(name: str):
     scope = {effect.name: effect.term for effect in effects.REGISTRY} | {"__name__": __name__}
-    # numba's cache on disk wants a file that exists; this one's content decides together with the registry's.
+    # numba's cache on disk needs an existing file; the content of this one and of the registry decide.
     exec(compile(_source(name, HOOKS[name]), __file__, "exec"), scope)
     return njit(scope[name])
 
 
-#: Whether an effect sees what terms see, which is followed without any term then.
+#: Whether an effect uses the signals of terms, which must then be computed even without a term.
 _WATCHED = any("signals" in effect.arguments for effect in effects.REGISTRY)
 
 
 @njit
 def look(e, s, p, m):
-    """What terms see and add at this sample."""
+    """Signals and amounts of terms at this sample."""
     if _WATCHED or e.count > 0:
         terms.look(e, s, p, m)
 

@@ -14,7 +14,7 @@ EFFECT = Effect(
     name="signal_delay",
     hook="motor_angle",
     term=term,
-    # Undone to first order: fifty milliseconds of a slow stroke, a cycle and a half of a fast one.
+    # First-order correction: good for fifty milliseconds of a slow stroke, and for a cycle and a half of a fast one.
     parameters=(Parameter("delay_s", "s", -0.05, 0.05, 0.001, "age of the angle", drawn=(0.0, 0.006)),),
     equation="θ → θ + d ω",
     source="first-order hold of a delayed sample",

@@ -1,8 +1,8 @@
-"""Terms that no catalogue holds: data in a calibration, evaluated by this one bounded kernel in the same step as all else.
+"""Terms that are not in the catalogue: data in a calibration, evaluated by one bounded kernel in the estimator's step.
 
 A term is coefficient × shape(memory(signal)) × gate at one port of the physics. `emb_daemon.diagnose.grammar` makes them;
-`Calibration.terms` holds them, checked when the file is loaded. Nothing executable comes from a file. Without terms the kernel
-is not called.
+`Calibration.terms` contains them, checked when the file is loaded. A file never contains code. Without terms the kernel is not
+called.
 """
 
 from math import cos, exp, hypot, sin, sqrt
@@ -12,7 +12,7 @@ import numpy as np
 from emb_daemon.jit import fields, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
-#: Most terms of one calibration.
+#: Largest number of terms in a calibration.
 MOST = 4
 
 #: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
@@ -21,7 +21,7 @@ PORTS = (
     "pad_friction", "current", "relaxation_time",
 )  # fmt: skip
 #: Signals and their units. Forces are those of the stiffness path, temperatures and brake torque the models' own; heat of the
-#: motor is that of the estimator's winding and housing, as a share of what the largest force's current leaves for ever.
+#: motor is that of the estimator's winding and housing, as a share of the steady value at the largest force's current.
 SIGNALS = {
     "motor_angle": "rad",
     "travel": "rad",
@@ -42,8 +42,8 @@ SIGNALS = {
     "surface_temperature": "°C",
     "friction_power": "W",
 }
-#: What a term remembers of its signal x: nothing; z of τ dz/dt + z = x; z − x, what is still to come; a Maxwell slip element
-#: of stretch ``memory_scale``, z in [-1, 1]; a response: the same lag of what the shape makes of x.
+#: Memory of a term's signal x: none; lag: z of τ dz/dt + z = x; deficit: z − x; slip: a Maxwell slip element of stretch
+#: ``memory_scale``, z in [-1, 1]; response: the same lag, of the output of the shape.
 MEMORIES = ("none", "lag", "deficit", "slip", "response")
 #: Of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
 SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset", "harmonic", "bump")
@@ -69,8 +69,8 @@ TERM = np.dtype(
     align=True,
 )
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` by port; ``sigma`` and ``torque_sigma``: standard deviations of the static force (N) and of the torque (N m) by
-#: what terms add outside their range.
+#: ``added`` by port; ``sigma`` and ``torque_sigma``: standard deviations of the static force (N) and of the torque (N m) that
+#: terms outside of their range cause.
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
@@ -109,7 +109,7 @@ def _follow(signal, s, m):
 
 @njit
 def _remembered(q, t, k, x, dt):
-    """What term ``k`` makes of the history of ``x``."""
+    """Signal ``x`` of term ``k`` after its memory."""
     if q.memory == _NONE:
         return x
     if t.begun[k] == 0:
@@ -161,7 +161,7 @@ def _gate(q, signal, maximum_force):
 
 @njit
 def _value(q, t, k, dt, maximum_force):
-    """What term ``k`` adds at its port, in the port's unit; outside its range what it adds at the edge."""
+    """Amount that term ``k`` adds at its port, in the port's unit; outside its range the amount at the edge."""
     x = t.signal[q.signal]
     if not np.isfinite(x):
         return 0.0
@@ -177,8 +177,8 @@ def _value(q, t, k, dt, maximum_force):
 
 @njit
 def _outside_sigma(q, x, added):
-    """Standard deviation in the port's unit: of the coefficient, and the term's own size for each width of its range that the
-    signal is outside."""
+    """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of the signal
+    from its range, in widths of the range."""
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
     if not outside > 0.0:
         return 0.0
@@ -187,7 +187,7 @@ def _outside_sigma(q, x, added):
 
 @njit
 def _of_force(port, s):
-    """Static force (N) by what comes to a port, per its unit."""
+    """Static force (N) per unit that is added at a port."""
     if port == _STIFFNESS:
         return s.force
     return 1.0 if port == _STATIC_FORCE else s.slope
@@ -195,7 +195,7 @@ def _of_force(port, s):
 
 @njit
 def _of_torque(port, s, p, m):
-    """Torque (N m) by what comes to a port, per its unit."""
+    """Torque (N m) per unit that is added at a port."""
     if port == _TORQUE:
         return 1.0
     if port == _GEAR_GAIN:
@@ -230,14 +230,14 @@ def look(e, s, p, m):
 @njit
 def _follow_all(e, t, signals, dt, maximum_force, values):
     for row in range(len(signals)):
-        # Its own, and those that gates look at.
+        # The term's own signal, and those of the gates.
         for which in (e.signal, _FORCE, _SPEED, _WHEEL):
             t.signal[which] = signals[row, which]
         values[row] = _value(e, t, 0, dt[row], maximum_force)
 
 
 def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
-    """What a term (TERM) adds at its port over signals, shape (n, signals), ``dt`` s apart, in the port's unit."""
+    """Amount that a term (TERM) adds at its port for signals of shape (n, signals), ``dt`` s apart, in the port's unit."""
     values = np.zeros(len(signals))
     _follow_all(term, np.zeros(1, STATE)[0], signals, dt, maximum_force_N, values)
     return values

@@ -15,7 +15,7 @@ STATE = np.dtype([("known", "i8", 2), ("smoothed", "f8", 2)], align=True)
 
 @njit
 def term(p, s, side, value, dt):
-    """What to add to the reading ``value``, K."""
+    """Correction of the reading ``value``, K."""
     if p.lag_s == 0.0:
         return 0.0
     if s.known[side] == 0:

@@ -1,7 +1,7 @@
 """Torque constant falling with the temperature of the motor's magnets.
 
-The magnets' temperature is not measured. It lies between the caliper's, which is, and the disc's, which heats the motor
-from the other side: a share says where.
+The magnets' temperature is not measured. It lies between that of the caliper, which is measured, and that of the disc, which
+heats the motor from the other side; a share says where.
 """
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode

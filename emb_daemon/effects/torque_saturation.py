@@ -1,14 +1,15 @@
 """Torque constant falling with the present current: saturated iron carries less of the flux that makes torque.
 
 Flux linkage is odd in the current, so that its first departure from proportion is cubic and the torque constant's is
-quadratic. Where pads are clamped the current follows the force, and friction or a curve that bend a little look the same: on
-simulated brakes without it this effect was found. There a term is made of it, which has to stand out against a whole grammar.
+quadratic. On a brake the current follows the clamp force, and a slightly nonlinear friction or curve looks the same: this
+effect was found on simulated brakes without it. It is therefore tried only on bare actuators; on brakes `diagnose` can make a
+term of it, which is tested against the whole grammar.
 """
 
 from emb_daemon.effects.base import Effect, Parameter
 from emb_daemon.jit import njit
 
-#: Loss beyond which the quadratic is no description any more: a motor is built to stay far from it.
+#: Loss beyond which the quadratic is no longer valid; motors stay far below it.
 _MOST = 0.5
 
 

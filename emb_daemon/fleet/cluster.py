@@ -1,7 +1,7 @@
 """Work on a Dask cluster: an existing one by its scheduler's address, or processes of this machine.
 
-Tasks are small and their results are files that are whole or not there, so that Dask may run one again wherever a worker dies,
-and what a killed client left is gone on with.
+Tasks are small, and their results are files that are either complete or missing. Dask can therefore repeat a task when a
+worker dies, and a new client can continue the work of a killed one.
 """
 
 import contextlib
@@ -12,11 +12,11 @@ from typing import Any
 
 from emb_daemon.errors import InputError, Unavailable
 
-#: Workers that a task may take along before it is given up: a fault of the file, not of the machine.
+#: Number of workers that a task may kill before it is given up; then the file is at fault and not the machine.
 _LIVES = 3
-#: Tasks that the scheduler holds per worker: enough that none waits for the client, few enough that 10⁷ logs need no memory.
+#: Tasks that the scheduler holds per worker: enough that no worker waits for the client, few enough for 10⁷ logs.
 _AHEAD = 20
-#: A scheduler that does not answer for so long is not there, s.
+#: Time without an answer after which a scheduler counts as missing, s.
 _PATIENCE_S = 10
 
 
@@ -26,13 +26,13 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
 
     Args:
         address: of a scheduler (``tcp://host:8786``) whose workers see the data set; None: processes of this machine.
-        workers: of those; as many as there are cores if None.
+        workers: number of these processes; None: number of cores.
 
     Raises:
         Unavailable: no scheduler answers.
-        InputError: the address is none.
+        InputError: the address is not valid.
     """
-    # One thread each: a worker is a core, and BLAS must not think otherwise.
+    # One thread each: a worker uses one core, and BLAS must not start more threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import dask
     from distributed import Client, LocalCluster
@@ -74,9 +74,9 @@ def run(
     """``task(item)`` of every item, in their order.
 
     Args:
-        progress: called with how many are done of how many.
-        failed: what stands for an item whose task raises InputError or outlives no worker even when it runs alone, by item
-            and reason; such an error ends the work if None.
+        progress: called with the number of items done and of all items.
+        failed: gives, from item and reason, the result for an item whose task raises InputError or kills its worker even when
+            it runs alone. None: such an error ends the work.
 
     Raises:
         InputError: of a task, where ``failed`` is None.
@@ -124,7 +124,7 @@ def run(
         settle(row_of.pop(future.key), future, (InputError,))
         if (following := submit()) is not None:
             running.add(following)
-    # Dask blames a worker's death on every task that lay there: to blame is who kills one when it is alone.
+    # Dask blames a worker's death on every task that was there. Each is repeated alone to find the one that kills a worker.
     for row in suspects:
         settle(row, client.submit(task, items[row], pure=False), (InputError, KilledWorker))
     return results

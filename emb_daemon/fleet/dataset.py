@@ -1,13 +1,13 @@
-"""A fleet's data set: a folder that every worker sees, Parquet partitioned by unit, corner and day, nothing else.
+"""A fleet's data set: a folder that every worker can access, Parquet partitioned by unit, corner and day.
 
 ::
 
     drives/unit=…/corner=…/day=…/DIGEST.parquet     samples of one log, DIGEST the beginning of the log's SHA-256
-    ingested/DIGEST.json                            what became of each log file, damaged ones too
+    ingested/DIGEST.json                            result for each log file, damaged ones included
     estimates/…, figures/…                          `fleet replay`, partitioned alike
     evidence/…, learned/…                           `fleet diagnose`, `fleet learn`: one file for each unit and corner
 
-Files are whole at every moment and are never changed; who writes one twice writes the same bytes.
+Files are complete at every moment and are never changed; writing a file again gives the same bytes.
 """
 
 import datetime
@@ -25,7 +25,7 @@ from emb_daemon.logs.columns import References
 from emb_daemon.offline.log import Log
 from emb_daemon.wire.frames import FRAME
 
-#: Characters of a log's SHA-256 that name it: 64 bits, no two alike among 10⁷ logs but for one chance in 10⁵.
+#: Characters of a log's SHA-256 in its name: 64 bits; among 10⁷ logs two are alike with a chance of one in 10⁵.
 DIGEST = 16
 _FORMAT, _KEY = 1, b"emb_daemon"
 _FORCE = "clamp_force_ref_N"
@@ -48,11 +48,11 @@ class Drive:
 
 @dataclass(frozen=True)
 class About:
-    """What a drive's file says of its log, beside the samples.
+    """Information on the log in a drive's file, in addition to the samples.
 
     Attributes:
-        refused: frames of the corner and the car that E2E, sequence or range did not pass, by verdict.
-        notes: what the reader had to say: cut off, brought to our rate.
+        refused: frames of the corner and the car that failed the checks of E2E, sequence or range, by verdict.
+        notes: remarks of the reader: truncated, resampled to the daemon's rate.
     """
 
     source: str
@@ -70,10 +70,10 @@ def partition(unit: str, corner: str) -> Path:
 
 
 def folder_of(path: Path, *parts: str | Path) -> Path:
-    """A folder of the data set, made if it is not there.
+    """A folder of the data set, created if it does not exist.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: it cannot be created.
     """
     folder = Path(path, *parts)
     try:
@@ -84,7 +84,7 @@ def folder_of(path: Path, *parts: str | Path) -> Path:
 
 
 def write_drive(root: Path, drive: Drive, about: About, samples: np.ndarray, force_N: np.ndarray) -> Path:
-    """SAMPLE rows of one drive, and the reference force where a rig has one; whole or not at all."""
+    """Write SAMPLE rows of one drive, and the reference force if there is one; completely or not at all."""
     import pyarrow
     import pyarrow.parquet
 
@@ -105,14 +105,14 @@ def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
     """A drive as it was ingested.
 
     Raises:
-        InputError: no such drive, or not a file of ours.
+        InputError: no such drive, or not a file of a data set.
     """
     import pyarrow
     import pyarrow.parquet
 
     path = Path(root, "drives", drive.partition, f"{drive.digest}.parquet")
     try:
-        # The folders' names are no columns of ours.
+        # The names of the folders are not columns.
         table = pyarrow.parquet.ParquetFile(path).read(use_threads=False)
         described = json.loads(table.schema.metadata[_KEY])
         samples = np.zeros(len(table), SAMPLE)
@@ -130,7 +130,7 @@ def drives(root: Path) -> list[Drive]:
     """Everything ingested, by unit, corner and time.
 
     Raises:
-        InputError: nothing is.
+        InputError: nothing was ingested.
     """
     found = [Drive(**entry) for known in ingested(root) for entry in known["drives"]]
     if not found:
@@ -139,7 +139,7 @@ def drives(root: Path) -> list[Drive]:
 
 
 def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
-    """Drives of each unit's corners."""
+    """Drives by unit and corner."""
     groups: dict[tuple[str, str], list[Drive]] = {}
     for drive in found:
         groups.setdefault((drive.unit, drive.corner), []).append(drive)
@@ -147,13 +147,13 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
 
 
 def ingested(root: Path) -> list[dict]:
-    """What became of each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged one, its path's), ``notes``,
-    ``fault`` (empty if it is good) and its ``drives``."""
+    """Result for each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged file: of its path), ``notes``,
+    ``fault`` (empty if the file is good) and its ``drives``."""
     return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
 
 
 def note(root: Path, known: dict) -> None:
-    """Keep what became of a log file."""
+    """Store the result for a log file."""
     write_json(Path(root, "ingested", f"{known['sha256']}.json"), known)
 
 
@@ -164,7 +164,7 @@ def write_json(path: Path, content: dict) -> None:
 
 
 def forget(root: Path, known: dict) -> None:
-    """Take an earlier state of a log file out again."""
+    """Remove the data of an earlier state of a log file."""
     for entry in known["drives"]:
         drive = Drive(**entry)
         Path(root, "drives", drive.partition, f"{drive.digest}.parquet").unlink(missing_ok=True)

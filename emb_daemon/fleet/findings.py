@@ -1,4 +1,4 @@
-"""What the scores of a whole fleet say: batches, units, drift and season, each with its size in newtons and its chance."""
+"""Findings from the scores of a fleet: batches, units, drift and season, each with its size in newtons and its p-value."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -27,16 +27,16 @@ from emb_daemon.fleet.population import (
 )
 from emb_daemon.fleet.scores import Cause, Questions, Score
 
-#: Drift is stated per so many days, season per so many kelvins.
+#: Drift is stated per this number of days, season per this number of kelvins.
 PER_DAYS, PER_K = 30.0, 10.0
-#: A fleet is asked for drift if its drives span so many days, and for season if their surroundings span so many kelvins.
+#: Drift is tested if the drives span this number of days, season if the ambient temperature spans this number of kelvins.
 _LEAST_DAYS, _LEAST_K = 5, 5.0
-#: Least force that is worth saying, N: of a group two parts in a thousand of a usual stop of 5 kN, as `diagnose` has it of a
-#: log; of a single unit the same of the 18 kN that training reaches, or no workshop could confirm it.
+#: Least force that is reported, N. For a group: two thousandths of a usual stop of 5 kN, as in `diagnose` for a log. For a
+#: single unit: the same share of the 18 kN that training reaches, because a workshop could not confirm less.
 _LEAST_SHARED_N, _LEAST_UNIT_N = 10.0, 36.0
-#: Points of a trend.
+#: Number of points of a trend.
 _WINDOWS = 8
-#: Drives of a unit below which its own scatter is not known, and from which slopes over two covariates leave as many for it.
+#: Least number of drives of a unit for its own scatter, and for slopes over two covariates in addition.
 _LEAST_DRIVES, _SLOPE_DRIVES = 3, 6
 ALL = "all units"
 
@@ -44,15 +44,16 @@ Fleet = Mapping[tuple[str, str], Sequence[Score]]
 
 
 class Finding(msgspec.Struct, kw_only=True):
-    """Something that is not as calibrated, or as with the others.
+    """Something that differs from the calibration, or from the other units.
 
     Attributes:
         where: a level of a factor (``batch A``), ``all units``, or a unit and corner.
         units: how many share it.
-        cause, key, shape, amount, sigma, unit: see `scores.Cause`; ``amount`` over the others', or per 30 days or 10 K.
+        cause, key, shape, amount, sigma, unit: see `scores.Cause`; ``amount`` is the difference from the others, or the change
+            per 30 days or 10 K.
         size_N: RMS of its force in contact, with the amount's sign; ``sigma_N`` its standard deviation.
-        chance: of a false alarm among all that was asked: of a single false group, or of each unit named (q-value).
-        rivals: causes that explain nearly as much of the same.
+        chance: of a false alarm, corrected for all tests: for groups that any is false, for units the q-value.
+        rivals: causes that explain nearly as much.
         action: what to do next.
     """
 
@@ -72,7 +73,7 @@ class Finding(msgspec.Struct, kw_only=True):
 
 
 class Placed(msgspec.Struct, kw_only=True):
-    """One unit on the fleet's map: how far it is from its group in its worst cause, in standard deviations and N."""
+    """One unit on the fleet's map: its difference from its group in its worst cause, in standard deviations and N."""
 
     unit: str
     corner: str
@@ -109,7 +110,7 @@ class Trend(msgspec.Struct, kw_only=True):
 
 
 class Findings(msgspec.Struct, kw_only=True):
-    """All of it. ``silent``: why drives say nothing, by digest; ``left_out``: units that cannot be placed, and why."""
+    """All findings. ``silent``: why drives cannot be used, by digest; ``left_out``: units that cannot be placed, and why."""
 
     calibration: str
     first_day: str
@@ -134,7 +135,7 @@ def save(findings: Findings, root: Path) -> None:
 
 
 def load(root: Path) -> Findings:
-    """Raises InputError: none are there, or not ours."""
+    """Raises InputError: no such file, or not a file of findings."""
     path = Path(root, "findings.json")
     try:
         return msgspec.json.decode(path.read_bytes(), type=Findings)
@@ -148,7 +149,7 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
     """Factors by unit: a CSV file with a column ``unit``, and one for each factor (batch, supplier, plant, ...).
 
     Raises:
-        InputError: not such a file, or a unit twice.
+        InputError: not such a file, or a unit occurs twice.
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -173,13 +174,13 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
 def find(
     fleet: Fleet, questions: Questions, calibration: str, factors: Mapping[str, Mapping[str, str]], silent: Mapping[str, str]
 ) -> Findings:
-    """Everything that a fleet's scores say.
+    """All findings from a fleet's scores.
 
     Args:
-        factors: by unit and name, what units have in common: batch, supplier.
+        factors: by unit and name, properties that units share: batch, supplier.
 
     Raises:
-        InputError: too few units to tell one from the others.
+        InputError: too few units to distinguish one from the others.
     """
     slopes = np.median([len(scores) for scores in fleet.values()] or [0]) >= _SLOPE_DRIVES
     least = _SLOPE_DRIVES if slopes else _LEAST_DRIVES
@@ -195,7 +196,7 @@ def find(
 
 
 class _Study:
-    """The population's vectors, and findings made of them."""
+    """The vectors of the population, and the findings from them."""
 
     def __init__(self, fleet: Fleet, questions: Questions, factors: Mapping[str, Mapping[str, str]], slopes: bool):
         self.keys, self.scores, self.causes = list(fleet), list(fleet.values()), questions.causes
@@ -213,11 +214,11 @@ class _Study:
             self.covariates.append("warmth")
         self.units = [self._unit(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
         named = sorted({name for levels in factors.values() for name in levels})
-        # Corners differ by design: a front brake is no rear brake.
+        # Corners differ by design: front and rear brakes are different.
         self.levels = {"corner": np.array([corner for _, corner in self.keys])}
         self.levels |= {name: np.array([factors.get(unit, {}).get(name, "") for unit, _ in self.keys]) for name in named}
         self.levels = {name: levels for name, levels in self.levels.items() if len(set(levels.tolist())) > 1}
-        # Of all factors but the corner, whose difference is no finding.
+        # Of all factors except the corner, whose difference is by design.
         self.groups = {
             f"{name} {level}": levels == level
             for name, levels in self.levels.items() if name != "corner"
@@ -323,7 +324,7 @@ class _Study:
         return result
 
     def _trends(self, shared: Sequence[Shared], drifts: Sequence[Finding], readings: Readings) -> list[Trend]:
-        """What batches share and what drifts, window by window, over all drives of the group together."""
+        """Trends of the causes that batches share and of drifts, by windows of time, over all drives of a group together."""
         names = [str(cause) for cause in self.causes]
         wanted = [(s.group, s.cause) for s in shared]
         wanted += [
@@ -350,7 +351,7 @@ class _Study:
 
 
 def _manoeuvre(cause: Cause) -> str:
-    """What makes a cause visible."""
+    """Words for the manoeuvre that makes a cause visible."""
     told = next((effect.manoeuvre for effect in REGISTRY if effect.name == cause.name), "")
     return f"to see it: {told or 'slow and fast strokes over all forces'}"
 

@@ -1,4 +1,4 @@
-"""Log files into the data set: each once, whatever its format; a damaged one is listed, and never ends the work."""
+"""Reads log files into the data set: each once, in any format; damaged files are listed and do not end the work."""
 
 import contextlib
 import hashlib
@@ -21,14 +21,14 @@ from emb_daemon.replay import corners_in
 from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, WHEEL_SPEED
 from emb_daemon.wire.receive import BAD_LENGTH, VERDICTS
 
-#: Where a path says whose log it is: the folder that it lies in.
+#: Default pattern for the unit in a path: the folder that contains the log.
 UNIT_OF_PATH = r"(?P<unit>[^/]+)/[^/]+$"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A log file to ingest. ``mapping``: file that maps another rig's signals to ours, or None; ``earlier``: what is known of
-    the same path with other content."""
+    """A log file to ingest. ``mapping``: file that maps another rig's signals to ours, or None; ``earlier``: the result
+    for the same path with other content."""
 
     path: Path
     unit: str
@@ -38,13 +38,13 @@ class Job:
 
 
 def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping: Path | None = None) -> list[Job]:
-    """What is not in the data set yet, by path, size and time of change.
+    """Log files that are not in the data set yet, by path, size and time of change.
 
     Args:
         pattern: regular expression that finds ``unit``, and ``day`` if it has such a group, in a log's absolute path.
 
     Raises:
-        InputError: the pattern is none, has no group ``unit``, or does not fit a path.
+        InputError: the pattern is not valid, has no group ``unit``, or does not match a path.
     """
     try:
         compiled = re.compile(pattern)
@@ -67,7 +67,7 @@ def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping
 
 
 def log_files(paths: Iterable[Path]) -> list[Path]:
-    """Files as given, and all logs in folders, in order.
+    """The given files, and all logs in the given folders, in order.
 
     Raises:
         InputError: no such file, or a folder without logs.
@@ -82,14 +82,14 @@ def log_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def give_up(root: Path, job: Job, reason: str) -> dict:
-    """Note a file that took its workers along."""
+    """Note a file that killed its workers."""
     known = _nothing_of(job) | {"fault": f"{job.path}: {reason}"}
     note(root, known)
     return known
 
 
 def _nothing_of(job: Job) -> dict:
-    """What is known of a file before it is read, see `dataset.ingested`: no content names it yet, its path does."""
+    """Result for a file before it is read, see `dataset.ingested`; it is named by its path, because its content is unknown."""
     size, mtime_ns = _stamp(job.path)
     digest = hashlib.sha256(str(job.path).encode()).hexdigest()
     return {
@@ -106,7 +106,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def ingest(root: Path, job: Job) -> dict:
-    """One log file; returns what became of it, see `dataset.ingested`."""
+    """Ingest one log file; returns the result, see `dataset.ingested`."""
     known, words = _nothing_of(job), io.StringIO()
     try:
         with contextlib.redirect_stderr(words):
@@ -145,7 +145,7 @@ def ingest_frames(
 
 
 def _refused(pipeline: Pipeline, index: int) -> dict[str, int]:
-    """Frames that were not taken, by verdict: the corner's own and the car's."""
+    """Number of refused frames by verdict: those of the corner and of the car."""
     own = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
     counts = own + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)
     return {VERDICTS[verdict]: int(counts[verdict]) for verdict in range(BAD_LENGTH, len(VERDICTS)) if counts[verdict]}

@@ -1,4 +1,4 @@
-"""What park brake adaptation learns of each unit over its drives, and what all units together say of the next one."""
+"""What adaptation learns of each unit over its drives, and a calibration for the next unit from all of them."""
 
 import json
 import tempfile
@@ -19,7 +19,7 @@ from emb_daemon.fleet.dataset import Drive, partition, read_drive, write_json
 from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
 from emb_daemon.offline import estimate
 
-#: Standard deviations between units that bounds of adaptation leave room for: one unit in 16 000 of a normal population.
+#: Width of adaptation's bounds, in standard deviations between units: one unit in 16 000 of a normal population is outside.
 _WIDTH = 4.0
 
 
@@ -28,9 +28,10 @@ def learned_path(root: Path, unit: str, corner: str) -> Path:
 
 
 def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict:
-    """One unit's drives in order, each a power-on with what was learned before: every training and its outcome.
+    """Adaptation over one unit's drives in order; each begins with a power-on and the values learned before. Returns every
+    training and its outcome.
 
-    ``resume``: what is there of the same drives and calibration is kept.
+    ``resume``: keep an existing result of the same drives and calibration.
 
     Raises:
         InputError: a drive's file is missing or damaged.
@@ -53,7 +54,7 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
             estimate(log.samples, parameters, new_state(4), adaptation)
             after = memory.read(corner)
             if after and after != before:
-                # A file that is full drops its oldest entry for a new one.
+                # A full history drops its oldest entry for a new one.
                 new = after.history[len(before.history) if before else 0 :] or after.history[-1:]
                 trainings += [{"day": drive.day, **msgspec.to_builtins(entry)} for entry in new]
     told |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
@@ -63,7 +64,7 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
 
 
 def population(root: Path, calibration: Calibration) -> dict[str, tuple[RandomEffects, int]]:
-    """By key of the calibration what the last accepted trainings of all units say together, and of how many units."""
+    """Random effects of the last accepted trainings of all units, by key of the calibration, and the number of units."""
     values: dict[str, list[tuple[float, float]]] = {}
     for path in sorted(Path(root, "learned").glob("unit=*/corner=*.json")):
         told = json.loads(path.read_bytes())
@@ -71,20 +72,21 @@ def population(root: Path, calibration: Calibration) -> dict[str, tuple[RandomEf
         if told["calibration"] != calibration_hash(calibration) or not accepted:
             continue
         for key, value in accepted[-1]["values"].items():
-            # A value without a standard deviation comes with others, as the curves of pads beside those mounted.
+            # A value without a standard deviation is set together with others, such as the curves next to the mounted pads'
+            # thickness.
             values.setdefault(key, []).append((value, accepted[-1]["sigmas"].get(key, 0.0)))
     return {key: (random_effects(*map(np.array, zip(*pairs, strict=True))), len(pairs)) for key, pairs in values.items()}
 
 
 def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, tuple[float, float, float, int]]]:
-    """The calibration that the next unit of this kind starts from: the population's means, with the standard deviation between
-    units as each key's sigma, clearance as uncertain as units differ, and bounds of adaptation as wide as they spread.
+    """Calibration for the next unit of this kind: the population's means, with the standard deviation between units as sigma
+    of each key and of the clearance, and bounds of adaptation from their spread.
 
     Returns:
         (calibration, {key: (mean, its standard deviation, spread between units, units)}).
 
     Raises:
-        InputError: too few units have learned anything.
+        InputError: too few units have an accepted training.
     """
     learned = population(root, calibration)
     least = 2 * LEAST_UNITS

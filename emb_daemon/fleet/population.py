@@ -1,12 +1,13 @@
-"""Units as a population: what each says with its uncertainty, what is common, what a batch shares, who is unlike the others.
+"""Statistics of units as a population: each unit with its uncertainty, what is common, what a batch shares, and outliers.
 
-A unit's drives add up to normal equations of all causes together (`scores`). Most causes are nearly collinear, so a unit is
-described in the few directions that its drives really tell apart (`Directions`), without naming anything. A cause is a known
-vector there. How much of it a unit shows is read along the direction that units' own scatter disturbs least: a friction that
-scatters by a tenth between healthy units says little, and what scatters less says more. That scatter is estimated from the
-fleet itself with single outliers left aside, and always from other units than the one that is read.
+The drives of a unit add up to normal equations of all causes together (`scores`). Most causes are nearly collinear, so a unit
+is described in the few directions that its drives can distinguish (`Directions`). A cause is a known vector in this space. The
+amount of a cause in a unit is measured along the direction that the scatter between units disturbs least: a friction that
+scatters by a tenth between healthy units is weak evidence, a quantity that scatters less is stronger evidence. The scatter is
+estimated from the fleet without outliers, and for each unit from other units only.
 
-Statistics count units, not drives and not samples: p-values come from how units of one batch differ among themselves.
+The sample size is the number of units, not of drives or samples: p-values come from the differences between units of one
+batch.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,24 +17,24 @@ import numpy as np
 
 from emb_daemon.fleet.scores import Score
 
-#: Directions whose information is below this share of the strongest one's say nothing that rounding and curvature do not.
+#: Directions whose information is below this share of the strongest one's are dominated by rounding and curvature.
 _TOLD_APART = 1e-5
-#: Share of units that describe the population's scatter at first, and passes after which it does not change any more.
+#: Share of units in the first estimate of the population's scatter, and number of passes after which it no longer changes.
 _CORE, _PASSES = 0.75, 20
 #: A unit whose distance is above this quantile of its chi-square is left out of the population's mean and scatter.
 _OUTLYING = 0.999
-#: Parts into which units are divided, each read with the scatter of the others.
+#: Number of parts of the population; each part is measured with the scatter of the others.
 _FOLDS = 10
 
 
 @dataclass(frozen=True)
 class Directions:
-    """What drives tell apart.
+    """Directions that the drives can distinguish.
 
     Attributes:
         basis: shape (causes, directions): scores times this are the coordinates of scores.
-        prints: shape (causes, directions): what one unit of each cause is there.
-        size_N: RMS (N) of one unit of each cause over samples in contact, the contact angle taken out.
+        prints: shape (causes, directions): vector of one unit of each cause.
+        size_N: RMS (N) of one unit of each cause over samples in contact, without the contact angle.
     """
 
     basis: np.ndarray
@@ -57,7 +58,7 @@ class Directions:
 
 @dataclass(frozen=True)
 class Unit:
-    """What one unit's drives say together.
+    """Result of all drives of one unit.
 
     Attributes:
         values: coordinates as linear functions of the covariates, shape (m, q).
@@ -71,9 +72,9 @@ class Unit:
 def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndarray) -> Unit:
     """One unit by least squares; ``covariates`` have shape (drives, m), the first of them 1.
 
-    What its drives do not tell is held at nothing, by as much as a hundredth of what an average drive tells. The covariance
-    counts drives: it is made of what each adds to the equations at the solution (the sandwich of White, Econometrica 48,
-    1980).
+    Directions about which its drives say little are drawn to zero, with a hundredth of the information of an average drive.
+    The covariance counts drives: it is made of each drive's contribution to the equations at the solution (the sandwich of
+    White, Econometrica 48, 1980).
     """
     basis, (drives, count) = directions.basis, covariates.shape
     size = basis.shape[1]
@@ -89,11 +90,11 @@ def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndar
 
 
 def scatter_of(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How units differ that nothing sets apart: mean (q,) and covariance (q, q) of most rows, (N, q), whatever the others are.
+    """Scatter of ordinary units: robust mean (q,) and covariance (q, q) of most rows, (N, q), whatever the others are.
 
     Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
-    then once more with all that are not outlying. The covariance is drawn towards ``noise``, that of one row by its own
-    drives, with the weight of as many rows as it has columns: few units say little of all directions."""
+    then once more with all rows that are not outliers. The covariance is drawn towards ``noise``, that of one row by its own
+    drives, with the weight of as many rows as it has columns, because few units do not determine all directions."""
     count = len(units)
     mean = np.median(units, axis=0)
     spread = 1.4826 * np.median(np.abs(units - mean), axis=0)
@@ -117,7 +118,7 @@ def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """Which squared distances are those of a normal population whose median they have."""
+    """Which squared distances belong to a normal population with their median."""
     from scipy.stats import chi2
 
     size = units.shape[1]
@@ -129,22 +130,22 @@ def _distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 class Readings:
-    """How much of each cause each unit shows, read along the direction that the other units' scatter disturbs least.
+    """Amount of each cause in each unit, measured along the direction that the other units' scatter disturbs least.
 
     Args:
         units: shape (N, q).
-        centre: what the units' groups have in common, shape (N, q); scatter is about it.
+        centre: centre of each unit's groups, shape (N, q); scatter is about it.
         prints: of the causes, shape (K, q).
         noise: covariance of each unit by its own drives, shape (N, q, q).
 
     Attributes:
-        ordinary: units that are like the others, shape (N,).
-        filters: by unit and cause, what its vector is read with, shape (N, K, q).
+        ordinary: units that are not outliers, shape (N,).
+        filters: by unit and cause, weights that measure its vector, shape (N, K, q).
         inverse: of the scatter's covariance, mean over the parts, shape (q, q).
     """
 
     def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray):
-        # Of few drives not even the noise is known in all directions: half of it is taken as independent.
+        # With few drives even the noise is not known in all directions: half of it is taken as independent.
         typical = noise.mean(axis=0)
         typical = 0.5 * (typical + np.diag(np.diag(typical)))
         fold = np.arange(len(units)) % min(_FOLDS, len(units))
@@ -179,11 +180,11 @@ class Shared:
     """A cause that a group of units shares.
 
     Attributes:
-        group, cause: which; ``cause`` is a row of the prints.
+        group, cause: indices; ``cause`` is a row of the prints.
         amount, sigma: of the cause.
-        p_value: that there is nothing, over units.
-        chance: the same over all groups and causes that were asked (Holm, Scandinavian J. of Statistics 6, 1979): a batch is
-            called back on one accusation, so that none may be false.
+        p_value: of the hypothesis that there is no difference, over units.
+        chance: the same, corrected for all tested groups and causes (Holm, Scandinavian J. of Statistics 6, 1979): a batch is
+            recalled because of a single finding, so that no finding may be false.
         rivals: causes that would explain nearly as much.
     """
 
@@ -196,23 +197,23 @@ class Shared:
     rivals: tuple[int, ...]
 
 
-#: Chance of one false accusation of a group, share of false ones among the units accused, and the share of the winner's gain
-#: from which another cause is not told apart.
+#: Largest chance of any false group, largest share of false units among those reported, and share of the best cause's gain
+#: from which another cause counts as not distinguishable.
 SURE, FALSE_UNITS, _RIVAL = 0.01, 0.01, 0.8
-#: What a group's next cause explains at least of what its first did: of a shape a fifth off a twenty-fifth is left.
+#: Least gain of a group's next cause, as a share of the first one's: a shape that is wrong by a fifth leaves a twenty-fifth.
 _SECOND = 0.1
-#: Groups of fewer units than this are not accused, nor do they describe their own centre.
+#: Groups of fewer units are neither reported nor used for a centre of their own.
 LEAST_UNITS = 3
 
 
 def shared_causes(
     units: np.ndarray, groups: Mapping[str, np.ndarray], prints: np.ndarray, readings: Readings, beside: bool
 ) -> list[Shared]:
-    """What groups of units share, one after the other, the strongest first, until nothing is sure.
+    """Causes that groups of units share, one after the other, the strongest first, until none is significant.
 
     Args:
         groups: masks of the units, shape (N,).
-        beside: groups are compared with all other units; otherwise with nothing.
+        beside: compare groups with all other units; otherwise with zero.
     """
     rows = readings.ordinary
     chosen: list[tuple[str, int]] = []
@@ -252,7 +253,7 @@ def shared_causes(
 
 
 def _compared(inside: np.ndarray, outside: np.ndarray | None) -> tuple[float, float, float]:
-    """(p-value, difference, its standard deviation) of two sets of units by Welch's test, or of one against nothing."""
+    """(p-value, difference, its standard deviation) of two sets of units by Welch's test, or of one set against zero."""
     from scipy.stats import ttest_1samp, ttest_ind
 
     test = ttest_1samp(inside, 0.0) if outside is None else ttest_ind(inside, outside, equal_var=False)
@@ -277,8 +278,8 @@ def _together(
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit that is unlike its group, as `Shared`; ``sigma`` is by how much units differ, ``chance`` the q-value over all
-    (Benjamini and Hochberg): a unit is looked at in a workshop, and a known share of visits may be in vain."""
+    """A unit that differs from its group, with fields as in `Shared`. ``sigma`` is the scatter between units, ``chance`` the
+    q-value over all (Benjamini and Hochberg): a unit is only inspected in a workshop, so a known share may be false."""
 
     row: int
     cause: int
@@ -289,8 +290,8 @@ class Outlier:
 
 
 def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
-    """Units unlike their group, shape (N, q) about its centre, the most unlike first; each by more than units differ, and by
-    more than its own drives do."""
+    """Units that differ from their group, shape (N, q) about its centre, largest difference first. The difference must exceed
+    both the scatter between units and that between the unit's own drives."""
     from scipy.stats import false_discovery_control
     from scipy.stats import t as student
 
@@ -298,7 +299,7 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
     freedom = max(int(rows.sum()) - 1, 1)
     spread = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom)
     size = amounts / np.maximum(np.maximum(spread, readings.noise()), 1e-300)
-    # As many questions as causes were asked of each unit.
+    # Corrected for the number of causes that were tested for each unit.
     chances = np.minimum(1.0, 2.0 * student.sf(np.abs(size), freedom).min(axis=1) * size.shape[1])
     q_values = false_discovery_control(chances)
     found = []
@@ -312,7 +313,7 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
 
 
 def centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """What each unit's groups have in common, shape (N, q): medians by level, one factor after the other."""
+    """Centre of each unit's groups, shape (N, q): medians by level, one factor after the other."""
     left = units - np.median(units, axis=0)
     for levels in factors.values():
         for level in np.unique(levels):
@@ -328,7 +329,7 @@ class RandomEffects:
 
     Attributes:
         mean, sigma: of the population, and the mean's standard deviation.
-        spread: standard deviation between units, noise taken out.
+        spread: standard deviation between units, without noise.
     """
 
     mean: float
@@ -344,7 +345,7 @@ def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
         weight = variance / np.maximum(sigmas**2 + share * variance, 1e-300)
         return float(weight @ (values - weight @ values / weight.sum()) ** 2) / variance - (len(values) - 1)
 
-    # As a share of the values' own variance: the root finder's tolerance knows no units.
+    # Relative to the values' own variance, because the root finder's tolerance has no unit.
     variance = max(float(np.var(values, ddof=1)) if len(values) > 1 else 0.0, 1e-300)
     spread_2 = brentq(excess, 1e-9, 10.0) * variance if len(values) > 1 and excess(1e-9) > 0.0 > excess(10.0) else 0.0
     weight = 1.0 / np.maximum(sigmas**2 + spread_2, 1e-300)

@@ -16,7 +16,7 @@ def figures_path(root: Path, drive: Drive) -> Path:
 
 
 def is_replayed(root: Path, drive: Drive, calibration: str) -> bool:
-    """Whether a drive's estimates are there, of the calibration with this hash."""
+    """Whether a drive's estimates exist, with the calibration of this hash."""
     try:
         return json.loads(figures_path(root, drive).read_bytes())["calibration"] == calibration
     except (OSError, ValueError, KeyError):
@@ -36,6 +36,6 @@ def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict:
     write_table(folder / f"{drive.digest}.parquet", table_columns(estimates, 1e-9 * log.time_ns))
     figures = result.figures() | {"log": about.source, "refused": about.refused, "notes": about.notes}
     figures["calibration"] = calibration_hash(calibration)
-    # After the estimates: who finds the figures finds those too.
+    # Written after the estimates, so that existing figures imply existing estimates.
     write_json(figures_path(root, drive), figures)
     return figures

@@ -1,9 +1,9 @@
-"""What one drive without force sensor says: how the disagreement of its force paths answers to everything that might cause it.
+"""Scores of one drive without force sensor: how the disagreement of its force paths depends on every possible cause.
 
-The causes are the calibration's own parameters and every effect of the registry in each of its starting shapes: whatever
-`diagnose` would free or try on one log, here for thousands, so that nothing is fitted in a single drive. Each drive leaves the
-second moments of the regressors and the residual, from which any later question (a unit, a batch, a month) is answered by
-adding. The contact angle is each drive's own and is taken out at once.
+The causes are the calibration's own parameters and every effect of the registry in each of its starting shapes, that is,
+everything that `diagnose` would free or try on one log. Nothing is fitted in a single drive. Of each drive the second moments
+of regressors and residual are stored; any later test (of a unit, a batch, a month) adds them up. The contact angle differs
+from drive to drive and is eliminated at once.
 """
 
 import json
@@ -26,12 +26,12 @@ from emb_daemon.errors import InputError
 from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
 from emb_daemon.offline import Log
 
-#: Force (N) above which the pads touch: what a cause does is stated as RMS over such samples.
+#: Force (N) above which the pads touch; the size of a cause is its RMS over such samples.
 LOADED_N = 300.0
-#: Motor travel (rad) in contact below which a drive has no brake application to tell anything: one of 3 kN.
+#: Motor travel (rad) in contact that a drive needs: a brake application of 3 kN.
 _LEAST_TRAVEL_RAD = 10.0
-#: The contact angle is found before anything else, by Newton's steps: until one moves it by less than over what the curve's
-#: slope changes by a fiftieth (rad), and at most so many. A drive that begins clamped does not get there.
+#: The contact angle is found first, by Newton steps: until a step is smaller than the angle (rad) over which the curve's slope
+#: changes by a fiftieth, and at most this number. For a drive that begins clamped they do not converge.
 _SETTLED_RAD, _STEPS = 0.1, 6
 #: Residual of a log without reference.
 _CHANNEL = "innovation"
@@ -40,13 +40,13 @@ _FORCE_CHANNELS = ("stiffness", "torque")
 
 @dataclass(frozen=True)
 class Cause:
-    """A number in which units may differ.
+    """A quantity in which units may differ.
 
     Attributes:
         key: of the calibration.
         name: the effect's, or the key of a base parameter.
         shape: value of the effect's shape parameter with which it is tried, or None.
-        unit: of one; base parameters count in multiples of their size.
+        unit: unit of the amount; base parameters are in multiples of their size.
     """
 
     key: str
@@ -60,13 +60,13 @@ class Cause:
 
 @dataclass(frozen=True)
 class Score:
-    """What a drive says.
+    """Scores of one drive.
 
     Attributes:
-        products: second moments of the causes' regressors and, last, the residual, the contact angle taken out, shape
+        products: second moments of the causes' regressors and, last, of the residual, without the contact angle, shape
             (causes + 1, causes + 1), in the causes' units and N.
-        loaded: samples with the pads in contact.
-        ambient_C: of the surroundings, NaN if nobody said.
+        loaded: number of samples with the pads in contact.
+        ambient_C: ambient temperature, NaN if unknown.
     """
 
     drive: Drive
@@ -76,12 +76,12 @@ class Score:
 
 
 def is_periodic(effect: Effect) -> bool:
-    """Whether an effect has a phase. It counts from where wheel and motor stood at power-on: it is another in each drive."""
+    """Whether an effect has a phase. The phase counts from the position at power-on, so it differs from drive to drive."""
     return effect.harmonic is not None or any(p.group for p in effect.parameters)
 
 
 class Questions:
-    """The causes, and how drives are asked for them, under one calibration.
+    """The causes under one calibration, and the computation of scores for them.
 
     Attributes:
         causes: in the order of a score's columns.
@@ -117,12 +117,12 @@ class Questions:
         )
 
     def ask(self, log: Log, drive: Drive) -> Score:
-        """One drive.
+        """Scores of one drive.
 
         Raises:
-            InputError: it cannot tell anything; says why.
+            InputError: the drive cannot be used; says why.
         """
-        # What a fleet is asked must be the same of every unit, a rig's force sensor or not.
+        # All units must be treated alike, with or without a force sensor.
         bench = Bench([replace(log, force_N=np.full(len(log.samples), np.nan))], self.calibration, workers=1)
         values = {self._contact: self._contact.start}
         for _ in range(_STEPS):
@@ -137,7 +137,7 @@ class Questions:
         else:
             raise InputError("the contact angle is not found; does the drive begin with the brake applied?")
         table = np.column_stack([*others, residual[_CHANNEL]])
-        # The curve's coefficients, each by its own size: together, the force.
+        # The curve's coefficients together, each by its own size, are the scale of the force.
         curve = [row for row, cause in enumerate(self.causes) if cause.key.startswith("stiffness.curves")]
         loaded = np.abs(table[:, curve].sum(axis=1)) > LOADED_N
         samples = log.samples
@@ -149,9 +149,9 @@ class Questions:
 
 
 def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
-    """Ask every drive of one unit's corner and keep what they say; returns why some say nothing, by digest.
+    """Compute and store the scores of every drive of one unit's corner; returns why some cannot be used, by digest.
 
-    ``resume``: what is there of the same calibration is kept.
+    ``resume``: keep existing scores of the same calibration.
     """
     questions, path = Questions(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
@@ -190,7 +190,7 @@ def _write(path: Path, calibration: Calibration, causes: Sequence[Cause], scores
 
 
 def read_scores(path: Path, calibration: Calibration) -> tuple[list[Score], dict[str, str]]:
-    """What was kept of one unit's corner; nothing if it was asked under another calibration."""
+    """Stored scores of one unit's corner; none if they are of another calibration."""
     with np.load(path) as file:
         said = json.loads(file["said"].tobytes())
         if said["calibration"] != calibration_hash(calibration):
@@ -208,7 +208,7 @@ def read_scores(path: Path, calibration: Calibration) -> tuple[list[Score], dict
 
 
 def read_fleet(root: Path, calibration: Calibration) -> dict[tuple[str, str], list[Score]]:
-    """What was kept of every unit and corner under this calibration, units without a telling drive left out."""
+    """Stored scores of every unit and corner with this calibration, without units that have no usable drive."""
     result = {}
     for path in sorted(Path(root, "evidence").glob("unit=*/corner=*.npz")):
         scores, _ = read_scores(path, calibration)

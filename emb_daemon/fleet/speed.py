@@ -16,7 +16,7 @@ from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
 
-#: Each stage is run so often; the fastest counts, what else the machine does is none of the stage's.
+#: Number of runs of each stage. The fastest counts, because other load of the machine only slows a run.
 _TIMES = 3
 
 
@@ -30,7 +30,7 @@ class Stage:
 
 
 def stages(path: Path, calibration: Calibration) -> list[Stage]:
-    """Every stage of a log's way to estimates, wholes at the end.
+    """Every stage from a log to estimates; complete replays last.
 
     Raises:
         InputError: not readable, or without samples.

@@ -1,1 +1,1 @@
-"""What a running daemon says, seen from its broadcasts alone."""
+"""Live view of a running daemon, from its broadcasts alone."""

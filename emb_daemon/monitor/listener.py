@@ -1,4 +1,4 @@
-"""Broadcasts off the bus: last values, gaps in the E2E counters, and the forces of the last minute."""
+"""Broadcasts received from the bus: last values, gaps in the E2E counters, and the forces of the last minute."""
 
 import math
 from collections import deque
@@ -33,8 +33,7 @@ class Stream:
 
     Attributes:
         values: signals of the last good frame in the DBC's order and units; empty before the first.
-        received, missing, damaged: good frames, frames that the counter says were sent besides, and frames whose CRC is wrong
-            or whose counter stands still.
+        received, missing, damaged: good frames; frames missing by the counter; frames with a wrong CRC or a repeated counter.
     """
 
     cycle_ns: int
@@ -48,7 +47,7 @@ class Stream:
 
     @property
     def usable(self) -> bool:
-        """Whether the sender says that the values may be used."""
+        """Whether the values may be used, by the sender's Status."""
         return self.status <= contract.STATUS_DEGRADED
 
     def value(self, column: int) -> float | None:
@@ -62,7 +61,7 @@ class Stream:
             if step == 0 and elapsed < COUNTER_MODULO / 2:
                 self.damaged += 1
                 return False
-            # Whole turns of the counter are told by the time that passed.
+            # The elapsed time gives the number of complete turns of the counter.
             step += COUNTER_MODULO * max(0, round((elapsed - step) / COUNTER_MODULO))
             self.missing += max(step - 1, 0)
         self.values, self.status, self.counter, self.time_ns = values, status, counter, time_ns
@@ -90,11 +89,11 @@ class Corner:
             entry[1] = force_kN if math.isnan(entry[1]) else max(entry[1], force_kN)
 
     def refer(self, force_N: float, time_ns: int) -> None:
-        """A rig's force sensor has measured ``force_N``."""
+        """Store ``force_N``, measured by a rig's force sensor."""
         self._reference_kN, self._reference_ns = 1e-3 * force_N, time_ns
 
     def reference_kN(self, now_ns: int) -> float | None:
-        """What a rig's force sensor measured within the last half second, if there is one."""
+        """Force that a rig's sensor measured within the last half second, if there is one."""
         recent = now_ns - self._reference_ns <= SECOND_NS // 2 and math.isfinite(self._reference_kN)
         return round(self._reference_kN, 3) if recent else None
 
@@ -121,7 +120,7 @@ class Corner:
         return sum(stream.damaged for stream in self.streams)
 
     def silent_s(self, now_ns: int) -> float:
-        """Time since any good frame, s."""
+        """Time since the last good frame, s."""
         return max(0.0, 1e-9 * (now_ns - max(stream.time_ns for stream in self.streams)))
 
     def reasons(self) -> tuple[str, ...]:
@@ -130,7 +129,7 @@ class Corner:
         return contract.reason_words(status.values[3]) if status.values else ()
 
     def state(self, now_ns: int) -> dict:
-        """Everything known, for scripts. None: not heard yet, or the sender says not to use it."""
+        """Everything known, for scripts. None: not received yet, or not to be used by the sender's Status."""
         force, heat, status, request = (
             self.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS, ADAPT_REQUEST)
         )
@@ -168,7 +167,7 @@ class Corner:
 
 
 def _word(words: Sequence[str] | Mapping[int, str], stream: Stream, column: int) -> str | None:
-    """A code in words: None before it was heard, ``?`` if the contract has no such code."""
+    """A code in words: None before it was received, ``?`` if the contract has no such code."""
     if not stream.values:
         return None
     known = words if isinstance(words, Mapping) else dict(enumerate(words))
@@ -176,8 +175,8 @@ def _word(words: Sequence[str] | Mapping[int, str], stream: Stream, column: int)
 
 
 class Listener:
-    """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus` beside them. `hear` takes FRAME arrays as a bus
-    gives them, times on the monotonic clock."""
+    """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus`. `hear` takes FRAME arrays as a bus returns them,
+    with times on the monotonic clock."""
 
     def __init__(self):
         layout = default_layout()[0]
@@ -187,7 +186,7 @@ class Listener:
         [self._force] = signal_columns(rig, "RIG_FL_Force", ("ClampForceRef",)).tolist()
         self._rigs = {rig.get_message_by_name(f"RIG_{name}_Force").frame_id: row for row, name in enumerate(CORNERS)}
         self._signals = [layout["sent"][kind, : layout["sent_count"][kind]].tolist() for kind in range(4)]
-        # Loading compiled code takes long enough for a socket's buffer to overflow.
+        # Compiled code is loaded now: loading takes long enough for a socket's buffer to overflow.
         for compiled in (counter_of, status_of, partial(crc, 0)):
             compiled(np.uint64(0))
         self.reset()
@@ -198,7 +197,7 @@ class Listener:
 
     @property
     def heard(self) -> list[Corner]:
-        """The corners that somebody estimates."""
+        """The corners from which broadcasts were received."""
         return [corner for corner in self.corners if corner.heard]
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""A daemon's broadcasts as Prometheus takes them (text exposition format 0.0.4). What is not to be used is left out."""
+"""A daemon's broadcasts for Prometheus (text exposition format 0.0.4). Values that are not to be used are left out."""
 
 from collections.abc import Iterable
 
@@ -7,7 +7,7 @@ from emb_daemon.wire.contract import MODES, REASONS, SOURCES, STATUSES
 
 _TEMPERATURES = ("inner_surface", "inner_mean", "outer_surface", "outer_mean")
 
-#: Gauges: name, what it is, and its value in what `Corner.state` says.
+#: Gauges: name, description, and value from `Corner.state`.
 _GAUGES = {
     "emb_clamp_force_newtons": ("Clamp force", lambda state: _times(state["clamp_force_kN"], 1e3)),
     "emb_clamp_force_sigma_newtons": ("One standard deviation", lambda state: _times(state["clamp_force_sigma_kN"], 1e3)),
@@ -42,7 +42,7 @@ def _family(name: str, kind: str, about: str, rows: Iterable[tuple[str, float | 
 
 
 def exposition(listener: Listener, now_ns: int) -> str:
-    """Every corner that was heard, at a time on the monotonic clock."""
+    """Every corner from which broadcasts were received, at a time on the monotonic clock."""
     states = {corner.name: (corner, corner.state(now_ns)) for corner in listener.heard}
     lines: list[str] = []
     for name, (about, value) in _GAUGES.items():

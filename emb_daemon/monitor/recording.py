@@ -1,4 +1,4 @@
-"""What the monitor hears as an MCAP file, for PlotJuggler and the like: a topic for each corner, JSON with a schema."""
+"""The received broadcasts as an MCAP file, for PlotJuggler and similar tools: a topic for each corner, JSON with a schema."""
 
 import json
 import time
@@ -6,12 +6,12 @@ from pathlib import Path
 
 from emb_daemon.monitor.listener import Corner, Listener
 
-#: Bytes after which a chunk is written: some seconds of four corners are lost at most when the recorder is killed.
+#: Bytes after which a chunk is written: at most some seconds of four corners are lost if the recorder is killed.
 _CHUNK = 1 << 16
 
 
 def _schema(value) -> dict:
-    """JSON schema of what `Corner.state` gives. What is not to be used is null, whatever it is otherwise."""
+    """JSON schema of `Corner.state`. Each value may also be null, if it is not to be used."""
     if isinstance(value, dict):
         return {"type": "object", "properties": {name: _schema(inner) for name, inner in value.items()}}
     if isinstance(value, list):
@@ -20,7 +20,7 @@ def _schema(value) -> dict:
 
 
 class Recording:
-    """A file that grows while the monitor hears."""
+    """A file to which the monitor appends what it receives."""
 
     def __init__(self, path: Path):
         """Raises ImportError without mcap, OSError if the file cannot be written."""
@@ -33,7 +33,7 @@ class Recording:
         self._received: dict[str, int] = {}
 
     def show(self, listener: Listener, now_ns: int) -> None:
-        """Write each corner of which something new was heard; times on the machine's clock."""
+        """Write each corner from which something new was received; times on the machine's clock."""
         stamp = time.time_ns()
         for corner in listener.heard:
             state = corner.state(now_ns)

@@ -11,7 +11,7 @@ from emb_daemon.errors import Unavailable
 from emb_daemon.monitor.listener import SECOND_NS, Listener
 
 _DRAIN_S, _DRAW_NS = 0.05, 250_000_000
-#: Patience until the first frame of a daemon that runs: it sends every 4 ms, but its bus may be coming up.
+#: Time to wait for the first frame: a running daemon sends every 4 ms, but its bus may not be up yet.
 _WAIT_S = 3.0
 
 
@@ -40,7 +40,7 @@ def _keys():
 
 
 def _listener(bus) -> Listener:
-    """One that has heard nothing: of what came while this program was loading, the socket's buffer held a part only."""
+    """A listener that begins now: the socket's buffer holds only part of the frames that came while the program loaded."""
     listener = Listener()
     bus.drain()
     return listener
@@ -73,10 +73,10 @@ def watch(bus, title: str) -> None:
 
 
 def listen(bus) -> tuple[Listener, int]:
-    """Listen until one of the clock's seconds was heard from beginning to end; returns listener and time.
+    """Listen until one complete second of the clock was received; returns listener and time.
 
     Raises:
-        Unavailable: nothing is heard for some seconds.
+        Unavailable: nothing is received for some seconds.
     """
     listener, start = _listener(bus), time.monotonic_ns()
     heard_ns = 0

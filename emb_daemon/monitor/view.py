@@ -1,4 +1,4 @@
-"""The view of a terminal: five lines to a corner, four corners in 80 x 24."""
+"""The view on a terminal: five lines for each corner, four corners in 80 x 24."""
 
 import math
 
@@ -9,7 +9,7 @@ from emb_daemon.monitor.listener import Corner, Listener
 from emb_daemon.wire.contract import MODES
 from emb_daemon.wire.layout import CORNERS, PAD_TEMP
 
-#: Without a frame for this long the values on the screen are history.
+#: Time without a frame after which a corner is shown as silent.
 _SILENT_S = 0.5
 _LINES_PER_CORNER = 5
 _BLOCKS = "▁▂▃▄▅▆▇█"
@@ -19,7 +19,7 @@ _MISSING = "–"
 
 
 def sparkline(values: list[float], width: int, full: float) -> str:
-    """The largest of each of ``width`` equal parts of ``values``, from 0 to ``full``; a blank where there was none."""
+    """Bars of the largest value in each of ``width`` equal parts of ``values``, from 0 to ``full``; a blank where none is."""
     text = ""
     for cell in range(width):
         part = values[cell * len(values) // width : max((cell + 1) * len(values) // width, cell * len(values) // width + 1)]
@@ -36,7 +36,7 @@ def number(value: float | None, digits: int) -> str:
 
 
 def _two_lines(texts: list[str], width: int) -> list[str]:
-    """Texts with commas between them on at most two lines; what finds no room is counted."""
+    """Texts with commas between them on at most two lines; those without room are counted."""
     lines, left = [""], list(texts)
     while left:
         more = f" … and {len(left)} more"
@@ -135,7 +135,7 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
 
 
 def summary(listener: Listener, now_ns: int) -> list[str]:
-    """One line to a corner, for output that is no terminal."""
+    """One line for each corner, for output that is not a terminal."""
     lines = []
     for corner in listener.heard:
         state = corner.state(now_ns)

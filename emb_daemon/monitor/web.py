@@ -1,4 +1,4 @@
-"""The monitor for a browser, for Prometheus and for PlotJuggler: one thread hears, others hand out what it last said."""
+"""The monitor for a browser, for Prometheus and for PlotJuggler: one thread receives, others send its last state."""
 
 import collections
 import contextlib
@@ -15,30 +15,30 @@ from emb_daemon.errors import Unavailable
 from emb_daemon.monitor.listener import HISTORY_S, Listener
 from emb_daemon.monitor.metrics import exposition
 
-#: Bus and receivers of datagrams, s; browsers, which draw a minute on some hundred pixels, s.
+#: Period of taking frames and sending datagrams, s; period for browsers, which draw a minute on some hundred pixels, s.
 _HEAR_S, _SHOW_S = 0.02, 0.1
 _PAGE = Path(__file__).with_name("page.html")
-#: What a page draws, kept so that one which is opened later draws it too.
+#: Forces of the last minute, kept so that a page that is opened later can draw them too.
 _HISTORY = round(HISTORY_S / _SHOW_S)
 
 
 def state(listener: Listener, now_ns: int) -> dict:
-    """Everything known; times in s, on the machine's clock."""
+    """State of all corners; times in s, on the machine's clock."""
     return {"timestamp": time.time(), "corners": {corner.name: corner.state(now_ns) for corner in listener.heard}}
 
 
 def _forces(said: dict) -> list:
-    """What a plot draws of a `state`."""
+    """The part of a `state` that a plot draws."""
     corners = said["corners"].items()
     return [said["timestamp"], {name: [corner["clamp_force_kN"], corner["clamp_force_sigma_kN"]] for name, corner in corners}]
 
 
 class Web:
-    """Serves one page, its events and metrics on this machine alone.
+    """Serves one page, its events and metrics, to this machine only.
 
     Args:
         port: 0 for any that is free; `port` says which.
-        title: what the page says of the bus.
+        title: name of the bus on the page.
     """
 
     def __init__(self, port: int, title: str):
@@ -65,7 +65,7 @@ class Web:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def show(self, listener: Listener, now_ns: int) -> None:
-        """Hand out what is known now, ten times a second at most."""
+        """Publish the present state, ten times a second at most."""
         if time.monotonic() - self._shown_s < _SHOW_S:
             return
         with self._news:
@@ -85,7 +85,7 @@ class Web:
             "/metrics": ("text/plain; version=0.0.4; charset=utf-8", lambda: self._metrics),
             "/state.json": ("application/json", lambda: self._state),
         }.get(request.path)
-        # A page of somebody else's, under a name that leads here, gets nothing.
+        # A page from another site, under a host name that resolves to this machine, gets nothing (DNS rebinding).
         host = request.headers.get("Host", "").rpartition(":")[0]
         if host not in ("127.0.0.1", "localhost"):
             request.send_error(403)
@@ -103,7 +103,7 @@ class Web:
             request.wfile.write(body)
 
     def _everything(self) -> bytes:
-        """The state with what a plot draws of the time before."""
+        """The state, and the forces of the last minute for the plot."""
         with self._news:
             return json.dumps({"history": list(self._history)} | json.loads(self._state)).encode()
 
@@ -126,10 +126,10 @@ class Web:
 
 
 class Datagrams:
-    """JSON over UDP, as PlotJuggler's UDP server takes it. Nobody has to listen."""
+    """JSON over UDP for PlotJuggler's UDP server. It works without a receiver, too."""
 
     def __init__(self, host: str, port: int):
-        """Raises Unavailable for a host that is not known."""
+        """Raises Unavailable for an unknown host."""
         try:
             [(family, kind, *_, self._address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         except OSError as error:
@@ -138,7 +138,7 @@ class Datagrams:
         self._socket.setblocking(False)
 
     def show(self, listener: Listener, now_ns: int) -> None:
-        # The next one is due in a moment.
+        # A lost datagram does not matter: the next one follows at once.
         with contextlib.suppress(OSError):
             self._socket.sendto(json.dumps(state(listener, now_ns)).encode(), self._address)
 
@@ -147,12 +147,12 @@ class Datagrams:
 
 
 def hand_out(bus, receivers: list, stopped: Callable[[], bool]) -> None:
-    """Hear a bus for ``receivers``, until ``stopped()``."""
+    """Receive a bus for ``receivers``, until ``stopped()``."""
     listener = Listener()
     bus.drain()
     while not stopped():
         bus.wait(_HEAR_S)
-        # A frame wakes; a whole moment's are taken together.
+        # Pause after the first frame, to take all frames of a period together.
         time.sleep(_HEAR_S)
         listener.hear(bus.drain())
         now = time.monotonic_ns()

@@ -1,5 +1,5 @@
-"""A simulated electro-mechanical brake and the car around it: what demo, simulate and the tests drive the daemon with.
+"""A simulated electro-mechanical brake and the car around it, used by demo, simulate and the tests.
 
-The plant shares no code with the estimator where the two could agree by construction: it integrates differential equations
-in sub-steps, has more states than the estimator knows of, and its heat runs on another mesh by another scheme.
+The plant shares no code with the estimator wherever the two could agree by construction: it integrates differential equations
+in sub-steps, has states that the estimator does not model, and computes heat on another mesh with another scheme.
 """

@@ -7,7 +7,7 @@ import numpy as np
 from emb_daemon.jit import njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
-#: Temperature (degC) at which effects of heat are nothing, and at which magnets have their full strength.
+#: Temperature (degC) at which effects of heat are zero, and at which magnets have their full strength.
 _COLD_C, _MAGNETS_C = 22.0, 25.0
 #: Signals that drawn effects may follow, and their usual sizes.
 SIGNALS = (
@@ -16,13 +16,13 @@ SIGNALS = (
 )  # fmt: skip
 _BRAKE_NM, _RISE_K, _FORCE_N, _SPEED, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
 _DISC_SPEED, _POWER_W = 40.0, 30000.0
-#: Shapes of drawn effects: a power, what saturates, what begins at the signal's usual size.
+#: Shapes of drawn effects: a power, a saturation, an onset at the signal's usual size.
 POWER, SATURATION, ONSET = range(3)
 
 
 @njit
 def turned(p, angle):
-    """Angle (rad) by which a constant gear would have moved the pads as far: all that lies behind the gear is told in it."""
+    """Angle (rad) by which a constant gear would have moved the pads as far; everything behind the gear depends on it."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
         return angle
     return _along(angle, p.travel_angle, p.travel) / p.gear_gain
@@ -37,7 +37,7 @@ def slope_at(p, angle):
 
 @njit
 def gear_load(p, s):
-    """Force (N) on the gear's output: of pads and release spring."""
+    """Force (N) of pads and release spring on the gear's output."""
     return s.force + p.release_spring * p.gear_gain * max(turned(p, s.angle), 0.0)
 
 
@@ -51,7 +51,7 @@ def motor_angle(p, x):
 
 @njit
 def _along(x, xs, ys):
-    """Straight between the points of a rising table, and on beyond them."""
+    """Linear between the points of a rising table, and extrapolated beyond them."""
     i = min(max(np.searchsorted(xs, x) - 1, 0), TRAVEL_POINTS - 2)
     return ys[i] + (x - xs[i]) * (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
 
@@ -87,7 +87,7 @@ def static_angle(p, force):
 
 @njit
 def _signal(s, which):
-    """A signal over its usual size, without sign."""
+    """Absolute value of a signal, over its usual size."""
     if which == 0:
         return abs(s.brake_torque) / _BRAKE_NM
     if which == 1:
@@ -120,7 +120,7 @@ def _shaped(e, x):
 
 @njit
 def drawn(e, s, place):
-    """What one drawn effect adds."""
+    """Amount that one drawn effect adds."""
     if e.size == 0.0:
         return 0.0
     value = e.size * _shaped(e, _signal(s, int(e.signal)))
@@ -207,7 +207,7 @@ def move_motor(p, s, demand):
         resistance += cogging.cosine_Nm * cos(phase) + cogging.sine_Nm * sin(phase)
     before = s.speed
     s.speed += h * (torque - load - resistance) / p.inertia
-    # Symplectic: the friction spring neither gains nor loses energy by integration.
+    # Symplectic integration: the friction spring neither gains nor loses energy numerically.
     travel = h * s.speed
     s.angle += travel
     direction = 1.0 if travel > 0.0 else -1.0
@@ -230,8 +230,8 @@ def _settle(state, before, now, time_constant):
 def clamp(p, s):
     """One sub-step of the clamp force: backlash, static curve, slip, relaxations.
 
-    The first relaxation is the thesis's (3.3.2): force lags the motor angle, so a fast stroke returns more work to the motor
-    than it took. It describes what force sensors show, not a passive material.
+    The first relaxation is the thesis's (3.3.2): force lags the motor angle, so that a fast stroke returns more work to the
+    motor than it took. It describes measured forces, not a passive material.
     """
     e = p.effects
     angle = turned(p, s.angle)
@@ -240,7 +240,7 @@ def clamp(p, s):
         angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error
     half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
-    # The clearance is what the motor turns until contact when closing.
+    # The clearance is the motor angle until contact when closing.
     x = s.driven_angle + half + grown(p, s) + 1e-6 * drawn(e.drawn_thickness, s, 1) / p.gear_gain - p.contact_angle
     s.static_force = static_curve(p, x)
     hysteresis, further = e.stiffness_hysteresis, e.second_hysteresis
@@ -279,13 +279,13 @@ def _earlier(s, history, delay, largest):
 
 @njit
 def delayed_angle(p, s):
-    """What the resolver is about to measure: the motor angle as it was ``signal_delay`` ago."""
+    """Angle that the resolver measures now: the motor angle ``signal_delay`` ago."""
     return _earlier(s, s.angle_history, p.effects.signal_delay.delay_s, HISTORY - 2.0)
 
 
 @njit
 def delayed_mean_current(p, s):
-    """What the current sensor is about to measure: the mean over a cycle that ended ``current_delay`` ago."""
+    """Current that the sensor measures now: the mean over a cycle that ended ``current_delay`` ago."""
     delay, total = p.effects.current_delay.delay_s, 0.0
     for step in range(SUBSTEPS):
         total += _earlier(s, s.current_history, delay + step * SUBSTEP_S, HISTORY - 2.0)

@@ -1,4 +1,4 @@
-"""The car: one to four brakes, longitudinal motion, training motion on request, and everything that it says on the bus."""
+"""The car: one to four brakes, longitudinal motion, training motion on request, and all its messages on the bus."""
 
 from math import cos, pi
 from typing import NamedTuple
@@ -30,15 +30,15 @@ from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import SIGNAL, pack, unpack
 
-#: Period of the slow clamp and release of training motion, and the time in which a corner joins it from where it stands.
+#: Period of the slow clamp and release of training motion, and time in which a corner moves from its position into it.
 TRAINING_PERIOD_S = 20.0
 _JOINING_S = 1.0
-#: Without a request for this many cycles training ends: the daemon has gone.
+#: Number of cycles without a request after which training ends, because the daemon has stopped.
 _SILENCE_CYCLES = 25
-#: A request's low force of zero means the clearance, this far before contact.
+#: A low force of zero in a request means: into the clearance, this far before contact.
 _BEFORE_CONTACT_RAD = 2.0
 _SLOW_NS, _STATUS_NS, _REFERENCE_SLOW_NS = 10_000_000, 100_000_000, 100_000_000
-#: When the slow messages leave after their sample, and the rig's instruments after the resolver's frame.
+#: Delay of the slow messages after their sample, and of the rig's instruments after the resolver's frame.
 _AFTER_NS, _REFERENCE_AFTER_NS = 900_000, 400_000
 #: Frames that one cycle can hold with four corners and reference instruments.
 FRAMES_PER_TICK = 32
@@ -48,8 +48,8 @@ REFERENCE_WIRES = np.dtype([("signal", SIGNAL, (3, 4)), ("id", "i8", (3, 4))], a
 
 
 class World(NamedTuple):
-    """The car and what it sends with: CAR, shape (1,), records by corner, which corners they are, LAYOUT and REFERENCE_WIRES,
-    shape (1,), CAN ids by slot. The source of noise stands beside: with it numba would take ms to recognise the tuple."""
+    """The car and its messages: CAR, shape (1,), records by corner, numbers of the corners, LAYOUT and REFERENCE_WIRES, shape
+    (1,), CAN ids by slot. The random generator is not in the tuple, because numba would then take ms to recognise its type."""
 
     car: np.ndarray
     plants: np.ndarray
@@ -79,7 +79,7 @@ def _reference_wires() -> np.ndarray:
 
 @njit
 def _train(s, training, command, drive, standing):
-    """The command that training motion puts in the place of ``command``; changes ``training``."""
+    """The command with which training motion replaces ``command``; changes ``training``."""
     allowed = drive.park_brake == PARK_APPLIED and drive.brake_request == 0 and standing
     training.silent += 1
     if training.silent > _SILENCE_CYCLES:
@@ -121,7 +121,7 @@ def _corner_cycle(p, s, mode, target, rate, wheel_speed, wheel_gain, ambient, rn
     s.mean_current = current / SUBSTEPS
     # Ornstein-Uhlenbeck noise of the current sensor at four points of the cycle, averaged as the sensor does.
     decay = np.exp(-0.25 * CYCLE_S / p.current_noise_time)
-    # Of four such values a quarter of a cycle apart, the mean has this share of their variance.
+    # Variance of the mean of four such values, a quarter of a cycle apart, as a share of theirs.
     averaged = (4.0 + 6.0 * decay + 4.0 * decay**2 + 2.0 * decay**3) / 16.0
     spread = p.current_noise * np.sqrt((1.0 - decay * decay) / averaged)
     error = 0.0
@@ -146,7 +146,7 @@ def _put(frames, count, time_ns, can_id, data):
 
 @njit
 def _say(w, rng, slot, payload, frames, count, due_ns, least_late):
-    """A protected message of the car, which leaves later than ``due_ns`` by ``least_late`` to one more of the jitter."""
+    """A protected message of the car. It leaves after ``due_ns`` by ``least_late`` to ``least_late`` + 1 times the jitter."""
     car, can_id = w.car[0], w.ids[slot]
     sent = due_ns + np.int64(1e9 * car.jitter * (least_late + rng.random()))
     counter = car.counter[slot]
@@ -160,7 +160,7 @@ def _fast_frames(w, rng, row, frames, count):
     car, p, s, received = w.car[0], w.plants[row], w.states[row], w.wires[0].received
     base = wire.CORNER_MESSAGES * w.corners[row]
     noisy = p.released_angle + delayed_angle(p, s) + p.angle_noise * rng.standard_normal()
-    # Resolver-to-digital converters have hysteresis, so that a standing motor reads as standing.
+    # Resolver-to-digital converters have hysteresis, so that a standing motor gives a constant angle.
     if abs(noisy - s.angle_reading) > 0.5 * p.angle_count + p.angle_hysteresis:
         s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
     speed = s.speed + p.speed_noise * rng.standard_normal()
@@ -209,7 +209,7 @@ def _slow_frames(w, rng, drive, frames, count, due_ns):
 
 @njit
 def _reference_frames(w, rng, row, frames, count, slow):
-    """What a rig's instruments add; they carry neither counter nor CRC."""
+    """Frames of a rig's instruments, without counter and CRC."""
     car, p, s = w.car[0], w.plants[row], w.states[row]
     signal, can_id = w.reference[0].signal, w.reference[0].id[:, w.corners[row]]
     force = s.force + p.force_lead * s.force_rate + p.force_noise * rng.standard_normal()
@@ -263,7 +263,7 @@ def _drive(car, states, drive):
     if not np.isnan(drive.target_speed):
         wanted = 2.0 * (drive.target_speed - car.speed)
         acceleration += min(max(wanted - acceleration, 0.0), car.acceleration)
-    # Brakes and drag stop a car; they do not push it back.
+    # Brakes and drag stop a car, but never push it backwards.
     car.speed = max(car.speed + CYCLE_S * acceleration, 0.0)
     car.wheel_speed = car.speed / car.wheel_radius
     return before
@@ -302,7 +302,7 @@ def _run(w, rng, commands, drives, frames, truth):
 
 @njit
 def _hear(w, frames):
-    """Take adaptation requests out of what is on the bus."""
+    """Read adaptation requests from the frames on the bus."""
     wires = w.wires[0]
     signals = wires.sent[wire.ADAPT_REQUEST]
     for index in range(len(frames)):
@@ -326,7 +326,7 @@ class Car:
 
     Args:
         plants: PLANT array, one record per corner, in the order of ``corners``.
-        corners: which corners they are.
+        corners: numbers of these corners.
         seed: of every random number from here on.
         reference: send the rig instruments' RIG_* frames too.
         start_ns: time of the first sample, less one cycle.
@@ -366,7 +366,7 @@ class Car:
         self._rng = rng = np.random.default_rng(seed)
         self.motion = np.zeros(1, CAR)
         motion = self.motion[0]
-        # A middle-sized car; brakes that are not simulated carry their own quarter.
+        # A medium-sized car; each simulated brake stops a quarter of it.
         motion["mass"], motion["wheel_radius"] = 400.0 * len(corners), 0.31
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
@@ -403,5 +403,5 @@ class Car:
         return frames[:count].copy(), truth
 
     def hear(self, frames: np.ndarray) -> None:
-        """Take what the daemon says: EMB_c_AdaptRequest starts and ends training motion."""
+        """Receive the daemon's frames: EMB_c_AdaptRequest starts and ends training motion."""
         _hear(self._world, frames)

@@ -1,7 +1,7 @@
 """The brake controller of one corner: force over position over speed over current, on true signals.
 
-It is a controller, not an estimator under test: it may use what no car can measure, so that the motion is clean and the
-daemon is judged on its own.
+The controller may use signals that no car can measure. The motion then has no errors of its own, and only the daemon is
+tested.
 """
 
 from emb_daemon.jit import njit
@@ -17,7 +17,7 @@ _ACCELERATION = 8000.0
 _AT_TARGET_RAD = 0.02
 _FORCE_INTEGRAL = 2.0
 _LARGEST_CORRECTION_RAD = 4.0
-#: Force error that is left alone: 20 N and half a percent.
+#: Force error that is not corrected: 20 N and half a percent.
 _FORCE_BAND_N, _FORCE_BAND = 20.0, 0.005
 
 
@@ -36,8 +36,8 @@ def set_target(p, s, mode, target, rate):
         if abs(error) > band and abs(s.position_target - s.angle) < 0.5:
             correction = s.force_correction + CYCLE_S * _FORCE_INTEGRAL * error / slope
             s.force_correction = min(max(correction, -_LARGEST_CORRECTION_RAD), _LARGEST_CORRECTION_RAD)
-        # Wear and growth are followed, as a controller does that finds contact at each application; the disc's thickness
-        # over the turn is not, or it would not show in the force.
+        # The controller follows wear and growth, as if it found contact at each application. It does not follow the disc's
+        # thickness over the turn is not, or it would not show in the force.
         thicker = 1e-6 * p.effects.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
         s.position_target = motor_angle(p, p.contact_angle - thicker / p.gear_gain + goal) + s.force_correction
     else:
@@ -56,7 +56,7 @@ def current_demand(p, s):
     lag = speed - s.speed
     acceleration = _SPEED_GAIN * lag
     if abs(acceleration) < _ACCELERATION:
-        # Outside of its linear range the integral would wind up.
+        # Without this limit the integral would wind up.
         s.speed_integral += SUBSTEP_S * _SPEED_INTEGRAL * p.inertia * lag
     acceleration = min(max(acceleration, -_ACCELERATION), _ACCELERATION)
     torque = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) + p.inertia * acceleration + s.speed_integral

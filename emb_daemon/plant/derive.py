@@ -1,4 +1,4 @@
-"""Plants from calibrations: the same kind of brake, but not the same unit."""
+"""Plants from calibrations: another unit of the same kind of brake."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from emb_daemon.calibration.types import Calibration, FrictionTable, Noise, Ther
 from emb_daemon.models.gear import all_through_gear, steepest
 from emb_daemon.plant.records import EFFECTS, PLANT, TRAVEL_POINTS
 
-#: What no calibration says, the same for every plant, in the units of `records.PLANT_FIELDS`.
+#: Values that no calibration contains, the same for every plant, in the units of `records.PLANT_FIELDS`.
 _UNSTATED = {
     "current_time": 0.001,
     "magnet_heating": 0.02,
@@ -25,8 +25,8 @@ _UNSTATED = {
     "force_noise": 25.0,
     "brake_torque_noise": 0.6,
 }
-#: Standard deviations between what a calibration says and what a unit is, relative where nothing else is said: a well
-#: calibrated unit, some time later.
+#: Standard deviations between a calibration and a unit that was calibrated well, some time later; relative unless stated
+#: otherwise.
 _SCATTER = {
     "torque_constant": 0.002,
     "inertia": 0.01,
@@ -48,9 +48,9 @@ _SCATTER = {
     "disc_cooling_per_speed": 0.03,
     "friction_coefficient": 0.02,
 }
-#: The same of the whole curve, of the contact angle, rad, and of each parameter of an effect.
+#: The same for the complete curve, for the contact angle, rad, and for each parameter of an effect.
 _CURVE_SCATTER, _CONTACT_SCATTER_RAD, _EFFECT_SCATTER = 0.003, 0.01, 0.03
-#: The released position reads anything.
+#: Range of the resolver's reading in the released position, which is arbitrary.
 _RELEASED_RANGE_RAD = (-200.0, 200.0)
 
 
@@ -74,12 +74,12 @@ def plant_from_calibration(
 
     Args:
         seed: of the unit-to-unit scatter; None gives the calibration's own numbers.
-        effects: effects to switch on, with their parameters (`records.EFFECTS`); a parameter left out is zero. They stand
-            beside those of the calibration, and replace one of the same name.
+        effects: effects to switch on, with their parameters (`records.EFFECTS`); a parameter left out is zero. They are added
+            to those of the calibration, and replace effects of the same name.
         pad_thickness_mm: of the pads mounted, if not the calibration's.
 
     Raises:
-        InputError: the thickness is too far outside of what was measured.
+        InputError: the thickness is too far from the measured ones.
         KeyError: no such effect or parameter.
     """
     p = np.zeros(1, PLANT)[0]

@@ -1,7 +1,7 @@
 """Heat of pads, disc, backing plates and caliper: explicit finite volumes, cells of equal width, centred temperatures.
 
-The estimator solves the same physics implicitly on graded nodes with measured backing plates; here the plates and the caliper
-are states of their own.
+The estimator solves the same physics implicitly on graded nodes, with measured backing plates. Here the plates and the caliper
+are states.
 """
 
 from math import ceil
@@ -65,7 +65,7 @@ def friction_of_pads(p, s, wheel_speed):
 def heat_cycle(p, s, wheel_speed, ambient):
     """One 4 ms cycle of all temperatures, and of what depends on them: friction torque, wear, softening."""
     e, dt = p.effects, CYCLE_S
-    # What the friction follows of brake torque is that of the cycle before.
+    # Friction that depends on brake torque uses the torque of the previous cycle.
     s.brake_torque = 2.0 * friction_of_pads(p, s, wheel_speed) * p.effective_radius * s.force if wheel_speed > 0.0 else 0.0
     power = s.brake_torque * wheel_speed
     s.friction_heat += power * dt
@@ -80,7 +80,7 @@ def heat_cycle(p, s, wheel_speed, ambient):
         pad = s.pads[side]
         direct = p.heat_share[side] * power / p.pad_area
         half = 2.0 * p.conductivity * (1.0 + p.conductivity_rise * (pad[0] - _REFERENCE_C)) / width
-        # The surface holds no heat: what enters it leaves it.
+        # The surface stores no heat: inflow equals outflow.
         surface = (direct + conductance * s.disc + half * pad[0]) / (conductance + half)
         s.surface[side] = surface
         from_disc = conductance * (s.disc - surface)

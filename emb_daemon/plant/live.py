@@ -7,17 +7,17 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import CYCLE_NS
 from emb_daemon.plant.scenarios import Schedule, commands_of
 
-#: Frames of a cycle that the machine has held up for longer than this are lost, as they would be on a real bus; the car's
-#: time and counters go on with the clock.
+#: If the machine delays the frames of a cycle by more than this, they are lost, as on a real bus; the car's time and counters
+#: follow the clock.
 _LOST_NS = 2 * CYCLE_NS
 
 
 class LiveCar:
-    """Drives a schedule, over and over, one cycle every 4 ms, and listens to the daemon between two cycles.
+    """Drives a schedule repeatedly, one cycle every 4 ms, and receives the daemon's frames between two cycles.
 
     Attributes:
         ticks: cycles run.
-        late: cycles that left more than half a cycle after their time, the machine's doing.
+        late: cycles that left more than half a cycle after their time, caused by the machine.
         lost: cycles whose frames were not sent at all because their time had passed.
     """
 
@@ -36,8 +36,8 @@ class LiveCar:
     def run(self, stopped: Callable[[], bool], seconds: float | None = None, sent=None, heard=None) -> None:
         """Run until ``stopped()`` or ``seconds`` are over.
 
-        ``sent(time_ns, truth)`` is called after each cycle has left, with its TRUTH rows and when it left, 0 if it was lost;
-        ``heard(frames)`` with whatever came from the bus since. Both views are valid during the call only.
+        ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;
+        ``heard(frames)`` is called with the frames received since. Both views are valid during the call only.
         """
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()

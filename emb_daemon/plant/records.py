@@ -12,10 +12,10 @@ SUBSTEPS = 16
 SUBSTEP_S = 1e-9 * CYCLE_NS / SUBSTEPS
 #: Cells through one pad at most.
 CELLS = 30
-#: Sub-steps of motor angle and current that are kept, for late sensors.
+#: Number of past sub-steps of motor angle and current that are stored, for sensors with a delay.
 HISTORY = 64
 CURVE_TERMS = 5
-#: Of the travel of a gear that is not constant, between which it runs straight.
+#: Points of the travel of a gear that is not constant, linear between them.
 TRAVEL_POINTS = 257
 PAD_DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
 
@@ -29,8 +29,8 @@ class Field(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
-#: Effects that a plant can have, all off at zero. The first group carries the catalogue's names and parameters; the second
-#: has no catalogue entry, so that a diagnosis can be tested on what nobody has thought of.
+#: Effects that a plant can have, all off at zero. The first group has the names and parameters of the catalogue. The second
+#: group is not in the catalogue, so that a diagnosis can be tested on unknown effects.
 EFFECTS: dict[str, tuple[Field, ...]] = {
     "disc_thickness_variation": tuple(
         Field(f"order_{order}_{part}_um", "um", f"{part} of {order} per turn, over the angle that wheel pulses count")
@@ -89,7 +89,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
     ),
     "disc_radiation": (Field("area_m2", "m2", "radiating area times emissivity, in addition to the plant's own"),),
     "thermocouple_lag": (Field("lag_s", "s", "first-order lag of the backplate thermocouples"),),
-    # Outside of the catalogue.
+    # Not in the catalogue.
     "clamp_creep": (
         Field("share", "1", "share of the force that creeps in"),
         Field("time_constant_s", "s", "its time constant, tens of seconds"),
@@ -105,7 +105,7 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
         Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),
         Field("viscous_Nms_per_rad", "N m s/rad", "viscous friction at 12 degC, doubling every further 10 K down"),
     ),
-    # Whatever a seed draws: size × shape(signal) × other signal, through a lag. Signals as `brake.SIGNALS` counts them.
+    # Effects drawn by a seed: size × shape(signal) × other signal, through a lag. Signals by their index in `brake.SIGNALS`.
     **{
         f"drawn_{port}": (
             Field("size", unit, f"of what is added to {what} where the signals are at their usual sizes"),
@@ -205,7 +205,7 @@ PLANT_STATE = np.dtype(
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
         *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat"),
-        # What drawn effects add, in the order of their table.
+        # Amounts that drawn effects add, in the order of their table.
         ("drawn", "f8", (6,)),
         *fields("f8", "excitation force force_rate static_force stiffness_factor"),
         # Controller.
@@ -228,30 +228,30 @@ PLANT_STATE = np.dtype(
         ("current_history", "f8", (HISTORY,)),
         ("history_at", "i8"),
         ("angle_reading", "f8"),
-        # Books.
+        # Energy balance.
         *fields("f8", "motor_work friction_loss clamp_work friction_heat heat_lost"),
     ],
     align=True,
 )
 
-#: What the brake controller of a corner is told for one cycle: RELEASE, ANGLE (``target`` rad past the released position,
+#: Command to the brake controller of a corner for one cycle: RELEASE, ANGLE (``target`` rad past the released position,
 #: moving at ``rate`` rad/s), FORCE (``target`` N) or LATCH (a pawl holds the motor where it is, without current).
 RELEASE, ANGLE, FORCE, LATCH = range(4)
 COMMAND = np.dtype([("mode", "i8"), ("target", "f8"), ("rate", "f8")], align=True)
 
-#: What the driver (or the rig) does for one cycle. ``wheel_speed`` rad/s prescribes the discs' speed as a rig's drive does,
+#: Action of the driver (or the rig) in one cycle. ``wheel_speed`` rad/s prescribes the discs' speed like a rig's drive,
 #: NaN leaves it to the car; ``target_speed`` m/s is what the car's engine holds or reaches, NaN lets it coast.
 DRIVE = np.dtype([*fields("f8", "wheel_speed target_speed ambient"), *fields("i8", "park_brake brake_request")], align=True)
 
 #: Training motion of a corner (thesis Fig. 3-9): slow clamp and release between two angles (rad past the released position)
-#: with a small fast sinusoid. ``start`` is where it set out from, ``tick`` cycles it has run, ``silent`` cycles since the
-#: request was last heard.
+#: with a small fast sinusoid. ``start``: position at its beginning; ``tick``: cycles run; ``silent``: cycles since the last
+#: request.
 TRAINING = np.dtype(
     [*fields("?", "requested running"), *fields("f8", "low high amplitude frequency start"), *fields("i8", "tick silent")],
     align=True,
 )
 
-#: The car's longitudinal motion and what its messages need.
+#: State of the car's longitudinal motion and of its messages.
 CAR = np.dtype(
     [
         *fields("i8", "time_ns tick"),
@@ -266,7 +266,7 @@ CAR = np.dtype(
     align=True,
 )
 
-#: What was true at each resolver sample. Angles are the resolver's, contact and zero included; index 0 is the inner pad.
+#: Truth at each resolver sample. Angles are the resolver's, contact and zero included; index 0 is the inner pad.
 TRUTH = np.dtype(
     [
         *fields("i8", "time_ns corner counter"),

@@ -1,4 +1,4 @@
-"""What driver, rig operator and brake controller do: schedules of one row per 4 ms cycle, and their building blocks."""
+"""Schedules of driver, rig operator and brake controller, with one row per 4 ms cycle, and their building blocks."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import ANGLE, COMMAND, DRIVE, FORCE, RELEASE
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PARK_IN_TRANSITION, PARK_RELEASED
 
-#: A request is signalled while the demanded force is above this, N.
+#: BrakeRequest is sent while the demanded force is above this, N.
 _REQUEST_N = 200.0
 
 
@@ -62,7 +62,7 @@ def _forces(schedule: Schedule, force: np.ndarray) -> Schedule:
 
 
 def _approach(angle: np.ndarray) -> np.ndarray:
-    """Join a motion from the released position within half a second, and leave it to the same again."""
+    """Move from the released position into a motion within half a second, and back at its end."""
     time = CYCLE_S * np.arange(len(angle))
     share = np.clip(np.minimum(time, time[-1] - time) / 0.5, 0.0, 1.0)
     return 0.5 * (1.0 - np.cos(np.pi * share)) * angle
@@ -156,7 +156,7 @@ def park(force_N: float, seconds: float) -> Schedule:
 
 
 def city_drive() -> Schedule:
-    """Thirty seconds: two stops with a cruise between them, a hard one, parking."""
+    """Thirty seconds: two stops with a cruise between them, a hard stop, parking."""
     return (
         rest(1.0)
         + accelerate(12.0, 4.0)
@@ -225,9 +225,9 @@ def simulate_log(
 
     Args:
         plants: PLANT record, or array with one record per corner.
-        seconds: the schedule is cut or repeated to this length; None takes it as it is.
+        seconds: length to which the schedule is cut or repeated; None: as it is.
         reference: with the rig instruments' frames.
-        car_options: more of `Car`.
+        car_options: further arguments of `Car`.
 
     Returns:
         (FRAME array in order of time, TRUTH array of shape (cycles, corners)).

@@ -1,4 +1,4 @@
-"""One self-contained HTML page for every report: what was found first, then the evidence.
+"""One self-contained HTML page for every report: the result first, then the evidence.
 
 page = Page("Identification", "rig A (simulated), corner FL")
 page.verdict(True, "All targets met")

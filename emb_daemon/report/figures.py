@@ -11,9 +11,9 @@ INK = "#1d2430"
 MUTED = "#6b7480"
 GRID = "#e6e9ee"
 
-#: Points that a trace may have on the page; more cannot be told apart on a screen.
+#: Largest number of points of a trace on the page; more cannot be distinguished on a screen.
 SCREEN_POINTS = 3000
-#: Samples of a figure's traces that the page holds beside them, to be shown where one zooms: six megabytes.
+#: Largest number of samples of a figure that the page stores for zooming: six megabytes.
 DETAIL_SAMPLES = 1_000_000
 #: Quantiles of a band's edges that an axis reaches to: the widest hundredth is of a start.
 _IN_BAND = (0.01, 0.99)
@@ -21,7 +21,7 @@ _IN_BAND = (0.01, 0.99)
 
 @dataclass(frozen=True)
 class Style:
-    """How a trace looks, by what it is."""
+    """Appearance of a trace, by its meaning."""
 
     colour: str
     width: float = 1.4
@@ -35,7 +35,7 @@ REFERENCE = Style(INK, 1.6)
 MODEL = Style(ACCENT, 1.4)
 PALE = Style("#9aa4b1", 1.0)
 MARKS = Style(ACCENT, mode="markers")
-#: Between a trace and the one before it lies a pale band; give lower and upper edge in this style, lower first.
+#: Style with a pale band between a trace and the one before it: give the lower edge first, then the upper.
 BAND = Style("rgba(11,92,173,0.18)", 0.0)
 
 
@@ -63,7 +63,7 @@ class Panel:
 def decimate(x: np.ndarray, y: np.ndarray, points: int = SCREEN_POINTS) -> tuple[np.ndarray, np.ndarray]:
     """At most about ``points`` of a curve, smallest and largest of every bucket, so that no peak is lost.
 
-    NaN stays as a gap where a whole bucket is NaN."""
+    A bucket that is entirely NaN remains a gap."""
     x, y = np.asarray(x), np.asarray(y, dtype=float)
     if len(y) <= points:
         return x, y
@@ -122,8 +122,8 @@ def _figure(panels: list[Panel], x_title: str, *, reduce: bool, shared: bool):
 
 
 def _draw(figure, row: int, panel: Panel, shown: set[str], detail: "_Detail | None") -> None:
-    """A panel's traces; ``shown`` are the names that the legend has already. With ``detail`` lines are decimated, and what the
-    page may zoom to is kept there."""
+    """A panel's traces; ``shown`` are the names that are already in the legend. With ``detail`` lines are decimated, and their
+    samples are stored there for zooming."""
     from plotly.graph_objects import Scatter
 
     band_open = False
@@ -136,7 +136,7 @@ def _draw(figure, row: int, panel: Panel, shown: set[str], detail: "_Detail | No
         opens_band = is_band and not band_open
         scatter = Scatter(
             x=x,
-            # Single precision is beyond what an eye resolves and halves the file.
+            # Single precision is enough for the eye and halves the file.
             y=y.astype(np.float32),
             name=trace.name,
             meta=whole,
@@ -177,7 +177,8 @@ def _extent(panel: Panel) -> list[float] | None:
 
 
 class _Detail:
-    """Every sample of a figure's reduced traces, in base64 as the page's script takes it; times that traces share once.
+    """All samples of a figure's reduced traces, in base64 for the page's script; times that several traces share are stored
+    once.
 
     Attributes:
         times: by name, s, double precision.
@@ -189,8 +190,8 @@ class _Detail:
         self._left = DETAIL_SAMPLES
 
     def kept(self, x: np.ndarray, y: np.ndarray) -> dict[str, str] | None:
-        """What a trace carries: the name of its times, and its values in single precision; None where the page has no use or
-        no room for them."""
+        """Data of a trace: the name of its times, and its values in single precision; None if the page does not need them or
+        has no room for them."""
         if not SCREEN_POINTS < len(y) <= self._left:
             return None
         self._left -= len(y)
@@ -201,7 +202,7 @@ class _Detail:
 
 
 def time_figure(panels: list[Panel]):
-    """Panels over one time axis; zooming one zooms all, down to single samples. What is shown is decimated keeping peaks."""
+    """Panels over one time axis; zooming one zooms all, down to single samples. Shown points are decimated; peaks stay."""
     return _figure(panels, "time / s", reduce=True, shared=True)
 
 

@@ -1,4 +1,4 @@
-"""The page: verdict, sections, tables. Everything inside one file, nothing fetched."""
+"""The page: verdict, sections, tables. Everything is inside one file; nothing is loaded from elsewhere."""
 
 import html
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ class Section:
         return self
 
     def table(self, columns: list[str], rows: list[list], caption: str = "") -> "Section":
-        """A table; a column in which every entry begins with a digit or a sign stands flush right.
+        """A table; a column in which every entry begins with a digit or a sign is aligned right.
 
         Entries are texts or `Cell`."""
         cells = [[entry if isinstance(entry, Cell) else Cell(str(entry)) for entry in row] for row in rows]
@@ -87,7 +87,7 @@ class Page:
 
     Args:
         title: what it is.
-        subtitle: of what, when, by which version. State there when data are simulated.
+        subtitle: data, time and version. It must say if the data are simulated.
     """
 
     def __init__(self, title: str, subtitle: str = ""):
@@ -98,7 +98,7 @@ class Page:
         self._figures: list[str] = []
 
     def verdict(self, good: bool | None, headline: str, details: list[str] | None = None) -> None:
-        """The answer, before all evidence. ``good`` None: neither good nor bad."""
+        """The result, before all evidence. ``good`` None: neither good nor bad."""
         state = "" if good is None else PASS if good else FAIL
         lines = "".join(f"<p>{html.escape(line)}</p>" for line in details or [])
         self._verdict = f'<div class="verdict {state}"><strong>{html.escape(headline)}</strong>{lines}</div>'
@@ -114,7 +114,7 @@ class Page:
         return f"f{len(self._figures)}"
 
     def render(self) -> str:
-        """The whole file. The plot library is inside, once, and only if there is a plot."""
+        """The complete file. The plot library is included once, and only if there is a plot."""
         links = " ".join(f'<a href="#{section.anchor}">{html.escape(section.title)}</a>' for section in self._sections)
         data = "".join(
             f'<script type="application/json" id="f{number}">{text}</script>\n'
@@ -138,7 +138,7 @@ class Page:
         )
 
     def write(self, path: Path) -> None:
-        """Write the page whole or not at all.
+        """Write the page completely or not at all.
 
         Raises:
             OSError: the folder cannot be written.
@@ -151,5 +151,5 @@ def _is_number(text: str) -> bool:
 
 
 def _inside_script(text: str) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """JSON that cannot end the script element that contains it."""
     return text.replace("<", "\\u003c")

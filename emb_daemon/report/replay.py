@@ -12,7 +12,7 @@ from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, Panel, 
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
-#: Shortest stretch that is still seen on the whole time axis, as a share of it; closer stretches are drawn as one.
+#: Shortest interval that is visible on the complete time axis, as a share of it; intervals closer together are drawn as one.
 _SEEN = 1.0 / 1000.0
 _BINS = 120
 #: More than the travel of any brake past contact.
@@ -140,7 +140,7 @@ def _cells(part: dict) -> list[str]:
 
 
 def _adaptation(page: Page, learned, calibration: Calibration) -> None:
-    """What park brake adaptation made of the drive."""
+    """Results of park brake adaptation in the drive."""
     section = page.section(
         "Adaptation",
         "Learned from motor current and angle in training motions, the newest last; only accepted trainings are used. "
@@ -188,12 +188,12 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
 
 
 def replay_page(results: list, corner: str, described: str, learned=None, calibration: Calibration | None = None) -> Page:
-    """The page of one or more `replay.Result`, one after the other as the drive that they are.
+    """The page of one or more `replay.Result`, in sequence as one drive.
 
     Args:
-        described: which calibration it was, in words.
+        described: the calibration, in words.
         learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
-        calibration: to compare that with.
+        calibration: the one with which the learned values are compared.
     """
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
@@ -222,7 +222,7 @@ def replay_page(results: list, corner: str, described: str, learned=None, calibr
         tickvals=list(range(len(labels))), ticktext=labels, range=[-0.6, len(labels) - 0.4], automargin=True,
         row=len(panels) + 1, col=1,
     )  # fmt: skip
-    # The legend takes two rows, above which the tool bar stands.
+    # The legend takes two rows; the tool bar is above them.
     figure.update_layout(margin={"t": 108}, height=figure.layout.height + 40)
     page.section("The drive", "Drag across any plot to zoom all of them; double-click to zoom out.").figure(
         figure, "Curves are reduced for the screen; the smallest and the largest value of every interval are kept."

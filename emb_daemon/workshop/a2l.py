@@ -17,16 +17,16 @@ from emb_daemon.workshop import pages
 from emb_daemon.workshop.ifdata import A2ML, Connection, memory_segment, module_block
 from emb_daemon.workshop.image import CORNER_ADDRESS, PARAMETERS_ADDRESS, VERSION_ADDRESS, address_of, is_float
 
-#: Which the slave tells, and the file's name.
+#: Name of the file, which the slave states too.
 NAME = "emb_daemon"
-#: The text at VERSION_ADDRESS, by which a tool knows that file and slave belong together.
+#: The text at VERSION_ADDRESS, from which a tool knows that file and slave belong together.
 VERSION = f"emb_daemon {__version__} " + hashlib.sha256(
     LAYOUT_DIGEST + repr([signal.name for signal in INPUTS + OUTPUTS]).encode()
 ).hexdigest()[:12]  # fmt: skip
 
-#: A little below the largest that the formats hold, so that no reader rounds them to infinity.
+#: Slightly below the largest numbers of the formats, so that no reader rounds them to infinity.
 _FLOAT32_MAX, _FLOAT64_MAX, _ULONG_MAX = 3.4e38, 1.79e308, 0xFFFFFFFF
-#: Units in the letters that every tool reads.
+#: Units in characters that every tool can read.
 _ASCII = str.maketrans({"·": ".", "²": "^2", "³": "^3", "√": "sqrt ", "°": "deg"})
 _CODES = {"mode": dict(enumerate(MODES)), "source": SOURCES}
 
@@ -65,7 +65,7 @@ def _block(keyword: str, head: str, *lines: str) -> str:
 
 
 def _limit(bound: float) -> str:
-    # What lies below the smallest normal number is a bound "greater than zero".
+    # A bound below the smallest normal number means "greater than zero".
     bound = min(max(bound, -_FLOAT64_MAX), _FLOAT64_MAX)
     return repr(bound if abs(bound) >= sys.float_info.min else 0.0)
 
@@ -105,14 +105,14 @@ def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> 
 
 
 def version_of(calibrations: Mapping[str, Calibration], calibrate: bool) -> str:
-    """The text at VERSION_ADDRESS: where numbers may be written, it also says where each stands."""
+    """The text at VERSION_ADDRESS; if numbers may be written, it also identifies their layout."""
     return f"{VERSION} {pages.digest(calibrations)}" if calibrate else VERSION
 
 
 def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | None = None, calibrate: bool = False) -> bytes:
     """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC wants it.
 
-    With ``connection`` it says how the server is reached; with ``calibrate`` it has the numbers that may be written.
+    With ``connection`` it states how the server is reached; with ``calibrate`` it contains the numbers that may be written.
     """
     methods, blocks = _Methods(), []
     for name, calibration in calibrations.items():

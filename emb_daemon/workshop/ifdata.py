@@ -1,4 +1,4 @@
-"""How a measurement tool reaches the XCP server, as an A2L file says it: IF_DATA XCP, and the A2ML that describes it."""
+"""How a measurement tool reaches the XCP server, for the A2L file: IF_DATA XCP, and the A2ML that describes it."""
 
 from typing import NamedTuple
 
@@ -7,11 +7,11 @@ from emb_daemon.wire.layout import CORNERS
 from emb_daemon.workshop.pages import FILES, WORKING
 from emb_daemon.workshop.xcp import CALIBRATING, LISTS, MILLISECONDS, ON_CAN, ON_UDP, READING, Transport
 
-#: ms that a tool waits for an answer: longer than the daemon may take to check a page (`runtime.pages`).
+#: Time in ms for which a tool waits for an answer: longer than the daemon may take to check a page (`runtime.pages`).
 _T1_MS = 5000
 #: Versions of the protocol layer, 1.1, and of the transport layers, 1.0.
 _PROTOCOL, _LAYER = 0x0101, 0x0100
-#: Commands that every slave has; of the others a file says which are there.
+#: Commands that every slave has; the file lists the other ones.
 _MANDATORY = {"CONNECT", "DISCONNECT", "GET_STATUS", "SYNCH"}
 _OPTIONAL = {name: command.code for name, command in (READING | CALIBRATING).items() if name not in _MANDATORY}
 _UNITS = {3: "UNIT_1US", 5: "UNIT_100US"}
@@ -41,7 +41,7 @@ def over_can(request_id: int, response_id: int, bitrate: int | None) -> Connecti
 def module_block(connection: Connection, calibrate: bool) -> str:
     """IF_DATA of the module."""
     layer = connection.layer
-    # The command is not there where a packet has no room behind its header.
+    # The command does not exist if a packet has no room after its header.
     missing = set() if calibrate else set(CALIBRATING)
     if layer.max_cto <= 8:
         missing.add("SHORT_DOWNLOAD")
@@ -96,7 +96,7 @@ def _access(who: str, other: str) -> str:
 _PAGE_ACCESS = "; ".join([_access("ECU", "XCP"), _access("XCP_READ", "ECU"), _access("XCP_WRITE", "ECU")])
 _COMMANDS = ", ".join(f'"{name}" = 0x{code:02X}' for name, code in _OPTIONAL.items())
 
-#: What the blocks above are made of, and no more of XCP.
+#: Description of the blocks above, and of no other part of XCP.
 A2ML = f"""\
     /begin A2ML
       block "IF_DATA" taggedunion if_data {{

@@ -1,7 +1,7 @@
-"""The memory that a measurement tool sees: for each corner a page of signals and the parameters in use, all read only.
+"""The memory that a measurement tool reads: for each corner a page of signals and the parameters in use, read only.
 
-Signals are those of `interface.signals`, four bytes each, little-endian: FLOAT32 where the estimator has a float, else an
-unsigned number. Classic CAN carries seven bytes of data at a time, and a double would not fit.
+Signals are those of `interface.signals`, four bytes each, little-endian: FLOAT32 for the estimator's floats, otherwise an
+unsigned number. A packet on classic CAN carries seven bytes of data, so that a double would not fit.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from emb_daemon.wire.layout import CORNERS
 
 #: Bytes of a signal.
 SIGNAL_BYTES = 4
-#: Addresses: corners stand so far apart, a corner's PARAMETERS after its signals, and the text that says what memory this is.
+#: Addresses: distance between corners, offset of a corner's PARAMETERS, and address of the text that identifies the memory.
 CORNER_ADDRESS, PARAMETERS_ADDRESS, VERSION_ADDRESS = 0x10000, 0x1000, 0x80000
 
 _PAGE_BYTES = SIGNAL_BYTES * (len(INPUTS) + len(OUTPUTS))
@@ -24,12 +24,12 @@ def is_float(index: int) -> bool:
 
 
 def address_of(corner: int, index: int) -> int:
-    """Where a corner's signal at ``index`` of INPUTS and OUTPUTS stands."""
+    """Address of a corner's signal at ``index`` of INPUTS and OUTPUTS."""
     return CORNER_ADDRESS * corner + SIGNAL_BYTES * index
 
 
 def _place(index: int) -> tuple[bool, np.dtype, int]:
-    """Whether a signal is of the ESTIMATE, its type there and its offset in bytes."""
+    """Whether a signal is a field of ESTIMATE, its type and its offset in bytes."""
     if index < len(INPUTS):
         return False, *field_of(SAMPLE, INPUTS[index].field)
     return True, *field_of(ESTIMATE, OUTPUTS[index - len(INPUTS)].field)
@@ -42,7 +42,7 @@ class Image:
         version: the text at VERSION_ADDRESS.
 
     Attributes:
-        parameters: PARAMETERS array, shape (4,), that is shown.
+        parameters: the PARAMETERS array, shape (4,), that can be read.
     """
 
     def __init__(self, version: bytes):
@@ -55,13 +55,13 @@ class Image:
         self._others = [(i, out, kind, offset) for i, (out, kind, offset) in enumerate(places) if kind.kind != "f"]
 
     def pages_of(self, samples: np.ndarray, estimates: np.ndarray) -> list[bytes]:
-        """The page of signals that each row gives."""
+        """The page of signals for each row."""
         if not len(samples):
             return []
         halves = [np.ascontiguousarray(rows) for rows in (samples, estimates)]
         pages = np.zeros((len(samples), len(INPUTS) + len(OUTPUTS)), "<u4")
         for rows, (columns, words) in zip(halves, self._floats, strict=True):
-            # A number that no float holds is infinite.
+            # A number too large for FLOAT32 becomes infinite.
             with np.errstate(over="ignore", invalid="ignore"):
                 values = rows.view("f8").reshape(len(rows), -1)[:, words].astype("<f4")
             pages[:, columns] = values.view("<u4")
@@ -72,11 +72,11 @@ class Image:
         return [page.tobytes() for page in pages]
 
     def show(self, corner: int, page: bytes) -> None:
-        """Let a corner's signals be those of ``page``."""
+        """Set a corner's signals to those of ``page``."""
         self._pages[corner] = page
 
     def read(self, extension: int, address: int, size: int) -> bytes | None:
-        """``size`` bytes; None where not all of them can be read."""
+        """``size`` bytes; None if not all of them can be read."""
         if extension:
             return None
         if address >= VERSION_ADDRESS:

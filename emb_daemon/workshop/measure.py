@@ -1,7 +1,7 @@
-"""XCP's server: estimates in, out of the daemon's shared memory, commands in and responses and data out, over UDP or CAN.
+"""The XCP server: reads estimates from the daemon's shared memory, answers commands and sends data, over UDP or CAN.
 
-It shares nothing with the daemon but memory that it only reads, over CAN the bus, and for calibration the socket of
-`runtime.pages`; it may be killed at any moment.
+It shares with the daemon only memory that it reads, on CAN the bus, and for calibration the socket of `runtime.pages`; it may
+be killed at any moment.
 """
 
 import select
@@ -23,11 +23,11 @@ from emb_daemon.workshop.image import Image
 from emb_daemon.workshop.pages import Segment
 from emb_daemon.workshop.xcp import CONNECT, ON_CAN, ON_UDP, Slave
 
-#: Estimates are fetched this often, and the daemon's file is looked for that often.
+#: Period of fetching estimates, and period of looking for the daemon's file.
 _FETCH_S, _LOOK_S = 0.004, 0.25
-#: Commands answered at once; a master waits for each answer.
+#: Commands answered in one step; a master waits for each answer before it sends the next.
 _COMMANDS = 32
-#: Datagrams are kept below what Ethernet carries whole.
+#: Size of datagrams, below that of an Ethernet frame.
 _DATAGRAM = 1440
 _IP_RECVERR = 11
 _HEADER = struct.Struct("<HH")
@@ -36,16 +36,16 @@ _HEADER = struct.Struct("<HH")
 class Udp:
     """XCP on UDP (ASAM MCD-1 XCP, transport layer Ethernet): packets with length and counter, several to a datagram.
 
-    Who sent the last CONNECT is the master; nobody else is heard or answered.
+    The sender of the last CONNECT is the master; packets of others are ignored.
 
     Attributes:
-        gone: the master's machine said that nobody listens there.
+        gone: the master's machine reported that nobody listens any more.
     """
 
     layer = ON_UDP
 
     def __init__(self, host: str, port: int):
-        """Raises Unavailable for an address that cannot be had."""
+        """Raises Unavailable for an address that cannot be used."""
         try:
             [(family, kind, *_, address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
             self._socket = socket.socket(family, kind)
@@ -53,7 +53,7 @@ class Udp:
         except OSError as error:
             raise Unavailable(f"--udp {host}:{port}: {error.strerror}") from None
         if family == socket.AF_INET:
-            # Else a socket that is not connected never hears of a master that has ended.
+            # Without this option an unconnected socket gets no error when the master has ended.
             self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
         self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
@@ -118,7 +118,7 @@ class Can:
     """
 
     layer = ON_CAN
-    #: Nobody says on a bus that he has left it.
+    #: On a bus the end of a master cannot be detected.
     gone = False
 
     def __init__(self, bus, request_id: int, response_id: int):
@@ -151,9 +151,9 @@ class Measurement:
     """A slave on a transport, fed by a daemon.
 
     Args:
-        estimates: the daemon's file (`runtime.shared`), which need not be there yet.
+        estimates: the daemon's file (`runtime.shared`), which need not exist yet.
         transport: `Udp` or `Can`.
-        version: the text by which the A2L file knows its memory.
+        version: the text that identifies the memory to which the A2L file belongs.
         name, file: of the A2L file, without ending, and its content.
         calibrations: of the files, by corner, if they may be written.
     """
@@ -171,11 +171,11 @@ class Measurement:
 
     @property
     def trouble(self) -> str:
-        """Why no estimates come; empty if they do, or no daemon runs."""
+        """Why there are no estimates; empty if there are, or if no daemon runs."""
         return self.reader.trouble
 
     def _ask(self, page: Page) -> Answer:
-        # The daemon may have started since it was looked for last.
+        # The daemon may have started since the last look.
         self.reader.look()
         answer = self._pages.ask(page)
         if answer.refused:
@@ -183,7 +183,7 @@ class Measurement:
         return answer
 
     def step(self) -> None:
-        """Answer what is asked and hand out the estimates of a moment."""
+        """Answer commands, and send the estimates that have come since the last step."""
         self.transport.wait(_FETCH_S)
         now = time.monotonic()
         if now - self._looked >= _LOOK_S:

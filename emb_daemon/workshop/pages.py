@@ -1,7 +1,7 @@
-"""The calibration's numbers as a measurement tool sees them: one segment of two pages, the files' and the working page.
+"""The calibration's numbers for a measurement tool: one segment with two pages, that of the files and the working page.
 
-FLOAT64 one after the other, by corner and then in the files' order of `runtime.pages.tunable`. What is written while the
-daemon uses the working page takes effect with the last byte of a number, so that it never sees half of one.
+The numbers are FLOAT64, by corner and then in the order of `runtime.pages.tunable`. While the daemon uses the working page, a
+written number takes effect with its last byte, so that the daemon never sees half of it.
 """
 
 import hashlib
@@ -13,7 +13,7 @@ from emb_daemon.calibration.parameters import value_of
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.runtime.pages import Answer, Page, tunable
 
-#: Where the segment begins; bytes of a number.
+#: Address of the segment; bytes of a number.
 SEGMENT_ADDRESS, NUMBER_BYTES = 0x100000, 8
 #: Pages, by number.
 WORKING, FILES = 0, 1
@@ -25,12 +25,12 @@ def numbers(calibrations: Mapping[str, Calibration]) -> list[tuple[str, str]]:
 
 
 def address_of(index: int) -> int:
-    """Where the number at ``index`` of `numbers` stands."""
+    """Address of the number at ``index`` of `numbers`."""
     return SEGMENT_ADDRESS + NUMBER_BYTES * index
 
 
 def digest(calibrations: Mapping[str, Calibration]) -> str:
-    """Eight hexadecimal digits of what stands where in the segment."""
+    """Eight hexadecimal digits that identify the layout of the segment."""
     return hashlib.sha256(repr(numbers(calibrations)).encode()).hexdigest()[:8]
 
 
@@ -39,11 +39,11 @@ class Segment:
 
     Args:
         calibrations: of the files, by corner.
-        ask: has the daemon take a page.
-        on_page: whether the daemon estimates with other numbers than the files'.
+        ask: sends a page to the daemon.
+        on_page: whether the daemon estimates with numbers that differ from the files.
 
     Attributes:
-        shown: the page that is read and written.
+        shown: the page that the tool reads and writes.
         size: in bytes.
     """
 
@@ -57,22 +57,22 @@ class Segment:
         self.shown, self.size = WORKING, len(self._files)
 
     def read(self, address: int, size: int) -> bytes | None:
-        """``size`` bytes of the page that is shown; None where not all of them can be read."""
+        """``size`` bytes of the shown page; None if not all of them can be read."""
         offset, content = address - SEGMENT_ADDRESS, self._working if self.shown == WORKING else self._files
         return content[offset : offset + size] if offset >= 0 and offset + size <= self.size else None
 
     def covers(self, address: int, size: int) -> bool:
-        """Whether all of these bytes are the segment's."""
+        """Whether all of these bytes belong to the segment."""
         return self.read(address, size) is not None
 
     @property
     def used(self) -> int:
-        """The page that the daemon uses: the files' again after a reload, or a restart."""
+        """The page that the daemon uses; after a reload or a restart it is that of the files again."""
         return FILES if self._taken != self._files and not self._on_page() else self._used
 
     def write(self, address: int, content: bytes) -> Answer:
-        """Set bytes that it `covers` on the working page. If that is used the daemon is asked when a number is complete; what
-        it refuses is undone."""
+        """Set bytes that it `covers` on the working page. If the daemon uses this page, each complete number is sent to the
+        daemon; a number that it refuses is undone."""
         offset = address - SEGMENT_ADDRESS
         end = offset + len(content)
         self._working = self._working[:offset] + content + self._working[end:]
@@ -84,11 +84,11 @@ class Segment:
         return answer
 
     def fill(self) -> None:
-        """Let the working page be the files'."""
+        """Copy the page of the files to the working page."""
         self._working = self._files
 
     def use(self, page: int) -> Answer:
-        """Have the daemon estimate with a page."""
+        """Let the daemon estimate with a page."""
         content = self._working if page == WORKING else self._files
         values: dict[str, dict[str, float]] = {}
         for index, (name, key) in enumerate(self._numbers):

@@ -1,6 +1,6 @@
-"""The server's loop: broadcasts in, as the monitor hears them, requests in and responses out over ISO-TP (ISO 15765-2).
+"""The UDS server's loop: receives broadcasts like the monitor, and answers requests over ISO-TP (ISO 15765-2).
 
-It shares nothing with the daemon but the bus and files that it only reads; it may be killed at any moment.
+It shares with the daemon only the bus and files that it reads; it may be killed at any moment.
 """
 
 import json
@@ -22,14 +22,14 @@ from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_T
 from emb_daemon.workshop.trouble import Frame, TroubleMemory
 from emb_daemon.workshop.uds import FREEZE_FRAME, Server
 
-#: Data identifiers, the corner's number added: calibration's hash, learned values, the moment's estimate.
+#: Data identifiers, to which the corner's number is added: hash of the calibration, learned values, present estimate.
 SOFTWARE, CALIBRATION, LEARNED, ESTIMATE = 0xF189, 0x1000, 0x1010, FREEZE_FRAME
-#: What came meanwhile is taken together, or each frame would wake the process.
+#: Pause after which all frames are taken together; otherwise each frame would wake the process.
 _PAUSE_S = 0.02
 
 
 def frame_of(corner: Corner, time_s: int) -> Frame:
-    """What a corner's broadcasts say now."""
+    """Freeze frame of a corner's present broadcasts."""
     force, heat, status = (corner.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS))
     force_N, sigma_N = (None if kN is None else 1e3 * kN for kN in (force.value(0), force.value(1)))
     return Frame(
@@ -45,7 +45,7 @@ def frame_of(corner: Corner, time_s: int) -> Frame:
 
 
 def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int, Callable[[], bytes]]:
-    """What each data identifier reads, from the files as they are when it is asked for.
+    """Functions that read each data identifier, from the files as they are at the time of the request.
 
     Raises:
         InputErrors: the configuration is faulty.
@@ -53,7 +53,7 @@ def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int
     memory, corners_of = Memory(state), Setup(configuration).configuration.corners
 
     def calibration(name: str) -> bytes:
-        # As it is now: the daemon reads it again on reload, and refuses it if it is faulty.
+        # The file as it is now. The daemon reads it only on a reload, and refuses it if it is faulty.
         try:
             return calibration_hash(load_calibration(configuration.parent / corners_of[name].calibration)).encode()
         except InputError:
@@ -77,16 +77,16 @@ def data_of(configuration: Path, state: Path, corners: list[Corner]) -> dict[int
 
 
 class Diagnostics:
-    """A bus on which a tester is answered.
+    """Answers a tester on a bus.
 
     Args:
         bus: that receives the broadcasts and ``request_id`` (`ids`).
         configuration: the daemon's.
-        state: the daemon's state directory, where the trouble codes are kept too.
+        state: the daemon's state directory, where the trouble codes are stored too.
         request_id, response_id: 11-bit CAN ids.
 
     Attributes:
-        trouble: why the trouble codes could not be kept the last time; empty if they always could.
+        trouble: why the trouble codes could not be stored the last time; empty if they could.
     """
 
     def __init__(self, bus, configuration: Path, state: Path, request_id: int, response_id: int):
@@ -106,7 +106,7 @@ class Diagnostics:
             rxfn=lambda timeout: self._requests.pop(0) if self._requests else None,
             txfn=self._send,
             address=address,
-            # Frames of eight bytes, whatever is in them: the bus writes no others.
+            # All frames are padded to eight bytes, because the bus writes no others.
             params={"tx_padding": 0xCC, "blocking_send": False},
         )
 
@@ -117,10 +117,10 @@ class Diagnostics:
         self._bus.send(frame)
 
     def step(self) -> None:
-        """Take the frames of a moment, and send what is due."""
+        """Take all frames that have arrived, and send what is due."""
         time.sleep(_PAUSE_S)
         frames = self._bus.drain()
-        # The newest of each message is enough, and five times less work.
+        # Only the newest frame of each message is used, which is five times less work.
         _, newest = np.unique(frames["can_id"][::-1], return_index=True)
         self.listener.hear(frames[::-1][newest])
         for frame in frames[frames["can_id"] == self._request_id]:
@@ -136,9 +136,9 @@ class Diagnostics:
                 try:
                     self.memory.judge(row, mode, reasons, frame_of(corner, round(time.time())), now)
                 except OSError as error:
-                    # What cannot be kept can still be told; the next judgement tries again.
+                    # Codes that cannot be stored can still be read; storing is tried again with the next message.
                     self.trouble = f"{self.memory.path}: {error.strerror}"
-        # Once for each frame: a request may be whole, its answer's first frame due, and a flow control waiting.
+        # Once for each frame: a request may be complete, the first frame of its answer due, and a flow control waiting.
         for _ in range(2 + len(self._requests)):
             self._transport.process()
             while self._transport.available():

@@ -1,7 +1,7 @@
 """Trouble codes: one for each reason of each corner, with ISO 14229-1's status bits, ageing and a freeze frame.
 
-What is known survives a kill: it is written, whole, when a code fails for the first time and at most a second after other
-changes. A new operation cycle begins when the server starts, as it does with the box.
+The codes survive a kill: the file is written as a whole, at once when a code fails for the first time, and within a second of
+other changes. A new operation cycle begins when the server starts, which it does together with the box.
 """
 
 import struct
@@ -16,15 +16,15 @@ from emb_daemon.wire.layout import CORNERS
 #: Status bits (ISO 14229-1, D.2).
 TEST_FAILED, FAILED_THIS_CYCLE, PENDING, CONFIRMED = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 NOT_COMPLETED_SINCE_CLEAR, FAILED_SINCE_CLEAR, NOT_COMPLETED_THIS_CYCLE = 1 << 4, 1 << 5, 1 << 6
-#: All that are told; a warning lamp is not asked for.
+#: All supported bits; there is no warning lamp.
 AVAILABLE = 0x7F
 
-#: Messages EMB_c_EstimatorStatus, 100 ms apart, in a row that name a reason before its code fails: what shows in one alone was
-#: over before a driver or a controller could act on it.
+#: Number of messages EMB_c_EstimatorStatus in a row, 100 ms apart, that must contain a reason before its code fails: a reason
+#: in a single message is over before a driver or a controller can react.
 _MATURE = 3
-#: Operation cycles without failure after which a confirmed code is forgotten, as OBD's warm-up cycles (SAE J1979).
+#: Operation cycles without failure after which a confirmed code is deleted, like OBD's warm-up cycles (SAE J1979).
 AGED = 40
-#: Other changes than a first failure are written after this time at most, s.
+#: Longest time until changes other than a first failure are written, s.
 _WRITE_S = 1.0
 _FORMAT = 1
 FILE = "trouble.json"
@@ -43,8 +43,8 @@ _INDEX = {code_of(*divmod(index, len(REASONS))): index for index in range(CODES)
 
 
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What was estimated at one moment: ``time_s`` since 1970; forces N, temperatures degC, contact angle rad. What the paths
-    said apart is not on the bus; ``source`` tells which of them the force rests on. NaN, here None: not to be used."""
+    """The estimate at one moment: ``time_s`` since 1970; forces N, temperatures degC, contact angle rad. The forces of the
+    separate paths are not on the bus; ``source`` says which of them the force is based on. None: not to be used."""
 
     time_s: int
     mode: int
@@ -56,7 +56,7 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stiffness_factor: float | None
 
     #: time u32, mode u8, source u8, force and sigma u16 N, four temperatures i16 0.1 degC, contact angle i16 0.1 rad,
-    #: stiffness factor u16 0.0001; big-endian. All ones, or the most negative number, is what is not to be used.
+    #: stiffness factor u16 0.0001; big-endian. All ones, or the most negative number, mean: not to be used.
     LAYOUT = ">IBBHHhhhhhH"
 
     def encode(self) -> bytes:
@@ -75,8 +75,8 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
-    """One code. ``aged``: operation cycles without failure since the last one; ``occurrences``: times that it began to fail;
-    ``frame``: of the first since it was last clear."""
+    """One code. ``aged``: operation cycles without failure since the last one; ``occurrences``: number of failures;
+    ``frame``: freeze frame of the first failure since the code was last cleared."""
 
     status: int = NOT_COMPLETED_SINCE_CLEAR | NOT_COMPLETED_THIS_CYCLE
     aged: int = 0
@@ -90,15 +90,15 @@ class _Stored(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class TroubleMemory:
-    """All codes, kept in a folder.
+    """All codes, stored in a folder.
 
     Attributes:
         entries: by code.
-        warning: why the file that was there is not used; empty if it is, or there was none.
+        warning: why an existing file is not used; empty if it is used, or if there was none.
     """
 
     def __init__(self, folder: Path):
-        """Read what is kept, and begin an operation cycle. Raises OSError if the folder cannot be written."""
+        """Read the stored codes, and begin an operation cycle. Raises OSError if the folder cannot be written."""
         self.path, self.warning = folder / FILE, ""
         self.entries = {code: Entry() for code in _INDEX}
         self._row = [0] * CODES
@@ -117,12 +117,12 @@ class TroubleMemory:
         self.save()
 
     def save(self) -> None:
-        """Raises OSError; the old file is then untouched."""
+        """Raises OSError; the old file is then unchanged."""
         files.write(self.path, _Stored(_FORMAT, self.entries))
         self._dirty_s = None
 
     def judge(self, corner: int, mode: int, reasons: int, frame: Frame, now_s: float) -> None:
-        """Take one EMB_c_EstimatorStatus. Before a corner has heard anything, what is lost is no fault. Errors as `save`."""
+        """Evaluate one EMB_c_EstimatorStatus. Mode INIT is skipped: no inputs are expected yet. Errors as `save`."""
         first = False
         if mode != INIT:
             for reason in range(len(REASONS)):
@@ -139,7 +139,7 @@ class TroubleMemory:
             self.save()
 
     def clear(self, group: int) -> bool:
-        """Forget a code, or with 0xFFFFFF all; False for what is no code. Errors as `save`."""
+        """Clear a code, or with 0xFFFFFF all; False if there is no such code. Errors as `save`."""
         codes = list(self.entries) if group == _ALL else [group]
         if group != _ALL and group not in self.entries:
             return False
@@ -155,7 +155,7 @@ class TroubleMemory:
 
 
 def _begin_cycle(entry: Entry) -> None:
-    """Close one operation cycle and open the next."""
+    """End one operation cycle and begin the next."""
     if not entry.status & (FAILED_THIS_CYCLE | NOT_COMPLETED_THIS_CYCLE):
         entry.status &= ~PENDING
         entry.aged += bool(entry.status & CONFIRMED)
@@ -166,7 +166,7 @@ def _begin_cycle(entry: Entry) -> None:
 
 
 def _fail(entry: Entry, frame: Frame) -> bool:
-    """Whether that was the first failure since the code was last clear."""
+    """Set a code to failed; returns whether this was the first failure since the code was last cleared."""
     first = entry.frame is None
     if not entry.status & TEST_FAILED:
         entry.occurrences = min(entry.occurrences + 1, 255)

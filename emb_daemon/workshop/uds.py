@@ -11,7 +11,7 @@ _POSITIVE, _NEGATIVE, _SUPPRESS = 0x40, 0x7F, 0x80
 _NO_SERVICE, _NO_SUBFUNCTION, _WRONG_LENGTH, _TOO_LONG, _OUT_OF_RANGE, _CANNOT_WRITE = 0x11, 0x12, 0x13, 0x14, 0x31, 0x72
 
 DEFAULT_SESSION, EXTENDED_SESSION = 0x01, 0x03
-#: Without a request for this long the default session is back, s (ISO 14229-2, S3 server).
+#: Time without a request after which the default session returns, s (ISO 14229-2, S3 server).
 _SESSION_S = 5.0
 #: Time to answer that is promised, ms, and after "response pending", 10 ms: clearing waits for the disk.
 _P2_MS, _P2_EXTENDED_10MS = 1000, 500
@@ -28,15 +28,15 @@ _LONGEST = 4095
 
 
 class _Refused(Exception):
-    """With a negative response code."""
+    """A request is refused, with a negative response code."""
 
 
 class Server:
-    """One tester's partner.
+    """Answers the requests of one tester.
 
     Args:
         memory: the trouble codes.
-        data: what each data identifier reads, at most two bytes large; F186 is the server's own.
+        data: functions that read each two-byte data identifier; F186 is the server's own.
     """
 
     def __init__(self, memory: TroubleMemory, data: Mapping[int, Callable[[], bytes]]):
@@ -51,7 +51,7 @@ class Server:
         }
 
     def answer(self, request: bytes, now_s: float) -> bytes:
-        """The response to a request; empty if none is wanted."""
+        """The response to a request; empty if none is to be sent."""
         if not request:
             return b""
         if now_s - self._heard_s > _SESSION_S:

@@ -1,8 +1,8 @@
 """The slave's side of XCP (ASAM MCD-1 XCP 1.x): reading, data acquisition and, on request, calibration, as packets to packets.
 
-Nothing is written but the working page of `pages`, which the daemon checks before it uses it.
+Only the working page of `pages` can be written, and the daemon checks it before use.
 
-Whatever a packet holds, it gets one response; without a session none but CONNECT is answered.
+Each packet gets one response, whatever it contains; without a session only CONNECT is answered.
 """
 
 import struct
@@ -22,39 +22,39 @@ _RESPONSE, _ERROR, _EVENT = 0xFF, 0xFE, 0xFD
 SYNCH, DAQ_ACTIVE, UNKNOWN, SYNTAX, OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED = 0x00, 0x11, 0x20, 0x21, 0x22, 0x23, 0x24
 PAGE_NOT_VALID, MODE_NOT_VALID, SEGMENT_NOT_VALID, SEQUENCE, DAQ_CONFIG = 0x26, 0x27, 0x28, 0x29, 0x2A
 MEMORY_OVERFLOW, NOT_NOW = 0x30, 0x33
-#: Event code of what the master was not sent.
+#: Event code for data that could not be sent to the master.
 _OVERLOAD = 0x06
 
 #: CONNECT: data acquisition, and calibration where there is a page to write; little-endian, byte addresses,
 #: GET_COMM_MODE_INFO is there.
 _ACQUISITION, _CALIBRATION, _MODE, _VERSION = 0x04, 0x01, 0x80, 0x01
 _DAQ_RUNNING = 0x40
-#: GET_DAQ_PROCESSOR_INFO: dynamic lists, prescaler, time stamps; overload is told by an event.
+#: GET_DAQ_PROCESSOR_INFO: dynamic lists, prescaler, time stamps; overload is reported by an event.
 _DAQ_PROPERTIES = 0x01 | 0x02 | 0x10 | 0x80
-#: Bits of SET_DAQ_LIST_MODE that are understood, and of START_STOP_DAQ_LIST's answer to it.
+#: Supported bits of SET_DAQ_LIST_MODE, and bits of the answer to START_STOP_DAQ_LIST.
 _TIMESTAMP, _SELECTED, _RUNNING = 0x10, 0x01, 0x40
-#: GET_DAQ_EVENT_INFO: for acquisition, data of one event are of one moment; cycle in ms.
+#: GET_DAQ_EVENT_INFO: for acquisition; the data of one event belong to one moment; cycle in ms.
 _EVENT_PROPERTIES, MILLISECONDS = 0x04 | 0x80, 6
-#: SET_CAL_PAGE: who is to use the page, and that all segments are meant.
+#: SET_CAL_PAGE: who is to use the page, and whether all segments are meant.
 _BY_DAEMON, _BY_MASTER, _ALL_SEGMENTS = 0x01, 0x02, 0x80
-#: GET_PAGE_INFO: both may be used and read together with the other; the working page can be written, used or not.
+#: GET_PAGE_INFO: daemon and tool may use the same page or different ones; the working page can be written, in use or not.
 _READ_ONLY, _WRITABLE = 0x0F, 0x3F
-#: No entry has bits of its own.
+#: Bit offset of an entry that consists of whole bytes.
 _WHOLE = 0xFF
-#: Most lists, entries in all, and ODTs, whose number is a byte below the codes of responses.
+#: Largest numbers of lists, of entries in all, and of ODTs (an ODT's number is a byte below the codes of responses).
 LISTS, _ENTRIES, _ODTS = 16, 4096, 0xFC
-#: Address extension of a text that the slave offers to be uploaded.
+#: Address extension of a text that the slave provides for upload.
 _TEXT = 0xFF
 
 
 class Refusal(Exception):
-    """A command that is answered by the error code that it has as its argument."""
+    """A command is refused; the argument is the error code of the answer."""
 
 
 @dataclass(frozen=True)
 class Transport:
-    """What a transport layer carries: bytes of a command and of data, bytes of a time stamp, its unit's code and length in ns,
-    and most ODTs."""
+    """Properties of a transport layer: bytes of a command and of data, bytes of a time stamp, its unit's code and length in
+    ns, and the largest number of ODTs."""
 
     max_cto: int
     max_dto: int
@@ -72,7 +72,7 @@ ON_UDP = Transport(252, 1400, 4, 3, 1000)
 
 @dataclass
 class _List:
-    """A DAQ list: per ODT its entries (extension, address, size), size 0 for one that was not written."""
+    """A DAQ list: entries (extension, address, size) of each ODT; size 0: not written yet."""
 
     odts: list[list[tuple[int, int, int]]] = field(default_factory=list)
     event: int | None = None
@@ -87,7 +87,7 @@ class Slave:
     """One session, begun anew by each CONNECT.
 
     Args:
-        memory: what is read.
+        memory: the memory that can be read.
         transport: ON_CAN or ON_UDP.
         clock: monotonic time now, ns.
         name: of the A2L file, without its ending.
@@ -112,7 +112,7 @@ class Slave:
 
     def _reset(self) -> None:
         self._lists: list[_List] = []
-        #: What was allocated last: nothing, freed, lists, ODTs or entries; each may follow the one before and itself.
+        #: Step of allocation: none, freed, lists, ODTs, entries. Each may follow the step before it, or itself.
         self._allocated = 0
         self._pointer: tuple[int, int, int] | None = None
         self._address, self._text = (0, 0), b""
@@ -129,7 +129,7 @@ class Slave:
         try:
             if (command := self._commands.get(packet[0])) is None:
                 raise Refusal(UNKNOWN)
-            # Longer ones are filled up to the frame's size.
+            # Longer packets are padded to the frame's size.
             if len(packet) <= command.layout.size:
                 raise Refusal(SYNTAX)
             self._packet = packet
@@ -138,7 +138,7 @@ class Slave:
             return bytes([_ERROR, *refusal.args])
 
     def end(self) -> None:
-        """Forget the session."""
+        """End the session."""
         self.connected = False
         self._reset()
 
@@ -163,7 +163,7 @@ class Slave:
         return bytes(7)
 
     def _identify(self, kind: int) -> bytes:
-        """0 and 1: name; 4: the file itself. Of any other kind there is a text of length 0."""
+        """0 and 1: name; 4: the file itself; for all others a text of length 0."""
         self._offer(self._texts.get(kind, b""))
         return struct.pack("<BHI", 0, 0, len(self._text))
 
@@ -197,7 +197,7 @@ class Slave:
         return self._write(count, 8)
 
     def _write(self, count: int, header: int) -> bytes:
-        """Take ``count`` bytes that stand behind ``header`` bytes of the packet."""
+        """Write ``count`` bytes that follow ``header`` bytes of the packet."""
         (extension, address), content = self._address, self._packet[header : header + count]
         if not 0 < count <= self._transport.max_cto - header:
             raise Refusal(OUT_OF_RANGE)
@@ -380,7 +380,7 @@ class Slave:
         concerned = [chosen for chosen in self._lists if mode == 0 or chosen.selected]
         for chosen in concerned:
             if mode == 1:
-                # It may have changed since it was selected.
+                # The list may have changed since it was selected.
                 self._check(chosen)
         for chosen in concerned:
             self._run(chosen, mode == 1)
@@ -407,7 +407,7 @@ class Slave:
         return time_ns // self._transport.unit_ns
 
     def data(self, corner: int, time_ns: int) -> Iterator[bytes]:
-        """What an estimate of a corner at ``time_ns`` has the running lists send."""
+        """Packets that the running lists send for an estimate of a corner at ``time_ns``."""
         for number, chosen in enumerate(self._lists):
             if not chosen.running or chosen.event != corner:
                 continue
@@ -421,7 +421,7 @@ class Slave:
                 if chosen.timestamps and odt == 0:
                     width = self._transport.timestamp_bytes
                     parts.append((self._ticks(time_ns) & (1 << 8 * width) - 1).to_bytes(width, "little"))
-                # What could be read when it was written can be read now.
+                # An entry was checked when it was written, so it can be read.
                 parts += [self._memory.read(*entry) or b"" for entry in entries if entry[2]]
                 yield b"".join(parts)
 
@@ -431,7 +431,7 @@ class Slave:
 
 
 class Command(NamedTuple):
-    """A command's code, what follows it in a packet, and what answers it: bytes behind the response's first."""
+    """A command's code, the fields that follow it in a packet, and the function that gives the response after byte 0."""
 
     code: int
     layout: struct.Struct
@@ -442,7 +442,7 @@ def _table(rows: Iterable[tuple[str, int, str, Callable[..., bytes]]]) -> dict[s
     return {name: Command(code, struct.Struct("<" + layout), action) for name, code, layout, action in rows}
 
 
-#: What the slave answers, by the standard's names: always, and where numbers may be written.
+#: Commands that the slave answers, by the standard's names: always, and only if numbers may be written.
 READING = _table([
     ("CONNECT", CONNECT, "B", Slave._connect),
     ("DISCONNECT", 0xFE, "", Slave._disconnect),
