@@ -61,7 +61,7 @@ def _known(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: st
 
 
 def _compared(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str, weights: np.ndarray) -> dict:
-    sampled = np.array([[before.rmse(path, condition, w), after.rmse(path, condition, w)] for w in weights])
+    sampled = np.column_stack([which.rmses(path, condition, weights) for which in (before, after)])
     sampled = sampled[np.isfinite(sampled).all(axis=1)]
     low, high = np.percentile(sampled, (2.5, 97.5), axis=0)
     ratio = np.percentile(sampled[:, 1] / np.maximum(sampled[:, 0], 1e-12), (2.5, 97.5))

@@ -4,6 +4,7 @@ do, and the best few run through the estimator."""
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -56,7 +57,7 @@ class Screen:
     def __init__(self, model: Model, channel: str, samples: int):
         self.model, self.channel, bench = model, channel, model.bench
         self.means = Averaging(bench.episode[channel], samples)
-        self._of_episode = (self.means.episode == np.arange(bench.episodes)[:, None]).astype(float)
+        self._bounds = np.searchsorted(self.means.episode, np.arange(bench.episodes + 1))
         own = model.own(channel)
         penalty = model.penalty(own, channel) + 1e-12
         table = np.column_stack([*(model.columns[c] for c in own), model.residual[channel]])
@@ -64,7 +65,6 @@ class Screen:
         self.nuisances = averaged[:, :-1]
         self._inverse = np.linalg.pinv(self.nuisances.T @ self.nuisances + np.diag(penalty), rcond=1e-12, hermitian=True)
         self.residual = self.beside_nuisances(averaged[:, -1:])
-        self._residual_of_episode = self._of_episode * self.residual[:, 0]
         self.keep = model.residual[channel] != 0.0
 
     def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
@@ -82,10 +82,13 @@ class Screen:
 
     def scores_of(self, averaged: np.ndarray) -> Scores:
         """Of regressors that are averaged already."""
-        averaged = self.beside_nuisances(averaged)
-        u = self._residual_of_episode @ averaged
-        np.square(averaged, out=averaged)
-        return Scores(u.T, (self._of_episode @ averaged).T)
+        taken = self._inverse @ (self.nuisances.T @ averaged)
+        u, a = np.empty((2, len(self._bounds) - 1, averaged.shape[1]))
+        # An episode at a time stays in the processor's cache.
+        for index, (begin, end) in enumerate(pairwise(self._bounds)):
+            left = averaged[begin:end] - self.nuisances[begin:end] @ taken
+            u[index], a[index] = self.residual[begin:end, 0] @ left, np.einsum("ij,ij->j", left, left)
+        return Scores(u.T, a.T)
 
 
 @dataclass(frozen=True)
@@ -258,11 +261,11 @@ def _chance(search: Search) -> float:
     for port, column in search.sensitivities.items():
         rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
         if rows:
-            by_port.append((screen.means.of((column * screen.keep)[:, None]), rows))
+            by_port.append((screen.means.of((column * screen.keep)[:, None]), values[:, rows]))
     gain = search.scores.gain.max()
     for number in range(_CHANCES):
-        moved = np.roll(values, int(len(values) * search.random.uniform(0.1, 0.9)), axis=0)
-        if any(float(screen.scores_of(own * moved[:, rows]).gain.max()) >= gain for own, rows in by_port):
+        shift = int(len(values) * search.random.uniform(0.1, 0.9))
+        if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
             # One that is as good is one too many, and settles it.
             return 2.0 / (2.0 + number)
     return 1.0 / (1.0 + _CHANCES)

@@ -150,10 +150,13 @@ class EpisodeErrors:
 
     def rmse(self, path: str, condition: str = "total", weights: np.ndarray | None = None) -> float:
         """RMSE in the errors' unit; ``weights`` says how often each episode counts. NaN without samples."""
+        return float(self.rmses(path, condition, np.ones(self.sums.shape[2]) if weights is None else weights))
+
+    def rmses(self, path: str, condition: str, weights: np.ndarray) -> np.ndarray:
+        """RMSE for each row of ``weights``, shape (..., episodes)."""
         p, c = self.paths.index(path), self.conditions.index(condition)
-        weights = np.ones(self.sums.shape[2]) if weights is None else weights
-        count = float(self.counts[p, c] @ weights)
-        return float(np.sqrt(self.sums[p, c] @ weights / count)) if count else float("nan")
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(weights @ self.sums[p, c] / (weights @ self.counts[p, c]))
 
     def samples(self, path: str) -> int:
         """Samples with a finite error of ``path``."""
