@@ -123,7 +123,7 @@ def test_what_is_missing_is_said(figures):
     figures["loops"][0]["cyclictest"] = None
     figures["verdict"] = verdict(figures)
     shown = text(figures)
-    assert "above an empty loop's wake-up" in shown and "rt-tests" in shown
+    assert "minus an empty loop's wake-up" in shown and "rt-tests" in shown
     assert not _missed(figures)
 
 

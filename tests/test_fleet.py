@@ -262,7 +262,7 @@ def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
     root, found = fleet
     assert main(["fleet", "report", str(root), "--output", str(tmp_path / "fleet.html")]) == 0
     page = (tmp_path / "fleet.html").read_text()
-    assert "1 batch shares something" in page and "viscous friction" in page and found.groups[0].action in page
+    assert "1 batch shares a cause" in page and "viscous friction" in page and found.groups[0].action in page
     assert findings.load(root) == found
 
 
