@@ -347,6 +347,8 @@ class Mapping:
             raise InputError(
                 f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
             )
+        # No log has times before zero, as a recorder has them before its trigger.
+        frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
 
     def _check_rate(self, path: Path, messages: dict) -> None:
