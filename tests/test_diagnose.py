@@ -21,7 +21,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.diagnose import confirmation, diagnosis, grammar, prospects, search
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
-from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out
 from emb_daemon.diagnose.forms import harmonic, made_effect
@@ -313,6 +313,15 @@ def test_nothing_is_invented_and_a_calibration_that_is_off_is_said_to_be_off(cal
     assert result.before.rmse("fused") > 40.0
     assert result.after.rmse("fused") < 35.0
     assert "calibration itself was off" in verdict(result)
+    assert "No friction is left" not in verdict(result)
+    gone = {"friction.offset_Nm": Recalibrated(0.03, 1e-14, 0.03, "N·m", 5.0, "torque")}
+    assert "No friction is left" in verdict(dataclasses.replace(result, recalibrated=gone))
+
+
+def test_what_ends_at_the_bound_of_the_search_is_known_no_better_than_it_moved(calibration):
+    inertia = next(c for c in base_coordinates(calibration, [6.0]) if c.name == "motor.inertia_kg_m2")
+    assert inertia.sigma_of(0.9 * inertia.start, 0.01) == 0.01
+    assert inertia.sigma_of(inertia.low, 0.01) == pytest.approx(inertia.start - inertia.low)
 
 
 def test_each_log_has_its_own_pads(calibration):

@@ -652,3 +652,26 @@ def test_the_delays_of_a_busy_machine_are_no_other_rate(rig):
     times = frames["time_ns"][frames["can_id"] == 0x100]
     assert abs(np.median(np.diff(times)) / 4e6 - 1.0) > 0.05
     assert at_our_rate(frames) is frames
+
+
+def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys):
+    """A heated rod, one value every two seconds: temperatures arrive, and nothing is said of a motor."""
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: near, unit: degC}\n"
+        "  EMB_FL_Thermocouple.OuterBackplateTemp: {signal: far, unit: degC}\n"
+        "  RIG_FL_InnerPad.InnerPadTemp2mm: {signal: middle, unit: degC}\n"
+    )
+    rows = "".join(f"{2 * n},{20 + 0.1 * n:.1f},{20 + 0.01 * n:.2f},{20 + 0.05 * n:.2f}\n" for n in range(300))
+    (tmp_path / "rod.csv").write_text("t,near,far,middle\n" + rows)
+    log = load_log(tmp_path / "rod.csv", read=Mapping(tmp_path / "m.yaml").read)
+    assert capsys.readouterr().err == "" and log.time_s[-1] - log.time_s[0] == pytest.approx(598.0, abs=0.01)
+    samples = log.samples
+    assert not samples["angle"].any() and np.all(np.diff(samples["time_ns"]) == 4_000_000)
+    half = len(samples) // 2
+    assert samples["inner_backplate"][half] == pytest.approx(35.0, abs=0.2)
+    assert samples["outer_backplate"][half] == pytest.approx(21.5, abs=0.1)
+    times, pads = log.reference.pads["inner"]
+    assert pads[0][len(times) // 2] == pytest.approx(27.5, abs=0.2)
+    lines = [line for line in Mapping(tmp_path / "m.yaml").notes if "Resolver" in line]
+    assert lines == [f"{tmp_path / 'm.yaml'}: EMB_FL_Resolver is constant: the motor stands throughout"]

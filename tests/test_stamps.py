@@ -72,6 +72,46 @@ def test_stamps_of_recorders_are_put_right(truth, tmp_path, capsys, change, said
     assert np.ptp(late[20:-20]) < 2.0 * most_s
 
 
+def test_values_stamped_before_the_clock_was_set_are_left_out(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    late = columns["time_s"] + np.where(np.arange(len(columns["time_s"])) < 3, 111.0, 0.0)
+    log = _read(tmp_path, columns | {"time_s": late})
+    assert f"after value 3: 3 of {len(late)} values of another time left out" in capsys.readouterr().err
+    samples = _read(tmp_path, columns).samples
+    assert np.array_equal(log.samples["angle"], samples["angle"][3:])
+
+
+def test_what_was_recorded_before_a_trigger_is_a_log_too(truth, tmp_path):
+    """An oscilloscope counts from its trigger; no log that anybody reads has times below zero."""
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = foreignkit.write_table(tmp_path / "a.csv", columns | {"time_s": columns["time_s"] - 0.5})
+    arguments = ["convert", table, "--mapping", tmp_path / "mapping.yaml", "--output", tmp_path / "ours.log"]
+    assert main([str(argument) for argument in arguments]) == 0
+    log = load_log(tmp_path / "ours.log")
+    assert log.time_ns[0] >= 0 and log.samples["angle"][100] == pytest.approx(columns["angle_rad"][100], abs=1e-3)
+
+
+@pytest.mark.parametrize(("unit", "starts_anew"), [("ms", 2**16), ("us", 2**32), ("s", 86_400), ("s", 3600)])
+def test_a_counter_that_is_full_and_a_clock_at_midnight_go_on(tmp_path, unit, starts_anew):
+    """A motor at 2 rad/s, its stamps begun anew in the middle: as far apart as before."""
+    per_s = {"ms": 1e3, "us": 1e6, "s": 1.0}[unit]
+    stamps = np.mod(starts_anew - 2.0 * per_s + 0.004 * per_s * np.arange(1000), starts_anew)
+    if unit == "s":
+        written = [f"{int(t // 3600):02d}:{int(t // 60 % 60):02d}:{t % 60:06.3f}" for t in np.round(stamps, 3)]
+        written = [text[3:] if starts_anew == 3600 else text for text in written]
+    else:
+        written = np.rint(stamps).astype(int).tolist()
+    rows = "".join(f"{time},{0.008 * n:.3f}\n" for n, time in enumerate(written))
+    (tmp_path / "a.csv").write_text("t,angle\n" + rows)
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ntime: {{signal: t, unit: {unit}}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad}}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    assert log.time_s[-1] - log.time_s[0] == pytest.approx(3.996, abs=0.005)
+    assert np.abs(log.samples["speed"][5:-5] - 2.0).max() < 0.05
+
+
 def test_a_signal_that_is_held_in_a_finer_raster_is_taken_at_its_own_rate(truth, tmp_path):
     """A current of 250 Hz in a table of 1 kHz is a mean over 4 ms, and a force of 25 Hz does not go by steps."""
     fine = foreignkit.sampled(truth, 1000.0)
@@ -266,6 +306,26 @@ def test_inertia_alone_turns_no_torque_sensor_round(tmp_path, capsys):
     assert np.corrcoef(columns["current_A"], columns["force_N"])[0, 1] < -0.6
     _read(tmp_path, columns, _NO_ANGLE)
     assert "scale: -1" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("load", [0.0, 400.0])
+@pytest.mark.parametrize(("factor", "said"), [(-1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"), (1.0, "")])
+def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
+    """A motor to and fro against a torque sensor, load and stroke of their own; and one that turns free, at either end of its
+    travel with a current of its own (cogging), which is nothing that clamps."""
+    rng, time_s = np.random.default_rng(4), 0.004 * np.arange(5000)
+    angle = 30.0 * np.sin(2.0 * np.pi * 0.37 * time_s)
+    speed = np.gradient(angle, time_s)
+    force = load * np.sin(2.0 * np.pi * 0.11 * time_s)
+    current = 0.02 * force + 0.8 * np.sign(speed) + 2e-4 * np.gradient(speed, time_s) + rng.normal(0.0, 0.1, len(time_s))
+    if not load:
+        current += 0.5 * (angle < -25.0)
+    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed, "current_A": current}
+    free = foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
+    columns |= {"force_N": force, "plate_C": 22.0 + 0.0 * time_s}
+    _read(tmp_path, columns, foreignkit.COLUMNS if load else free)
+    told = capsys.readouterr().err
+    assert said in told and ("scale: -1" in told) == bool(said)
 
 
 def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):

@@ -62,6 +62,10 @@ class Coordinate:
     parameter: str = ""
     log: int | None = None
 
+    def sigma_of(self, value: float, sigma: float) -> float:
+        """Standard deviation of a fitted value: one at a bound of what is searched is known no better than it has moved."""
+        return max(sigma, abs(value - self.start)) if np.isclose(value, (self.low, self.high)).any() else sigma
+
 
 Values = Mapping[Coordinate, float]
 

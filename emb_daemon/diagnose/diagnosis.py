@@ -294,7 +294,8 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
         gain = model.rms(evidence.gain, group[0].channel)
         for c in group:
             size = next((move.weight for move in c.moves if move.key == c.name), 1.0)
-            value, sigma = model.values[c] * size, model.fits[c.channel].sigmas.get(c, 0.0) * abs(size)
+            sigma = c.sigma_of(model.values[c], model.fits[c.channel].sigmas.get(c, 0.0)) * abs(size)
+            value = model.values[c] * size
             known = any(move.key == c.name for move in c.moves)
             before = value_of(calibration, c.name) if known else c.start
             unit = parameter(calibration, c.name).unit if known else "1"

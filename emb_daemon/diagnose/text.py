@@ -1,6 +1,6 @@
 """The verdict in words, for terminal and page."""
 
-from emb_daemon.calibration.parameters import in_words
+from emb_daemon.calibration.parameters import OFFSET_FRICTION, in_words
 from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
@@ -18,6 +18,8 @@ _PORTS = {
 _TOLD = 3
 #: Change of the curve's force from which other pads are a better guess than wear of these: units scatter by less.
 _OTHER_PADS = 0.1
+#: Share of the friction as calibrated from which what is left of it is none.
+_NO_FRICTION = 1e-6
 NAMES = {
     "stiffness": "stiffness path",
     "torque": "torque path",
@@ -93,7 +95,11 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
     if not parts:
         return []
     told = [f"{text.strip()} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]
-    return [f"Recalibrated: {', '.join(told)}."]
+    offset = diagnosis.recalibrated.get(OFFSET_FRICTION)
+    # Searched down to zero, which no machine has.
+    none = offset is not None and offset.value < _NO_FRICTION * offset.before
+    turned = ["No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing?"]
+    return [f"Recalibrated: {', '.join(told)}.", *(turned if none else [])]
 
 
 def _unexplained(diagnosis: Diagnosis) -> list[str]:

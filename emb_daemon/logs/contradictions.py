@@ -20,6 +20,8 @@ _FOLLOWS = 0.2
 #: Correlation of force and the current that accelerates nothing, negative, from which one of the two is turned round. Friction
 #: that holds the force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
+#: Share of the highest speed from which the motor moves.
+_MOVING = 0.05
 #: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
 _LEAST_CLAMP_N = 100.0
 #: Fastest change of an angle that our message of the motor's speed carries, rad/s: 6 000 rpm; share of the time in which it
@@ -53,13 +55,16 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _find_too_fast(angle)
+    speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
+    # A motor whose load is a constant clamps nothing.
+    is_free = isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
+    moves = not (speed is None or current is None or (angle or speed.integral()).way_is_unknown)
+    if moves and (force is not None or is_free):
+        lines += _find_driving_friction(speed, current, force)
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # The travel tells nothing of directions; current and force do.
-        speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
-        if not (speed is None or current is None or force is None or (angle or speed.integral()).way_is_unknown):
-            lines += _find_opposed(speed, current, force)
-        return lines
-    if current is not None and np.ptp(current.values):
+        return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
+    if current is not None and np.ptp(current.values) and not is_free:
         lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force)
@@ -114,6 +119,26 @@ def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     return [
         f"ClampForceRef falls while CurrentQ rises (correlation {correlation:.2f}), and positive current clamps: "
         "`scale: -1` of one of the two?"
+    ]
+
+
+def _find_driving_friction(speed: Series, current: Series, force: Series | None) -> list[str]:
+    """A line where the current that neither load nor inertia takes is against the motion: friction takes current."""
+    times = current.time_ns
+    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
+    moving = np.isfinite(load) & (np.abs(at) > _MOVING * np.nanquantile(np.abs(at), 0.99))
+    direction = np.sign(at[moving])
+    if min(np.sum(direction > 0.0), np.sum(direction < 0.0)) < _LEAST:
+        return []
+    known = np.stack([np.ones(len(times)), load, np.gradient(at, 1e-9 * times)], axis=1)[moving]
+    columns = np.column_stack([current.values[moving], direction])
+    left = columns - known @ np.linalg.lstsq(known, columns)[0]
+    correlation = float(np.corrcoef(left.T)[0, 1]) if np.all(np.ptp(left, axis=0) > 0.0) else 0.0
+    if correlation > -_AGAINST:
+        return []
+    return [
+        f"CurrentQ is less in the direction of motion than against it (correlation {correlation:.2f}), as if friction drove "
+        "the motor: `scale: -1` of MotorAngle and MotorSpeed?"
     ]
 
 

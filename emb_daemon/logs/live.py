@@ -197,7 +197,9 @@ class MappedBus(PythonCanBus):
         self._clocks = {}
         for corner in CORNERS:
             if resolver := self._messages.get(f"EMB_{corner}_Resolver"):
-                clock = next(value for value in resolver.signals.values() if isinstance(value, _Value))
+                clock = next((value for value in resolver.signals.values() if isinstance(value, _Value)), None)
+                if clock is None:
+                    raise InputError(f"{mapping.path}: EMB_{corner}_Resolver is constant; expected a motor on a live bus")
                 self._clocks[corner] = clock
 
     def drain(self) -> np.ndarray:

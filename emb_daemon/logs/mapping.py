@@ -19,7 +19,7 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions
 from emb_daemon.logs.read import Recorded, ids_in, read_log
-from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages
+from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages, standing
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
@@ -244,10 +244,11 @@ class Mapping:
 
     def _check_complete(self) -> None:
         """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
-        corners = [corner for corner in CORNERS if self._sources(f"EMB_{corner}_Resolver")]
+        corners = [corner for corner in CORNERS if f"EMB_{corner}_Resolver" in self.messages]
         if not corners and not self._faults:
             self._faults.append(
-                f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner"
+                f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner; of a "
+                "bench without a motor, or whose motor stands, say so by `EMB_FL_Resolver.MotorAngle: {value: 0}`"
             )
         # Of a message with a fault nobody knows yet what will be missing.
         whole = [name for name in self.messages if not any(f"signals.{name}." in fault for fault in self._faults)]
@@ -259,6 +260,8 @@ class Mapping:
                 other = name in ("VEH_WheelSpeed", "VEH_WheelPulse") and signal.name[-2:] not in corners
                 if signal.name in signals or optional or other:
                     continue
+                if name.endswith("_Resolver") and not self._sources(name):
+                    continue
                 if signal.name in substitutes:
                     self.notes.append(f"{self.path}: {name}.{signal.name} is not measured: {substitutes[signal.name]}")
                 else:
@@ -266,7 +269,12 @@ class Mapping:
             if name.endswith("_Thermocouple") and not any(plate in signals for plate in _PLATES):
                 self._fault(name, f"expected {' or '.join(_PLATES)}")
             if name.endswith("_Resolver") and not self._sources(name):
-                self._fault(name, "only constants: expected at least one signal of the rig")
+                if "MotorAngle" not in signals:
+                    self._fault(f"{name}.MotorAngle", "missing: of a motor that stands give it a constant `value`, too")
+                elif not any(map(self._sources, self.messages)):
+                    self._fault(name, "only constants: expected at least one signal of the rig")
+                else:
+                    self.notes.append(f"{self.path}: {name} is constant: the motor stands throughout")
         for corner in corners:
             for message, text in _LOST.items():
                 if (name := message.format(corner)) not in self.messages:
@@ -330,12 +338,17 @@ class Mapping:
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 print(f"{path}: {corner}: {line}", file=sys.stderr)
         self._check_rate(path, messages)
+        for name in messages:
+            if name.endswith("_Resolver") and not self._sources(name):
+                messages[name] = standing(messages, messages[name]["MotorAngle"])
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             found = f"; found {ids_in(recorded.frames)}" if self.databases else ""
             raise InputError(
                 f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
             )
+        # No log has times before zero, as a recorder has them before its trigger.
+        frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
 
     def _check_rate(self, path: Path, messages: dict) -> None:
@@ -358,7 +371,7 @@ class Mapping:
             if channel is not None:
                 place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
-        return ", ".join(names)
+        return ", ".join(names) or "a signal"
 
     def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
         """Times and values of the rig's signals by bus and name; one in a frame too short for it is left out."""

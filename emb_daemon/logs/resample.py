@@ -11,6 +11,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from emb_daemon.jit import njit
 from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest, shipped_database
 from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -235,6 +236,17 @@ def fill_missing(name: str, signals: Signals) -> Signals:
     return signals
 
 
+def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Series]:
+    """Resolver signals of a motor that stands for as long as anything of ``messages`` was measured."""
+    measured = [source.time_ns for signals in messages.values() for source in signals.values() if isinstance(source, Series)]
+    measured = np.sort(np.concatenate(measured))
+    stretches = _stretches(measured, _SILENT_NS) if len(measured) else []
+    times = np.concatenate([np.arange(first, last + 1, CYCLE_NS) for first, last in stretches] or [measured])
+    return {
+        name: Series(times, np.full(len(times), value)) for name, value in (("MotorAngle", angle_rad), ("MotorSpeed", 0.0))
+    }
+
+
 def _another_motion(angle: Series, speed: Series) -> str:
     """How speed and angle contradict each other; empty if they do not, or if nobody knows the way between two samples."""
     if angle.is_sparse:
@@ -427,10 +439,17 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
     frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
     frames["data"] = payload[usable]
     if not is_reference:
-        counters = cycles[usable] % COUNTER_MODULO
-        for frame, counter in zip(frames, counters.tolist(), strict=True):
-            frame["data"] = protect(message.frame_id, frame["data"], counter, 0)
+        frames["data"] = _protected(frames["data"], message.frame_id, cycles[usable] % COUNTER_MODULO)
     return frames
+
+
+@njit
+def _protected(payloads, can_id, counters):
+    """`protect` of one after the other."""
+    protected = np.empty_like(payloads)
+    for row in range(len(payloads)):
+        protected[row] = protect(can_id, payloads[row], counters[row], 0)
+    return protected
 
 
 def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -11,6 +11,8 @@ from emb_daemon.errors import InputError
 LATEST_S = 9.2e9
 #: Step back in time from which a file holds two recordings; frames of two buses stand less out of order, ns.
 _BACK_NS = 1_000_000_000
+#: Share of the values from which those between two steps back are the recording; others were stamped before a clock was set.
+_ONE_RECORDING = 0.99
 #: Share of the mean period up to which two stamps are one: jitter leaves more, a gateway or a queue that is emptied less.
 _ONE = 0.2
 #: Shares of the steps in motion that have to be so short, and to be none at all, for stamps to come in bunches; chance makes
@@ -39,10 +41,20 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     Raises:
         InputError: time goes back by more than a second, or does not pass.
     """
+    rows = np.arange(len(time_ns))
     if len(back := np.flatnonzero(np.diff(time_ns) < -_BACK_NS)):
         by = 1e-9 * float(time_ns[back[0]] - time_ns[back[0] + 1])
-        raise InputError(f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}; expected one recording in a file")
-    rows = np.argsort(time_ns, kind="stable")
+        rows = max(np.split(rows, back + 1), key=len)
+        if len(rows) < _ONE_RECORDING * len(time_ns):
+            raise InputError(
+                f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}; expected one recording in a file"
+            )
+        print(
+            f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}: {len(time_ns) - len(rows)} of {len(time_ns)} "
+            "values of another time left out",
+            file=sys.stderr,
+        )
+    rows = rows[np.argsort(time_ns[rows], kind="stable")]
     times = time_ns[rows]
     steps = np.diff(times)
     if len(steps) < 2:

@@ -33,6 +33,9 @@ _CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}
 #: What calls a column by its place.
 _BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+#: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits, in its unit; how
+#: many ordinary steps may pass meanwhile.
+_CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 2**32), 10.0
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
 #: Column names listed where one was not found.
@@ -80,8 +83,24 @@ def _seconds(path: Path, table, time) -> np.ndarray:
     """When each row was written, s."""
     if time.signal is None:
         return np.arange(table.num_rows) / time.rate_Hz
+    times = np.array(_numbers(path, table, time.signal), float)
+    is_clock = _is_clock(table[time.signal])
+    known = np.isfinite(times)
+    if is_clock or np.all(times[known] == np.rint(times[known])):
+        times[known] = _going_on(times[known], _CLOCKS_S if is_clock else _COUNTERS)
     # Of a clock, seconds already.
-    return _numbers(path, table, time.signal) * (1.0 if _is_clock(table[time.signal]) else UNITS[time.unit][1])
+    return times * (1.0 if is_clock else UNITS[time.unit][1])
+
+
+def _going_on(times: np.ndarray, periods: tuple[int, ...]) -> np.ndarray:
+    """Times that start anew, as a clock does at midnight and a counter when it is full, put together; as they are where a step
+    back is none of the least of ``periods`` that they keep within."""
+    steps = np.diff(times)
+    period = next((period for period in periods if len(steps) and np.max(times) < period), None)
+    anew = steps < -0.5 * (period or np.inf)
+    if not anew.any() or np.max(steps[anew]) + period > _ORDINARY_STEPS * np.quantile(steps[~anew], 0.95):
+        return times
+    return times + period * np.concatenate([[0], np.cumsum(anew)])
 
 
 def _other_unit(largest_s: float, time) -> str:
