@@ -126,7 +126,7 @@ def test_one_that_does_not_fit_is_refused(tmp_path, changes, why):
 def test_one_that_is_damaged_is_refused(tmp_path, damage):
     path = _sealed(tmp_path / "kernels.so")
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(Refused, match="incomplete|damaged"):
+    with pytest.raises(Refused, match=r"incomplete|damaged"):
         check(path)
 
 
