@@ -51,6 +51,11 @@ def log_ending(path: Path) -> str:
     return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
 
 
+def ending_of_content(content: bytes) -> str:
+    """A log's format by how it begins, as its ending; empty where that tells nothing."""
+    return next((ending for beginning, ending in _BEGINNINGS.items() if content.startswith(beginning)), "")
+
+
 def needs_extra(path: Path, error: ImportError) -> InputError:
     """The error for a format of which a library is not installed."""
     return InputError(f"{path}: this format needs an extra: pip install emb_daemon[mf4] ({error})")
@@ -178,7 +183,7 @@ def read_log(path: str | Path) -> Recorded:
     path = Path(path)
     raw = read_file(path)
     content = unpack_gzip(path, raw)
-    ending = next((known for beginning, known in _BEGINNINGS.items() if content.startswith(beginning)), log_ending(path))
+    ending = ending_of_content(content) or log_ending(path)
     if ending not in LOG_ENDINGS:
         known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
         raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
