@@ -385,6 +385,14 @@ def test_nothing_that_a_numpy_file_holds_is_executed(tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
+def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):
+    arguments = [str(bus), "--mapping", str(bus.parent / "mapping.yaml")]
+    line = "no --calibration: estimates are those of another actuator, rig-A"
+    for calibration in ([], ["--calibration", str(bus.parent / "calibration.yaml")]):
+        assert main(["replay", *arguments, *calibration]) == 0
+        assert (line in capsys.readouterr().err) == (not calibration)
+
+
 def test_variables_that_are_no_table_are_refused(tmp_path):
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)

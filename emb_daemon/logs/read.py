@@ -19,6 +19,7 @@ from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError
 from emb_daemon.logs.apart import frames_apart, frames_of
 from emb_daemon.logs.candump import parse_candump
+from emb_daemon.logs.dialects import as_candump
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
 
@@ -183,7 +184,9 @@ def read_log(path: str | Path) -> Recorded:
     path = Path(path)
     raw = read_file(path)
     content = unpack_gzip(path, raw)
-    ending = ending_of_content(content) or log_ending(path)
+    if rewritten := as_candump(content):
+        content = rewritten
+    ending = ".log" if rewritten else ending_of_content(content) or log_ending(path)
     if ending not in LOG_ENDINGS:
         known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
         raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
