@@ -385,6 +385,26 @@ def test_nothing_that_a_numpy_file_holds_is_executed(tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
+def test_a_channel_that_is_there_twice_is_told_by_its_group(tmp_path):
+    asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    times = 0.004 * np.arange(100)
+    with asammdf.MDF() as file:
+        for factor in (1.0, 2.0):
+            file.append([asammdf.Signal(factor * times, times, name="angle")])
+        file.save(tmp_path / "a.mf4")
+    mapping = "format: 1\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
+    for signal, said in (
+        ("angle", "2 channels have that name; expected one of `angle group 0`, `angle group 1`"),
+        ("angel", "angel: no such channel; the measurement has .*angle"),
+        ("angle group 7", "angle group 7: no such channel"),
+    ):
+        (tmp_path / "m.yaml").write_text(mapping.replace("angle,", f"{signal},"))
+        with pytest.raises(InputError, match=said):
+            Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
+    (tmp_path / "m.yaml").write_text(mapping.replace("angle,", "angle group 1,"))
+    assert load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"][50] == pytest.approx(0.4)
+
+
 def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):
     arguments = [str(bus), "--mapping", str(bus.parent / "mapping.yaml")]
     line = "no --calibration: estimates are those of another actuator, rig-A"

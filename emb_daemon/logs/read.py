@@ -193,5 +193,6 @@ def read_log(path: str | Path) -> Recorded:
     parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     frames, octets, channels = parsed
     if not len(frames):
-        raise InputError(f"{path}: holds no frames")
+        hint = "; a measurement's channels need a mapping without dbc" if ending == ".mf4" else ""
+        raise InputError(f"{path}: holds no frames{hint}")
     return Recorded(frames, octets, hashlib.sha256(raw).hexdigest(), channels)

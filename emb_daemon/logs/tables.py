@@ -44,6 +44,8 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits, in its unit; how
 #: many ordinary steps may pass meanwhile.
 _CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 2**32), 10.0
+#: What calls a channel by its group, and one of the frames that loggers of a bus write.
+_IN_GROUP, _BUS = " group ", "CAN_DataFrame"
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
 #: Column names listed where one was not found.
@@ -375,6 +377,25 @@ def _is_number(cell: str) -> bool:
     return cell.lstrip("+-.,")[:1].isdigit() or cell.lstrip("+-").lower() in ("inf", "nan")
 
 
+def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
+    """Where a channel stands in a measurement, also of one that is called by its group where several have its name.
+
+    Raises:
+        InputError: there is none, or several.
+    """
+    plain, _, group = name.rpartition(_IN_GROUP)
+    places = [place for place in file.channels_db.get(plain, ()) if group.isdigit() and place[0] == int(group)]
+    if not (places := places or list(file.channels_db.get(name, ()))):
+        if _BUS in file.channels_db:
+            raise InputError(f"{path}: {name}: the file holds CAN frames, which a mapping with `dbc` reads")
+        known = _some(name, list(file.channels_db)) or "none"
+        raise InputError(f"{path}: {name}: no such channel; the measurement has {known}")
+    if len(places) > 1:
+        these = ", ".join(f"`{name}{_IN_GROUP}{group}`" for group, _ in places)
+        raise InputError(f"{path}: {name}: {len(places)} channels have that name; expected one of {these}")
+    return places[0]
+
+
 def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     try:
         from asammdf import MDF
@@ -385,7 +406,7 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
             start_ns = round(1e9 * file.header.start_time.timestamp())
             found = {}
             for name in names:
-                signal = file.get(name)
+                signal = file.get(None, *_group_and_index(path, file, name))
                 values = np.asarray(signal.samples).astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
                 stamps, rows = in_time(f"{path}: {name}", stamps, [values])
