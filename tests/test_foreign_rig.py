@@ -184,6 +184,10 @@ def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, conte
         ("15:{s:06.3f}", "s"),
         ("22.11.2026 08:15:{s:06.3f}", "s"),
         ("2026-11-22T08:15:{s:06.3f}Z", "s"),
+        ("2026-11-22 08:15:{s:06.3f}", "s"),
+        ("11/22/2026 08:15:{s:06.3f} PM", "s"),
+        ("22/11/2026 08:15:{s:06.3f}", "s"),
+        ("2026/11/22 08:15:{s:06.3f}", "s"),
         ("{ns:d}", "ns"),
     ],
 )
@@ -194,6 +198,53 @@ def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
     (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
     log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
     assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "decimal", "group"),
+    [(";", ",", "."), (";", ",", " "), (";", ".", "'"), (",", ".", ","), (";", ",", "\u00a0")],
+)
+def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
+
+    def number(value: float) -> str:
+        text = f"{value:,.1f}".translate(str.maketrans({",": group, ".": decimal}))
+        return f'"{text}"' if delimiter == "," else text
+
+    rows = [
+        delimiter.join(map(number, (4.0 * n, 0.1 * n, 25.0, 1.5, 22.0, 1500.0 + 10.0 * (n % 2) - 900.0 * (n % 3 == 0))))
+        for n in range(400)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", delimiter), *rows]) + "\n")
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.allclose(log.time_s, 0.004 * np.arange(400), atol=1e-6)
+    assert set(np.round(log.force_N).tolist()) == {600.0, 610.0, 1500.0, 1510.0}
+
+
+def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, capsys):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    rows = [f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,{'OVER' if n % 10 < 3 else '100'}" for n in range(300)]
+    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert "90 cells are no numbers, left out, the first of them 'OVER'" in capsys.readouterr().err
+    assert np.nanmax(np.abs(log.force_N - 100.0)) < 1.0 and len(log.samples) == 300
+
+
+def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
+    """A text called .log, its header behind a mark; a column that is missed is told by name, units in its name or not."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    rows = "".join(f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,0\n" for n in range(100))
+    (tmp_path / "a.log").write_text(f"# bench 4\n#{_HEADER}\n{rows}")
+    mapping = Mapping(tmp_path / "mapping.yaml")
+    assert len(load_log(tmp_path / "a.log", read=mapping.read).samples) == 100
+    named = ",".join(f"{name} [x]" for name in _HEADER.split(","))
+    (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{rows}")
+    with pytest.raises(InputError, match=r"no such column; the table has time_s, angle_rad \[x\], speed_rad_per_s \[x\]"):
+        mapping.read(tmp_path / "b.csv")
+    for binary in (b"PK\x03\x04", b"\x89HDF"):
+        (tmp_path / "c.csv").write_bytes(binary + bytes(100))
+        with pytest.raises(InputError, match="expected a table"):
+            mapping.read(tmp_path / "c.csv")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le"])
@@ -332,6 +383,34 @@ def test_nothing_that_a_numpy_file_holds_is_executed(tmp_path):
     with pytest.raises(InputError, match=r"not readable: .*pickle"):
         load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
     assert not (tmp_path / "executed").exists()
+
+
+def test_a_channel_that_is_there_twice_is_told_by_its_group(tmp_path):
+    asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    times = 0.004 * np.arange(100)
+    with asammdf.MDF() as file:
+        for factor in (1.0, 2.0):
+            file.append([asammdf.Signal(factor * times, times, name="angle")])
+        file.save(tmp_path / "a.mf4")
+    mapping = "format: 1\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
+    for signal, said in (
+        ("angle", "2 channels have that name; expected one of `angle group 0`, `angle group 1`"),
+        ("angel", "angel: no such channel; the measurement has .*angle"),
+        ("angle group 7", "angle group 7: no such channel"),
+    ):
+        (tmp_path / "m.yaml").write_text(mapping.replace("angle,", f"{signal},"))
+        with pytest.raises(InputError, match=said):
+            Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
+    (tmp_path / "m.yaml").write_text(mapping.replace("angle,", "angle group 1,"))
+    assert load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"][50] == pytest.approx(0.4)
+
+
+def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):
+    arguments = [str(bus), "--mapping", str(bus.parent / "mapping.yaml")]
+    line = "no --calibration: estimates are those of another actuator, rig-A"
+    for calibration in ([], ["--calibration", str(bus.parent / "calibration.yaml")]):
+        assert main(["replay", *arguments, *calibration]) == 0
+        assert (line in capsys.readouterr().err) == (not calibration)
 
 
 def test_variables_that_are_no_table_are_refused(tmp_path):

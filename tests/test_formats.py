@@ -16,6 +16,7 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames, read_log
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
+from emb_daemon.wire.frames import EXTENDED, REMOTE
 
 _THEIR_DBC = """VERSION ""
 BU_: RIG
@@ -255,6 +256,36 @@ def test_a_multiplexer_of_an_unknown_number_is_no_value(tmp_path):
     (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
     angle = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Resolver")["MotorAngle"]
     assert len(angle) > 90 and angle == pytest.approx(20.0, abs=0.01)
+
+
+_SHOWN = """ (1709294400.000100)  can0  123   [8]  11 22 33 44 55 66 77 88
+ (1709294400.010100)  can1  18FEF131   [2]  AB CD
+
+ (1709294400.020100)  can0  RX - -  123   [8]  11 22 33 44 55 66 77 88   '.."3DUfw.'
+ (1709294400.030100)  can0  123   [12]  01 02 03 04 05 06 07 08 09 0A 0B 0C
+ (1709294400.040100)  can0  123   [0]  remote request
+"""
+_GVRET = """Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
+166064000,00000123,false,Rx,0,8,11,22,33,44,55,66,77,88,
+166074000,18FEF131,true,Rx,1,2,AB,CD,
+"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("x.log", _SHOWN), ("x.txt", _SHOWN), ("x.csv", _GVRET)])
+def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    recorded = read_log(tmp_path / name)
+    frames = recorded.frames
+    assert frames["can_id"][:2].tolist() == [0x123, 0x18FEF131] and frames["flags"][:2].tolist() == [0, EXTENDED]
+    assert frames["data"][:2].tolist() == [0x8877665544332211, 0xCDAB] and frames["length"][:2].tolist() == [8, 2]
+    assert np.diff(frames["time_ns"][:2]) == 10_000_000
+    assert recorded.channels[0] != recorded.channels[1]
+    if text is _SHOWN:
+        assert len(frames) == 5 and frames["data"][2] == frames["data"][0]
+        assert recorded.payloads(np.array([3]))[0] == bytes(range(1, 13)) and frames["flags"][4] == REMOTE
+    (tmp_path / name).write_text(text + "what is this\n")
+    with pytest.raises(InputError, match=r"x\.\w+:\d: not a candump line"):
+        read_log(tmp_path / name)
 
 
 @pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", ".mf4", ".log"])

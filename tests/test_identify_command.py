@@ -142,6 +142,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(rig, tmp_pat
         (["--output", str(campaign)], "is one of the inputs"),
         (["--output", str(tmp_path / "none" / "c.yaml")], "no such folder"),
         (["--output", str(tmp_path / "c.yaml"), "--report", str(tmp_path / "file")], "expected a folder"),
+        (["--output", str(tmp_path / "c.yaml"), "--report", str(tmp_path / "c.yaml")], "is the calibration's file"),
     ):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(read, "read_file", lambda path: pytest.fail(f"{path} read"))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wirekit import MS, frame, record
 
-from emb_daemon.errors import InputErrors
+from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
@@ -29,6 +29,7 @@ from emb_daemon.wire.receive import (
     new_reception,
     receive,
 )
+from emb_daemon.wire.units import conversion
 
 #: The wire contract: message, id of its first corner, cycle (ms), signals as start|length, sign, factor, offset, unit.
 _CONTRACT = (
@@ -357,6 +358,17 @@ def test_a_dbc_of_ones_own_is_read_in_its_units(tmp_path, unit, factor, offset, 
     per_unit = value / float(factor)
     assert unpack(np.uint64(1000 << 16), signal) == pytest.approx(1000.0 * value + float(offset) * per_unit)
     assert (signal["low"], signal["high"]) == (pytest.approx(-80000 * per_unit), pytest.approx(80000 * per_unit))
+
+
+@pytest.mark.parametrize(
+    ("unit", "target", "value"),
+    [("Degrees", "rad", np.pi / 180.0), ("U/min", "rad/s", np.pi / 30.0), ("KPH", "m/s", 1.0 / 3.6), ("Amps", "A", 1.0),
+     ("Celsius", "degC", 1.0), ("mV", "V", 1e-3)],
+)  # fmt: skip
+def test_a_unit_may_be_spelt_in_other_ways(unit, target, value):
+    assert conversion(unit, target)[0] == pytest.approx(value)
+    with pytest.raises(InputError, match="expected s, ms"):
+        conversion("MV", "s")
 
 
 def test_what_is_sent_is_in_the_units_of_a_dbc_of_ones_own(tmp_path):

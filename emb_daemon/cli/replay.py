@@ -69,6 +69,11 @@ def run(arguments: argparse.Namespace) -> int:
             "are clamp forces, never negative; `diagnose` takes a load of either sign",
             file=sys.stderr,
         )
+    if arguments.mapping and not arguments.calibration:
+        print(
+            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
+            file=sys.stderr,
+        )
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
     sign = np.asarray
     if arguments.keys:

@@ -32,6 +32,9 @@ def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray
         raise InputError(f"{path}: not readable: {text}") from None
     columns: dict[str, np.ndarray] = {}
     for name, variable in variables.items():
+        if name.startswith("__"):
+            # What the file says of itself.
+            continue
         _add(columns, name, np.asarray(variable))
     return columns
 

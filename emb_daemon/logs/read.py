@@ -19,6 +19,7 @@ from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError
 from emb_daemon.logs.apart import frames_apart, frames_of
 from emb_daemon.logs.candump import parse_candump
+from emb_daemon.logs.dialects import as_candump
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
 
@@ -49,6 +50,11 @@ def _most_bytes() -> int:
 def log_ending(path: Path) -> str:
     """What decides a log's format: its last ending, before .gz."""
     return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+
+
+def ending_of_content(content: bytes) -> str:
+    """A log's format by how it begins, as its ending; empty where that tells nothing."""
+    return next((ending for beginning, ending in _BEGINNINGS.items() if content.startswith(beginning)), "")
 
 
 def needs_extra(path: Path, error: ImportError) -> InputError:
@@ -178,12 +184,15 @@ def read_log(path: str | Path) -> Recorded:
     path = Path(path)
     raw = read_file(path)
     content = unpack_gzip(path, raw)
-    ending = next((known for beginning, known in _BEGINNINGS.items() if content.startswith(beginning)), log_ending(path))
+    if rewritten := as_candump(content):
+        content = rewritten
+    ending = ".log" if rewritten else ending_of_content(content) or log_ending(path)
     if ending not in LOG_ENDINGS:
         known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
         raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
     parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
     frames, octets, channels = parsed
     if not len(frames):
-        raise InputError(f"{path}: holds no frames")
+        hint = "; a measurement's channels need a mapping without dbc" if ending == ".mf4" else ""
+        raise InputError(f"{path}: holds no frames{hint}")
     return Recorded(frames, octets, hashlib.sha256(raw).hexdigest(), channels)

@@ -13,29 +13,39 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs import arrays
-from emb_daemon.logs.read import log_ending, needs_extra, read_file, unpack_gzip
+from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 _TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
-#: What a measurement file begins with, one that was not closed included.
-_MDF = (b"MDF     ", b"UnFinMF ")
+#: Endings of logs of frames alone; all others may be a table's. How workbooks and HDF5 begin, which are not read.
+_FRAMES, _BINARY = (".blf", ".asc", ".trc"), (b"PK\x03\x04", b"\x89HDF", b"\xd0\xcf\x11\xe0")
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
-#: Share of a column's cells that may be no numbers.
-_MOST_ODD = 0.01
-#: A time of day with parts of a second, or minutes and seconds, after a German date or none; others are pyarrow's to read.
-_CLOCK = re.compile(r"(?:(?P<date>\d{1,2}\.\d{1,2}\.\d{4})[ T])?(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)")
+#: Share of a column's cells that may be no numbers; half of them if they are a few words, as of an instrument out of range.
+_MOST_ODD, _FEW_WORDS = 0.01, 3
+#: A time of day with parts of a second, or minutes and seconds, after a date or none; what ISO 8601 has is pyarrow's to read.
+_CLOCK = re.compile(
+    r"(?:(?P<date>\d{1,4}[./-]\d{1,2}[./-]\d{1,4}),?[ T])?"
+    r"(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?"
+)
+#: A number with marks between its thousands, or with a decimal comma; the marks that are never decimal.
+_GROUPED, _SPACES = re.compile(r"[+-]?\d[\d.,'’\s]*(?:[eE][+-]?\d+)?"), re.compile(r"['’\s]")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
+#: Months of a year, and digits by which a date begins with it.
+_MONTHS, _YEAR = 12, 4
 #: What calls a column by its place.
 _BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits, in its unit; how
 #: many ordinary steps may pass meanwhile.
 _CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 2**32), 10.0
+#: What calls a channel by its group, and one of the frames that loggers of a bus write.
+_IN_GROUP, _BUS = " group ", "CAN_DataFrame"
 #: Octets of which every second is zero in UTF-16 without a mark.
 _MARK = 200
 #: Column names listed where one was not found.
@@ -56,10 +66,11 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
+    begins = ending_of_content(content)
     # `.dat` is what INCA calls a measurement, and what others call a text.
-    if ending in _MEASUREMENTS and (ending != ".dat" or content.startswith(_MDF)):
+    if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):
         return _channels(path, content, names), digest
-    if ending not in _TABLES:
+    if begins or ending in _FRAMES or (ending not in arrays.ENDINGS and content.startswith(_BINARY)):
         tables, measurements = ", ".join(_TABLES), ", ".join(_MEASUREMENTS)
         raise InputError(f"{path}: expected a table ({tables}) or a measurement ({measurements}): no dbc")
     if time is None:
@@ -182,33 +193,59 @@ def _numbers(path: Path, table, name: str) -> np.ndarray:
         except pyarrow.ArrowException:
             raise InputError(f"{path}: {name}: expected a column of numbers, found {column.type}") from None
     cells = column.to_pylist()
-    values = np.array([_number(cell) for cell in cells])
+    texts = _ungrouped([cell if cell is None else cell.strip() for cell in cells])
+    dates = [found["date"] for text in texts if text and (found := _CLOCK.fullmatch(text)) and found["date"]]
+    day_first = any(int(re.split("[./-]", date)[0]) > _MONTHS for date in dates) or any("." in date for date in dates)
+    values = np.array([_number(text, day_first) for text in texts])
     odd = [row for row in np.flatnonzero(np.isnan(values)).tolist() if cells[row] is not None]
     if not odd:
         return values
     first = f"the first of them {cells[odd[0]]!r}, value {odd[0] + 1}"
-    if len(odd) > _MOST_ODD * len(cells):
+    few = len({cells[row] for row in odd}) <= _FEW_WORDS
+    if len(odd) > (0.5 if few else _MOST_ODD) * len(cells):
         raise InputError(f"{path}: {name}: expected a column of numbers; {len(odd)} cells are none, {first}")
     print(f"{path}: {name}: {len(odd)} cells are no numbers, left out, {first}", file=sys.stderr)
     return values
 
 
-def _number(cell: str | None) -> float:
+def _ungrouped(cells: list[str | None]) -> list[str | None]:
+    """A column's numbers without marks between thousands, and with a decimal point; other texts as they are."""
+    numbers = [cell for cell in cells if cell and _GROUPED.fullmatch(cell)]
+    both = next((cell for cell in numbers if "," in cell and "." in cell), None)
+    if both is not None:
+        group = min(",.", key=both.rindex)
+    else:
+        commas = [cell for cell in numbers if "," in cell]
+        group = "," if commas and all(map(_THOUSANDS.fullmatch, commas)) else "."
+
+    def plain(cell: str) -> str:
+        text = _SPACES.sub("", cell)
+        # A point alone is a decimal one.
+        return (text.replace(group, "") if both or group == "," else text).replace(",", ".")
+
+    return [plain(cell) if cell and _GROUPED.fullmatch(cell) else cell for cell in cells]
+
+
+def _number(cell: str | None, day_first: bool) -> float:
     """Of a cell's text; of a date and a time of day, or of one of them, seconds; NaN of anything else."""
     if cell is None:
         return np.nan
     try:
         return float(cell)
     except ValueError:
-        found = _CLOCK.fullmatch(cell.strip())
+        found = _CLOCK.fullmatch(cell)
     if not found:
         return np.nan
     hours, minutes, seconds = (float((found[part] or "0").replace(",", ".")) for part in ("h", "m", "s"))
+    if found["half"]:
+        hours = hours % 12.0 + 12.0 * (found["half"] in "Pp")
     of_day = 3600.0 * hours + 60.0 * minutes + seconds
+    if not found["date"]:
+        return of_day
+    parts = re.split("[./-]", found["date"])
+    year, month, day = parts if len(parts[0]) == _YEAR else (parts[2], *(parts[1::-1] if day_first else parts[:2]))
     try:
-        return of_day + (
-            datetime.strptime(found["date"], "%d.%m.%Y").replace(tzinfo=UTC).timestamp() if found["date"] else 0.0
-        )
+        return of_day + datetime(int(year), int(month), int(day), tzinfo=UTC).timestamp()
     except ValueError:
         return np.nan
 
@@ -224,10 +261,15 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
-    # The header has most of the names; before it stands what the tool has to say.
+    # The header has most of the names, and parts of its lines do what parts it; before it stands what the tool has to say.
     header, delimiter = max(
         ((row, mark) for row in range(min(len(lines), _PREAMBLE)) for mark in _DELIMITERS),
-        key=lambda at: (len({*names} & {*_cells(lines[at[0]], at[1])}), -at[0], lines[at[0]].count(at[1])),
+        key=lambda at: (
+            len({*names} & {*_cells(lines[at[0]], at[1])}) * _parts(lines[at[0] + 1 : at[0] + 2 + _UNITS], at[1]),
+            -at[0],
+            at[1] != " ",
+            lines[at[0]].count(at[1]),
+        ),
     )
     cells = _cells(lines[header], delimiter)
     by_place = all(map(_BY_PLACE.fullmatch, names))
@@ -275,6 +317,11 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     return table
 
 
+def _parts(lines: list[str], delimiter: str) -> bool:
+    """Whether a mark parts any of the lines below a header; true of none."""
+    return not any(lines) or any(len(_cells(line, delimiter)) > 1 for line in lines)
+
+
 def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: str) -> list[str]:
     """Names of a table whose rows, ``line`` the first of them, have more cells than its header: a first column that counts or
     names the rows, as R and pandas write it, has none; else the last ones have none."""
@@ -304,9 +351,10 @@ def _as_utf8(content: bytes) -> bytes:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
+    # As numpy.savetxt and MATLAB write a header.
+    line = line.lstrip("#%")
     if delimiter == " ":
-        # As numpy.savetxt and MATLAB write a header.
-        line = " ".join(line.split()).lstrip("#% ")
+        line = " ".join(line.split())
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 
@@ -329,6 +377,25 @@ def _is_number(cell: str) -> bool:
     return cell.lstrip("+-.,")[:1].isdigit() or cell.lstrip("+-").lower() in ("inf", "nan")
 
 
+def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
+    """Where a channel stands in a measurement, also of one that is called by its group where several have its name.
+
+    Raises:
+        InputError: there is none, or several.
+    """
+    plain, _, group = name.rpartition(_IN_GROUP)
+    places = [place for place in file.channels_db.get(plain, ()) if group.isdigit() and place[0] == int(group)]
+    if not (places := places or list(file.channels_db.get(name, ()))):
+        if _BUS in file.channels_db:
+            raise InputError(f"{path}: {name}: the file holds CAN frames, which a mapping with `dbc` reads")
+        known = _some(name, list(file.channels_db)) or "none"
+        raise InputError(f"{path}: {name}: no such channel; the measurement has {known}")
+    if len(places) > 1:
+        these = ", ".join(f"`{name}{_IN_GROUP}{group}`" for group, _ in places)
+        raise InputError(f"{path}: {name}: {len(places)} channels have that name; expected one of {these}")
+    return places[0]
+
+
 def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     try:
         from asammdf import MDF
@@ -339,7 +406,7 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
             start_ns = round(1e9 * file.header.start_time.timestamp())
             found = {}
             for name in names:
-                signal = file.get(name)
+                signal = file.get(None, *_group_and_index(path, file, name))
                 values = np.asarray(signal.samples).astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
                 stamps, rows = in_time(f"{path}: {name}", stamps, [values])

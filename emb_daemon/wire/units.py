@@ -13,7 +13,7 @@ UNITS = {
     "rev": ("rad", 2.0 * math.pi, 0.0), "turn": ("rad", 2.0 * math.pi, 0.0),
     "rad/s": ("rad/s", 1.0, 0.0), "deg/s": ("rad/s", _DEGREE, 0.0), "°/s": ("rad/s", _DEGREE, 0.0),
     "rpm": ("rad/s", math.pi / 30.0, 0.0), "RPM": ("rad/s", math.pi / 30.0, 0.0), "1/min": ("rad/s", math.pi / 30.0, 0.0),
-    "r/min": ("rad/s", math.pi / 30.0, 0.0), "U/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
+    "r/min": ("rad/s", math.pi / 30.0, 0.0), "rev/s": ("rad/s", 2.0 * math.pi, 0.0),
     "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
     "degC": ("degC", 1.0, 0.0), "°C": ("degC", 1.0, 0.0), "C": ("degC", 1.0, 0.0), "deg C": ("degC", 1.0, 0.0),
     "K": ("degC", 1.0, -273.15), "degF": ("degC", 5.0 / 9.0, -160.0 / 9.0), "°F": ("degC", 5.0 / 9.0, -160.0 / 9.0),
@@ -29,6 +29,15 @@ UNITS = {
     "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
 }  # fmt: skip
 
+#: Other spellings of them in DBC files and headers, in small letters.
+_SPELLINGS = {
+    "degree": "deg", "degrees": "deg", "degree/s": "deg/s", "degrees/s": "deg/s", "deg/sec": "deg/s", "dps": "deg/s",
+    "radian": "rad", "radians": "rad", "rad/sec": "rad/s", "rad.s-1": "rad/s", "u/min": "rpm", "upm": "rpm", "min-1": "rpm",
+    "revolutions": "rev", "turns": "rev", "amp": "A", "amps": "A", "ampere": "A", "volt": "V", "volts": "V",
+    "celsius": "degC", "deg c": "degC", "degc": "degC", "ºc": "degC", "° c": "degC", "kelvin": "K", "deg f": "degF",
+    "km/hr": "km/h", "kmh": "km/h", "kmph": "km/h", "km/h": "km/h", "kph": "km/h", "newton": "N", "newtons": "N", "n*m": "Nm",
+    "newton meter": "Nm", "percent": "%",
+}  # fmt: skip
 #: For an axis whose travel is measured instead of its motor's angle.
 TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", "m/min", "in/s")
 
@@ -39,6 +48,7 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     Raises:
         InputError: the unit is unknown, missing, or of another quantity.
     """
+    unit = unit if unit in UNITS else _SPELLINGS.get(unit.lower(), unit)
     if unit == target:
         return 1.0, 0.0
     target_base, target_factor, target_offset = UNITS[target]
