@@ -60,7 +60,7 @@ def passes(part: dict, load_kgf: int) -> tuple[np.ndarray, np.ndarray]:
         if name in samples.dtype.names:
             rows[name] = samples[name]
     current = samples["current_q"][samples["has_current"]]
-    pairs = pairs_of_passes(rows, np.atleast_1d(to_parameters(cranfield.starting_calibration()))[0])
+    pairs = pairs_of_passes(rows, np.atleast_1d(to_parameters(cranfield.calibration_to_start_from()))[0])
     return pairs, np.array([current[current > 0.0].mean(), current[current < 0.0].mean()])
 
 

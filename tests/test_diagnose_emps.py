@@ -1,24 +1,18 @@
 """Measured data: the EMPS benchmark (Janot, Gautier, Brunot 2019), a motor and ball screw that clamp nothing."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.offline import load_log
-
-_TOOL = Path(__file__).parent.parent / "tools" / "emps_to_log.py"
+from studies import hardware
 
 
 def test_torque_balance_of_the_thesis_is_completed_to_the_published_model(shared, tmp_path):
     folder = shared / "measured" / "emps"
     if not folder.is_dir():
         pytest.skip(f"NOT RUN: {folder} with the EMPS data set is not here")
-    spec = importlib.util.spec_from_file_location("emps_to_log", _TOOL)
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
+    tool = hardware.tool("emps_to_log")
     assert tool.main([str(folder / "DATA_EMPS.mat"), str(folder / "DATA_EMPS_PULSES.mat"), "--output", str(tmp_path)]) == 0
     first, second, pulses = (load_log(tmp_path / f"{name}.log") for name in ("first_half", "second_half", "pulses"))
     result = diagnose([first], load_calibration(tmp_path / "calibration.yaml"), [second, pulses])

@@ -27,15 +27,16 @@ import csv
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from no_pads import starting_calibration
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.files import save_calibration
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.resample import Series, fill_missing, frames_of
-from emb_daemon.resources import resource
 
 LEAD_M = 5e-3
 GEAR_GAIN_M_PER_RAD = LEAD_M / (2.0 * np.pi)
@@ -43,8 +44,6 @@ NEWTON_PER_KGF = 9.80665
 LOADS_KGF = (-40, 20, 40)
 #: What a first guess says: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
 NOMINAL_CONSTANT, NOMINAL_COULOMB, NOMINAL_INERTIA = 1.5, 0.7, 3e-5
-#: Clearance that no motion closes, rad.
-NEVER = 1e4
 #: Supply current of the drive while the nut stands, A: the middle of the normal runs'.
 STANDSTILL_A = 0.36
 #: Speed of the set point (mm/s) from which the nut is to move, and time of a stroke from which its current has settled, s.
@@ -104,26 +103,18 @@ def frames(part: dict[str, np.ndarray], load_kgf: int, with_load: bool = True) -
     return frames_of(messages)
 
 
-def starting_calibration() -> object:
-    """The thesis's torque balance, with what one would guess, and nothing to clamp."""
-    base = load_calibration(resource("config/calibration.yaml"))
-    replace = msgspec.structs.replace
-    return replace(
-        base,
-        actuator="Cranfield",
-        motor=replace(
-            base.motor,
-            torque_constant_Nm_per_A=NOMINAL_CONSTANT,
-            inertia_kg_m2=NOMINAL_INERTIA,
-            gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
-            maximum_speed_rad_per_s=100.0,
-        ),
-        friction=replace(base.friction, load_m_per_rad=0.0, offset_Nm=NOMINAL_COULOMB, presliding_angle_rad=0.5),
-        stiffness=replace(base.stiffness, maximum_force_N=500.0),
-        contact=replace(base.contact, clearance_rad=NEVER),
-        effects={},
-        provenance=None,
+def calibration_to_start_from() -> Calibration:
+    """What one would guess."""
+    start = starting_calibration(
+        "Cranfield",
+        torque_constant_Nm_per_A=NOMINAL_CONSTANT,
+        inertia_kg_m2=NOMINAL_INERTIA,
+        coulomb_Nm=NOMINAL_COULOMB,
+        presliding_angle_rad=0.5,
+        gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
+        maximum_speed_rad_per_s=100.0,
     )
+    return moved(start, {"stiffness.maximum_force_N": 500.0})
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -143,7 +134,7 @@ def main(argv: list[str] | None = None) -> int:
         if run in arguments.runs:
             content = format_candump(frames(part, load, not arguments.without_load)).encode()
             write_atomically(arguments.output / f"run{run}_{load}kgf.log", content)
-    save_calibration(starting_calibration(), arguments.output / "calibration.yaml")
+    save_calibration(calibration_to_start_from(), arguments.output / "calibration.yaml")
     return 0
 
 

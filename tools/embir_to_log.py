@@ -21,21 +21,18 @@ import re
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from no_pads import starting_calibration
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.files import save_calibration
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.mapping import Mapping
-from emb_daemon.resources import resource
 
 GEAR_GAIN_M_PER_RAD = 5e-4
 #: Of rotor and coupling, kg m2; motor friction, N m: what a datasheet would say.
 NOMINAL_INERTIA, NOMINAL_COULOMB = 1e-4, 0.02
-#: Clearance that no motion closes, rad.
-NEVER = 1e4
 
 MAPPING = """# Columns of the EMBiR dynamometer.
 format: 1
@@ -61,27 +58,6 @@ def read_header(path: Path) -> tuple[float, str]:
     if not constant or not sensor:
         raise InputError(f"{path}: no torque constant (kt_1 = ...) or no torque sensor: not a run of the EMBiR dynamometer")
     return float(constant.group(1)), sensor.group(1)
-
-
-def starting_calibration(constant: float) -> object:
-    """The thesis's torque balance: inertia and Coulomb friction, no other effect, and nothing to clamp."""
-    base = load_calibration(resource("config/calibration.yaml"))
-    replace = msgspec.structs.replace
-    return replace(
-        base,
-        actuator="EMBiR",
-        motor=replace(
-            base.motor,
-            torque_constant_Nm_per_A=constant,
-            inertia_kg_m2=NOMINAL_INERTIA,
-            gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
-            maximum_speed_rad_per_s=250.0,
-        ),
-        friction=replace(base.friction, load_m_per_rad=0.0, offset_Nm=NOMINAL_COULOMB, presliding_angle_rad=0.05),
-        contact=replace(base.contact, clearance_rad=NEVER),
-        effects={},
-        provenance=None,
-    )
 
 
 def write_logs(run: Path, mapping: str, folder: Path) -> None:
@@ -110,7 +86,16 @@ def main(argv: list[str] | None = None) -> int:
     except (OSError, InputError, InputErrors) as error:
         print(error, file=sys.stderr)
         return 2
-    save_calibration(starting_calibration(constant), arguments.output / "calibration.yaml")
+    start = starting_calibration(
+        "EMBiR",
+        torque_constant_Nm_per_A=constant,
+        inertia_kg_m2=NOMINAL_INERTIA,
+        coulomb_Nm=NOMINAL_COULOMB,
+        presliding_angle_rad=0.05,
+        gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
+        maximum_speed_rad_per_s=250.0,
+    )
+    save_calibration(start, arguments.output / "calibration.yaml")
     return 0
 
 

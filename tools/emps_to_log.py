@@ -23,17 +23,15 @@ import argparse
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from no_pads import starting_calibration
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.files import save_calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.resources import resource
-from emb_daemon.wire.e2e import COUNTER_MODULO, protect
-from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.layout import load_database, pack, signal_columns
+from emb_daemon.logs.resample import Series, frames_of
+from emb_daemon.wire.contract import CYCLE_NS
 
 GEAR_GAIN_M_PER_RAD = 5e-4
 AMPERE_PER_VOLT = 10.0
@@ -42,7 +40,6 @@ NOMINAL_MASS_KG, NOMINAL_COULOMB_N = 80.0, 30.0
 #: Corner (Hz) of the zero-phase filter of position and drive input, and samples at 1 kHz for each sample on the wire.
 _CORNER_HZ = 60.0
 _DECIMATION = 4
-_CYCLE_NS = 4_000_000
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
@@ -77,49 +74,18 @@ def frames(columns: dict[str, np.ndarray], begin: float = 0.0, end: float = 1.0)
     mean = np.cumsum(np.concatenate([[0.0], drive]))
     # Trapezoidal mean over the four intervals that end at the sample.
     current = (mean[rows + 1] - mean[rows + 1 - _DECIMATION] + 0.5 * (drive[rows - _DECIMATION] - drive[rows])) / _DECIMATION
-    result = np.zeros(3 * len(rows), FRAME)
-    wire, rig = load_database(resource("dbc/emb.dbc")), load_database(resource("dbc/rig.dbc"))
-    time_ns = 1_000_000_000 + _CYCLE_NS * np.arange(len(rows))
-    messages = (
-        (wire, "EMB_FL_Resolver", {"MotorAngle": position[rows] / GEAR_GAIN_M_PER_RAD,
-                                   "MotorSpeed": speed[rows] / GEAR_GAIN_M_PER_RAD}),
-        (wire, "EMB_FL_Current", {"CurrentQ": AMPERE_PER_VOLT * current}),
-        (rig, "RIG_FL_Force", {"ClampForceRef": np.zeros(len(rows)), "DiscTempRef": np.full(len(rows), 20.0)}),
-    )  # fmt: skip
-    for place, (database, name, values) in enumerate(messages):
-        message = database.get_message_by_name(name)
-        signals = signal_columns(database, name, tuple(values))
-        for row in range(len(rows)):
-            payload = 0
-            for signal, column in zip(signals, values.values(), strict=True):
-                payload |= int(pack(column[row], signal))
-            frame = result[3 * row + place]
-            frame["time_ns"] = time_ns[row] + 100_000 * place
-            frame["can_id"] = message.frame_id
-            frame["length"] = message.length
-            frame["data"] = payload if database is rig else protect(message.frame_id, payload, row % COUNTER_MODULO, 0)
-    return result
+    stamps = 1_000_000_000 + CYCLE_NS * np.arange(len(rows))
 
+    def series(values: np.ndarray) -> Series:
+        return Series.of(stamps, values)
 
-def starting_calibration(gtau: float) -> object:
-    """The thesis's torque balance: inertia and Coulomb friction, no other effect, and a clearance that never closes."""
-    base = load_calibration(resource("config/calibration.yaml"))
-    gamma = GEAR_GAIN_M_PER_RAD
-    replace = msgspec.structs.replace
-    return replace(
-        base,
-        actuator="EMPS",
-        motor=replace(
-            base.motor,
-            torque_constant_Nm_per_A=gamma * gtau / AMPERE_PER_VOLT,
-            inertia_kg_m2=gamma**2 * NOMINAL_MASS_KG,
-            gear_gain_m_per_rad=gamma,
-            maximum_speed_rad_per_s=1000.0,
-        ),
-        friction=replace(base.friction, load_m_per_rad=0.0, offset_Nm=gamma * NOMINAL_COULOMB_N, presliding_angle_rad=0.1),
-        contact=replace(base.contact, clearance_rad=1e4),
-        effects={},
-        provenance=None,
+    motion = {"MotorAngle": position[rows] / GEAR_GAIN_M_PER_RAD, "MotorSpeed": speed[rows] / GEAR_GAIN_M_PER_RAD}
+    return frames_of(
+        {
+            "EMB_FL_Resolver": {name: series(values) for name, values in motion.items()},
+            "EMB_FL_Current": {"CurrentQ": series(AMPERE_PER_VOLT * current).averaged()},
+            "RIG_FL_Force": {"ClampForceRef": 0.0, "DiscTempRef": 20.0},
+        }
     )
 
 
@@ -154,7 +120,17 @@ def main(argv: list[str] | None = None) -> int:
         ("pulses", frames(pulses)),
     ):
         write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
-    save_calibration(starting_calibration(float(run["gtau"][0])), arguments.output / "calibration.yaml")
+    gamma = GEAR_GAIN_M_PER_RAD
+    start = starting_calibration(
+        "EMPS",
+        torque_constant_Nm_per_A=gamma * float(run["gtau"][0]) / AMPERE_PER_VOLT,
+        inertia_kg_m2=gamma**2 * NOMINAL_MASS_KG,
+        coulomb_Nm=gamma * NOMINAL_COULOMB_N,
+        presliding_angle_rad=0.1,
+        gear_gain_m_per_rad=gamma,
+        maximum_speed_rad_per_s=1000.0,
+    )
+    save_calibration(start, arguments.output / "calibration.yaml")
     return 0
 
 

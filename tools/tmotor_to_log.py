@@ -16,8 +16,8 @@ import argparse
 import sys
 from pathlib import Path
 
-import msgspec
-from embir_to_log import GEAR_GAIN_M_PER_RAD, starting_calibration, write_logs
+from embir_to_log import GEAR_GAIN_M_PER_RAD, write_logs
+from no_pads import starting_calibration
 
 from emb_daemon.calibration.files import save_calibration
 from emb_daemon.errors import InputError, InputErrors
@@ -48,11 +48,16 @@ def main(argv: list[str] | None = None) -> int:
     except (OSError, InputError, InputErrors) as error:
         print(error, file=sys.stderr)
         return 2
-    replace = msgspec.structs.replace
-    base = starting_calibration(CONSTANT_NM_PER_A)
-    motor = replace(base.motor, inertia_kg_m2=NOMINAL_INERTIA, maximum_speed_rad_per_s=FASTEST)
-    friction = replace(base.friction, offset_Nm=NOMINAL_COULOMB)
-    save_calibration(replace(base, actuator="AK80-9", motor=motor, friction=friction), arguments.output / "calibration.yaml")
+    start = starting_calibration(
+        "AK80-9",
+        torque_constant_Nm_per_A=CONSTANT_NM_PER_A,
+        inertia_kg_m2=NOMINAL_INERTIA,
+        coulomb_Nm=NOMINAL_COULOMB,
+        presliding_angle_rad=0.05,
+        gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
+        maximum_speed_rad_per_s=FASTEST,
+    )
+    save_calibration(start, arguments.output / "calibration.yaml")
     return 0
 
 

@@ -1,5 +1,6 @@
 """Characteristic curves over pad thickness: between and beyond the measured ones, and whether they rise."""
 
+from bisect import bisect_left
 from typing import Annotated
 
 import numpy as np
@@ -25,6 +26,11 @@ class Curve(Struct, kw_only=True):
     def __post_init__(self):
         if self.coefficients[0] <= 0.0:
             raise InvalidValue("the first coefficient (N/rad) must be positive: force rises from contact")
+
+    @property
+    def of_all_terms(self) -> np.ndarray:
+        """The coefficients, shape (CURVE_TERMS,)."""
+        return np.array([*self.coefficients, *[0.0] * (CURVE_TERMS - len(self.coefficients))])
 
 
 def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
@@ -60,20 +66,17 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
     Raises:
         InputError: the thickness is too far from the measured ones.
     """
-    table = np.zeros((len(curves), CURVE_TERMS))
-    for row, curve in enumerate(curves):
-        table[row, : len(curve.coefficients)] = curve.coefficients
     if len(curves) == 1:
-        return table[0]
+        return curves[0].of_all_terms
     low, high = thickness_range(curves)
     if not low <= pad_thickness_mm <= high:
         raise InputError(
             f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured thicknesses; expected {low:g} to {high:g}"
         )
-    thicknesses = np.array([curve.pad_thickness_mm for curve in curves])
-    upper = int(np.clip(np.searchsorted(thicknesses, pad_thickness_mm), 1, len(curves) - 1))
-    share = (pad_thickness_mm - thicknesses[upper - 1]) / (thicknesses[upper] - thicknesses[upper - 1])
-    below, above = table[upper - 1], table[upper]
+    upper = bisect_left(curves, pad_thickness_mm, 1, len(curves) - 1, key=lambda curve: curve.pad_thickness_mm)
+    thinner, thicker = curves[upper - 1], curves[upper]
+    share = (pad_thickness_mm - thinner.pad_thickness_mm) / (thicker.pad_thickness_mm - thinner.pad_thickness_mm)
+    below, above = thinner.of_all_terms, thicker.of_all_terms
     used = (below != 0.0) | (above != 0.0)
     if np.any(below[used] * above[used] <= 0.0):
         return below + share * (above - below)

@@ -5,14 +5,13 @@ A key is the dotted path of a number in the calibration file: ``motor.torque_con
 calibration (`types.to_parameters`); what adaptation learns is a partial calibration, ``{key: value}``, applied by `moved`.
 """
 
-import copy
 import difflib
 import math
 import re
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -29,6 +28,9 @@ PRESLIDING_ANGLE, CLEARANCE = "friction.presliding_angle_rad", "contact.clearanc
 #: Step of a numerical derivative, relative to the size of the parameter. With it the errors of rounding and of curvature are
 #: both far below the residuals of a fit, and few samples cross a switch such as contact or a reversal.
 _STEP = 1e-3
+
+#: What following the path of no number raises.
+_NO_NUMBER = (AttributeError, IndexError, KeyError, TypeError)
 
 #: Units of keys, by the ending that states them.
 _UNITS = {
@@ -125,10 +127,10 @@ def value_of(calibration: Calibration, key: str) -> float:
                 found = _neutral(part)
             else:
                 found = getattr(found, part) if isinstance(found, msgspec.Struct) else found[part]
-    except (AttributeError, IndexError, KeyError, TypeError):
+    except _NO_NUMBER:
         found = None
     if type(found) is not float:
-        raise InputError(f"{key}: not a number of the calibration{_near(calibration, key)}")
+        raise _unknown(calibration, key)
     return found
 
 
@@ -143,9 +145,13 @@ def moved(calibration: Calibration, values: Mapping[str, float], *, checked: boo
         InputError: no number has a key; names near ones.
         InputErrors: ``checked``, and the result is not what a calibration file may hold; lists every fault.
     """
-    for key in values:
-        value_of(calibration, key)
-    changed = reduce(lambda result, key: _set(result, _parts(key), float(values[key])), values, calibration)
+    changed = calibration
+    for key, value in values.items():
+        number = float(value)
+        try:
+            changed = _set(changed, _parts(key), number)
+        except _NO_NUMBER:
+            raise _unknown(calibration, key) from None
     return _validate(changed, values) if checked else changed
 
 
@@ -182,10 +188,11 @@ def _parts(key: str) -> tuple[str | int, ...]:
     return () if parts[0] == "provenance" else tuple(parts)
 
 
-def _near(calibration: Calibration, key: str) -> str:
+def _unknown(calibration: Calibration, key: str) -> InputError:
     effects = [f"effects.{effect}.{name}" for effect, parameters in _EFFECTS.items() for name in parameters]
     near = difflib.get_close_matches(key, dict.fromkeys([*keys(calibration), *effects]), 3, 0.6)
-    return f"; similar are {', '.join(near)}" if near else ""
+    similar = f"; similar are {', '.join(near)}" if near else ""
+    return InputError(f"{key}: not a number of the calibration{similar}")
 
 
 def _neutral(effect: str) -> dict[str, float]:
@@ -199,11 +206,13 @@ def _neutral(effect: str) -> dict[str, float]:
 def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
     """A copy of ``node`` with the number at ``parts`` below it set; everything outside of the path is shared."""
     if not parts:
+        if type(node) is not float:
+            raise TypeError
         return value
     part, rest = parts[0], parts[1:]
     if isinstance(node, msgspec.Struct):
         # Without __post_init__: `_validate` checks the whole.
-        result = copy.copy(node)
+        result = node.__copy__()
         msgspec.structs.force_setattr(result, part, _set(getattr(node, part), rest, value))
         return result
     if isinstance(node, dict):

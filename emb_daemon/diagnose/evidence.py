@@ -91,14 +91,13 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     outer = np.outer(scale, scale)
 
     def solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return np.linalg.solve(normal / outer + ridge, right / scale) / scale
+        return np.linalg.solve(normal / outer + ridge, (right / scale)[..., None])[..., 0] / scale
 
     if not columns:
         return LeftOut(np.zeros(0), np.zeros((0, 0)), products[:, -1, -1].copy(), np.zeros((len(products), 0)))
     values = solve(total[:-1, :-1], total[:-1, -1])
-    without = np.empty((len(products), columns))
-    for index, part in enumerate(products):
-        without[index] = solve(total[:-1, :-1] - part[:-1, :-1], total[:-1, -1] - part[:-1, -1]) if part.any() else values
+    rest = total - products
+    without = solve(rest[:, :-1, :-1], rest[:, :-1, -1])
     left_out = (
         products[:, -1, -1]
         - 2.0 * np.einsum("gi,gi->g", without, products[:, :-1, -1])
@@ -149,10 +148,9 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
     normal = total[:first, :first] + np.diag(penalty[nuisances])
     shadow = np.linalg.lstsq(normal, total[:first, first:-1], rcond=1e-12)[0] if first else np.zeros((0, count))
-    carried = np.empty((len(both.products), count, count))
-    for index, part in enumerate(both.products):
-        cross = shadow.T @ part[:first, first:-1]
-        carried[index] = part[first:-1, first:-1] - cross - cross.T + shadow.T @ part[:first, :first] @ shadow
+    cross = shadow.T @ both.products[:, :first, first:-1]
+    carried = both.products[:, first:-1, first:-1] - cross - cross.transpose(0, 2, 1)
+    carried += shadow.T @ both.products[:, :first, :first] @ shadow
     rest = carried.sum(axis=0)
     size = np.sqrt(own)
     kept = np.linalg.eigvalsh(rest / np.outer(size, size))
