@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_daemon.adapt.records import to_limits
@@ -254,6 +254,7 @@ def test_what_is_written_is_read(tmp_path_factory, value):
     assert load_yaml(_file(tmp_path_factory, dump_calibration(value)), _Everything) == value
 
 
+@settings(max_examples=20)
 @given(st.floats(1e-6, 10.0), st.floats(1e-9, 1e-3), st.dictionaries(_words, _number, max_size=3))
 def test_calibration_round_trip(tmp_path_factory, constant, gain, figures):
     provenance = Provenance(date="2026-01-01", tool="0.1", figures=figures, logs=(Source(log="010", sha256="1e5"),))

@@ -568,7 +568,7 @@ def test_torque_that_nothing_explains_is_stated_to_the_filter(calibration, monke
         return Selection(start.refined(bench.channels), Screening(bench, start))
 
     monkeypatch.setattr(diagnosis, "select", unsearched)
-    log = log_of(next(_logs(calibration, 54, {}, stops=12)))
+    log = log_of(next(_logs(calibration, 54, {}, stops=8)))
     result = diagnose([log], calibration)
     assert result.calibration.noise.torque_lasting == 0.0 and "Some stops" not in verdict(result)
     clamped = log.force_N > 500.0

@@ -28,9 +28,12 @@ so that what is slow stays correlated and the standard deviation means what it s
 
 from math import sqrt
 
+import numpy as np
+
 from emb_daemon.jit import njit
 
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(14)
+#: Of numpy: numba would compile what takes one of Python's numbers anew for each of them.
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = np.arange(14)
 STATES = 14
 #: States that the clamp force itself rests on.
 OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
