@@ -136,6 +136,16 @@ def test_angle_and_speed_that_repeat_for_fifty_samples_are_stuck_unless_the_moto
     assert Watched().pass_by(500, speed=0.0) == AGREE
 
 
+@pytest.mark.parametrize(("flickers", "verdict"), [(49, AGREE), (50, STIFFNESS_WRONG)])
+def test_who_flickered_at_rest_fifty_times_is_stuck_when_twelve_samples_repeat(flickers, verdict):
+    watched = Watched()
+    for sample in range(flickers):
+        watched.pass_by(1, speed=1e-3 * (1 + sample % 2), follows=0.0)
+    speed = float(watched.m["speed"][0])
+    assert watched.pass_by(11, speed=speed, follows=0.0) == AGREE
+    assert watched.pass_by(1, speed=speed, follows=0.0) == verdict
+
+
 def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_does_for_25_samples():
     """100 rad/s over 0.6 rad and the way of a delay of 10 ms, 1 rad: five samples of 0.4 rad, of which some leak away."""
     watched = Watched()
@@ -186,6 +196,7 @@ def test_a_motor_that_stands_under_a_torque_that_must_turn_it_is_due():
     """At 1000 rad/s² it turns by half a fortieth of a radian in the first seven milliseconds, wherever the resolver stands."""
     flicker = 1e-3 * np.random.default_rng(1).standard_normal(500)
     assert _due_after(flicker, 1000.0) <= 4
+    assert _due_after(np.ones(9), 1e6) == 2, "two samples that stand after the first are enough"
     assert _due_after(flicker, 1000.0, delay=0.02) == pytest.approx(2 * 0.02 / _DT, abs=2)
     assert _due_after(flicker, 0.0) is None and _due_after(flicker, -1000.0) is None
 
