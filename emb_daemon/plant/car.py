@@ -277,7 +277,8 @@ def _tick(w, rng, commands, drive, frames, truth):
     car.time_ns += CYCLE_NS
     car.tick += 1
     slow_reference = car.time_ns // _REFERENCE_SLOW_NS != (car.time_ns - CYCLE_NS) // _REFERENCE_SLOW_NS
-    count = 0
+    # Of numpy: numba would compile what takes Python's zero apart from what takes any count.
+    count = np.int64(0)
     for row in range(len(w.corners)):
         p, s, training, corner = w.plants[row], w.states[row], w.trainings[row], w.corners[row]
         mode, target, rate = _train(s, training, commands[row], drive, car.speed == 0.0)
