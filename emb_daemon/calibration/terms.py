@@ -19,11 +19,13 @@ _FACTOR = 0.9
 #: much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor constant
 #: twice as large is another machine's.
 _GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
+#: Temperature (degC) from which one that multiplies counts.
+_COLD_C = 20.0
 
 
 class Term(Struct, kw_only=True):
-    """Coefficient × shape(memory(signal)) × gate, added at one port of the physics. u = (z − centre)/scale, where z is the
-    signal through its memory."""
+    """Coefficient × shape(memory(signal)) × gate × other, added at one port of the physics. u = (z − centre)/scale, where z is
+    the signal through its memory."""
 
     #: Begins with ``term:``.
     name: Annotated[str, Meta(pattern="^term:.+")]
@@ -58,6 +60,11 @@ class Term(Struct, kw_only=True):
     low: float
     #: End of that range.
     high: float
+    #: A second signal, in proportion to whose size it acts, a temperature's from 20 °C on; a response follows the product.
+    other: Literal[tuple(SIGNALS)] | None = None
+    #: Where it acts in full, in that signal's unit: the largest at which the term was found. Beyond it stays what it is there,
+    #: and sigma grows.
+    other_high: float = 0.0
     #: Date and logs.
     provenance: str = ""
 
@@ -66,6 +73,8 @@ class Term(Struct, kw_only=True):
             raise InvalidValue("high: expected more than low")
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
+        if self.other and not self.other_high > self.other_from:
+            raise InvalidValue(f"other_high: expected more than {self.other_from:g}")
         if not self.is_bounded:
             least, most = self.reach
             beyond, kind = (most, f"{self.growth:g} at most") if most > self.growth else (least, f"{-self.limit:g} at least")
@@ -75,6 +84,11 @@ class Term(Struct, kw_only=True):
     def unit(self) -> str:
         """Of the coefficient."""
         return HOOKS[self.port].unit
+
+    @property
+    def other_from(self) -> float:
+        """Size at which the other signal is nothing, in its unit."""
+        return _COLD_C if self.other and SIGNALS[self.other] == "°C" else 0.0
 
     @property
     def limit(self) -> float:
@@ -122,6 +136,8 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["port"], row["signal"] = PORTS.index(term.port), list(SIGNALS).index(term.signal)
         row["memory"], row["shape"] = MEMORIES.index(term.memory), SHAPES.index(term.shape)
         row["gate"] = GATES.index(term.gate)
+        row["other"] = list(SIGNALS).index(term.other) if term.other else -1
+        row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
         row["limit"] = term.limit if term.memory == "response" else np.inf
