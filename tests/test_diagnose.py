@@ -539,6 +539,31 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
     assert best.form.memory_scale == pytest.approx(7.0, rel=0.4)
 
 
+def test_two_signals_that_multiply_are_seen_as_both(calibration):
+    """A gear whose friction rises for seconds with the force, the more the faster the disc turns: neither alone explains it."""
+    of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}
+    frames = next(_logs(calibration, 35, {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}, stops=8))
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
+    best = Search(model, "torque", grammar._signals(model)).prospects()[0]
+    assert best.means == ("gear_friction", "clamp_force times disc_speed") and best.form.memory == "response"
+    assert best.form.memory_scale == pytest.approx(5.0, rel=0.6)
+
+
+@pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (9.0, None)])
+def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
+    """By half as much again, and by what matters: an error that was small may have grown to one that still is."""
+    trials = [
+        SimpleNamespace(log=SimpleNamespace(samples=range(n), path=Path(name)))
+        for n, name in ((900, "cold.log"), (100, "warm.log"))
+    ]
+    model = SimpleNamespace(bench=SimpleNamespace(trials=trials))
+    selection = SimpleNamespace(model=model, screening=SimpleNamespace(floor=lambda model, channel: 10.0))
+    of = np.repeat([0, 1], [900, 100])
+    before, after = np.array([100.0, 5.0 if ruined < 100.0 else 100.0])[of], np.array([20.0, ruined])[of]
+    worse = confirmation._where_worse(selection, "torque", before, after)
+    assert (worse and worse[0]) == (log and slice(900, 1000)) and (not log or log in worse[1])
+
+
 @pytest.fixture(scope="module")
 def coupled(calibration):
     """(search, fit log, validation log) of a brake that clamps harder as it brakes, which no catalogue holds."""
