@@ -6,7 +6,7 @@ lags are stable by construction. Sizes are shares of what the signals cover in t
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -66,7 +66,7 @@ _STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4, 
 
 @dataclass(frozen=True)
 class Form:
-    """Structure of a term, with its sizes as tried."""
+    """Structure of a term, with its sizes as tried. ``straight``: the exponent is one, and no number to be found."""
 
     port: str
     signal: str
@@ -81,6 +81,7 @@ class Form:
     high: float
     other: str | None = None
     other_high: float = 0.0
+    straight: bool = False
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -94,6 +95,7 @@ class Form:
             "odd_power": ("exponent",), "even_power": ("exponent",), "saturation": ("scale",), "decay": ("scale",),
             "onset": ("centre",), "harmonic": ("scale",), "bump": ("centre", "scale"),
         }.get(self.shape, ())  # fmt: skip
+        own = () if self.straight else own
         if self.memory == "none":
             return own
         if self.memory == "lag" and self.signal != "clamp_force":
@@ -162,12 +164,12 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
             shapes = [("none", power, farthest, centre, exponent, 1.0) for exponent in _EXPONENTS]
             shapes.append(("none", "onset", high - low, low + _PLACES[0] * (high - low), 1.0, 1.0))
             shapes += [("response", "even_power", farthest, centre, 1.0, time) for time in _TIMES_S]
-            for memory, shape, scale, centre, exponent, time in shapes:
-                # Of the product itself once is enough.
-                if shape == "onset" or exponent != 1.0 or signal < other:
-                    found.append(
-                        Form(port, signal, memory, shape, "always", scale, centre, exponent, time, low, high, other, most)
-                    )
+            for memory, shape, scale, middle, exponent, time in shapes:
+                form = Form(port, signal, memory, shape, "always", scale, middle, exponent, time, low, high, other, most)
+                straight = shape != "onset" and exponent == 1.0
+                found += [form] if memory == "response" or not straight else []
+                # Of the plain product once is enough.
+                found += [replace(form, straight=True)] if straight and signal < other else []
     return found
 
 
