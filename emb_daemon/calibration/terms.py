@@ -101,11 +101,16 @@ class Term(Struct, kw_only=True):
         return _GROWS.get(self.port, self.limit)
 
     @property
+    def is_held(self) -> bool:
+        """Whether the kernel holds it within its limits: how long its signal stays says what a response reaches, and two
+        signals are hardly at their largest at once."""
+        return self.memory == "response" or (self.other is not None and self.growth == self.limit)
+
+    @property
     def is_bounded(self) -> bool:
-        """Whether it stays within its limits. What a response reaches, the time for which its signal stays says: the kernel
-        holds it there."""
+        """Whether it stays within its limits."""
         least, most = self.reach
-        return self.memory == "response" or (least >= -self.limit and most <= self.growth)
+        return self.is_held or (least >= -self.limit and most <= self.growth)
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -140,7 +145,7 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
-        row["limit"] = term.limit if term.memory == "response" else np.inf
+        row["limit"] = term.limit if term.is_held else np.inf
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

@@ -131,7 +131,7 @@ def _kernel(term: Term) -> list[str]:
     body = ("s.memory" if response else f"({shaped})") + (f" * {_GATES[term.gate]}" if _GATES[term.gate] else "")
     if not harmonic:
         body = f"p.coefficient * {body}"
-    if response and np.isfinite(term.limit):
+    if term.is_held and np.isfinite(term.limit):
         body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
     z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
     arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
