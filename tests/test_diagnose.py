@@ -549,6 +549,12 @@ def test_two_signals_that_multiply_are_seen_as_both(calibration):
     assert best.form.memory_scale == pytest.approx(5.0, rel=0.6)
 
 
+def test_whether_something_matters_can_be_written_as_json():
+    """Where the residual and not the force sets the limit, too: a change of a calibrated effect ended in a traceback."""
+    limit = Screening.floor(SimpleNamespace(_size={"torque": 1e3}), SimpleNamespace(noise=lambda channel: 1e6), "torque")
+    assert limit == pytest.approx(60.0) and json.dumps(70.0 >= limit) == "true"
+
+
 @pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (9.0, None)])
 def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
     """By half as much again, and by what matters: an error that was small may have grown to one that still is."""

@@ -118,7 +118,7 @@ class Screening:
         if channel == "temperature":
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
-        return max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel])
+        return float(max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel]))
 
     def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
         """RMS that a channel's residual need not exceed: what the calibration achieved on its own data, by what it states
