@@ -552,7 +552,7 @@ def test_two_signals_that_multiply_are_seen_as_both(calibration):
 def test_whether_something_matters_can_be_written_as_json():
     """Where the residual and not the force sets the limit, too: a change of a calibrated effect ended in a traceback."""
     limit = Screening.floor(SimpleNamespace(_size={"torque": 1e3}), SimpleNamespace(noise=lambda channel: 1e6), "torque")
-    assert limit == pytest.approx(60.0) and json.dumps(70.0 >= limit) == "true"
+    assert limit == pytest.approx(60.0) and json.dumps(limit <= 70.0) == "true"
 
 
 @pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (9.0, None)])
