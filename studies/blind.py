@@ -132,19 +132,17 @@ class Trial:
 
     @property
     def false_findings(self) -> set[str]:
-        true = set(self.hidden).union(*(_SAME.get(name, ()) for name in self.hidden), self._drawn_terms)
-        return {_without_number(name) for name in self.found} - true
+        true = set(self.hidden).union(*(_SAME.get(name, ()) for name in self.hidden))
+        return {name for name in self.found if _without_number(name) not in true and not self._is_drawn(name)}
 
-    @property
-    def _drawn_terms(self) -> set[str]:
-        """Terms that say what a drawn effect is: its port over either of its signals."""
-        drawn = self.hidden if self.kind == "drawn" else {}
-        return {
-            f"term:{name.removeprefix('drawn_')}:{SIGNALS[int(values[key])]}"
-            for name, values in drawn.items()
-            for key in ("signal", "other")
-            if values[key] >= 0.0
-        }
+    def _is_drawn(self, found: str) -> bool:
+        """Whether a term says what a drawn effect is: its port over one of its signals, or both."""
+        if self.kind != "drawn" or not found.startswith("term:"):
+            return False
+        [(name, values)] = self.hidden.items()
+        _, port, *signals = _without_number(found).split(":")
+        true = {SIGNALS[int(values[key])] for key in ("signal", "other") if values[key] >= 0.0}
+        return name == f"drawn_{port}" and set(signals) <= true
 
     @property
     def named(self) -> bool:
@@ -152,7 +150,7 @@ class Trial:
         if self.kind == "changed":
             return not self.found and set(self.changed) == set(self.hidden)
         if self.kind == "drawn":
-            return bool(self.found) and {_without_number(name) for name in self.found} <= self._drawn_terms
+            return bool(self.found) and all(map(self._is_drawn, self.found))
         if self.kind == "foreign":
             return len(self.found) == 1 and set(self.found) <= _SAME[next(iter(self.hidden))]
         return set(self.found) == set(self.hidden)
@@ -160,7 +158,8 @@ class Trial:
 
 def _without_number(term: str) -> str:
     """A term's name, of several that say the same the first's."""
-    return ":".join(term.split(":")[:3])
+    name, _, number = term.rpartition(":")
+    return name if number.isdigit() else term
 
 
 def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:

@@ -543,6 +543,37 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
     assert best.form.memory_scale == pytest.approx(7.0, rel=0.4)
 
 
+def test_two_signals_that_multiply_are_seen_as_both(calibration):
+    """A gear whose friction rises for seconds with the force, more on a faster disc: neither explains it alone."""
+    of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}
+    frames = next(_logs(calibration, 35, {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}, stops=8))
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
+    best = Search(model, "torque", grammar._signals(model)).prospects()[0]
+    assert best.means == ("gear_friction", "clamp_force times disc_speed") and best.form.memory == "response"
+    assert best.form.memory_scale == pytest.approx(5.0, rel=0.6)
+
+
+def test_whether_something_matters_can_be_written_as_json():
+    """Where the residual and not the force sets the limit, too: a change of a calibrated effect ended in a traceback."""
+    limit = Screening.floor(SimpleNamespace(_size={"torque": 1e3}), SimpleNamespace(noise=lambda channel: 1e6), "torque")
+    assert limit == pytest.approx(60.0) and json.dumps(limit <= 70.0) == "true"
+
+
+@pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (9.0, None)])
+def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
+    """By half as much again, and by what matters: an error that was small may have grown to one that still is."""
+    trials = [
+        SimpleNamespace(log=SimpleNamespace(samples=range(n), path=Path(name)))
+        for n, name in ((900, "cold.log"), (100, "warm.log"))
+    ]
+    model = SimpleNamespace(bench=SimpleNamespace(trials=trials))
+    selection = SimpleNamespace(model=model, screening=SimpleNamespace(floor=lambda model, channel: 10.0))
+    of = np.repeat([0, 1], [900, 100])
+    before, after = np.array([100.0, 5.0 if ruined < 100.0 else 100.0])[of], np.array([20.0, ruined])[of]
+    worse = confirmation._where_worse(selection, "torque", before, after)
+    assert (worse and worse[0]) == (log and slice(900, 1000)) and (not log or log in worse[1])
+
+
 @pytest.fixture(scope="module")
 def coupled(calibration):
     """(search, fit log, validation log) of a brake that clamps harder as it brakes, which no catalogue holds."""

@@ -191,6 +191,23 @@ def test_gates():
         np.testing.assert_allclose(over(Term(**base, gate=gate), np.zeros(3), **signals), 0.5 * np.array(acts))
 
 
+@pytest.mark.parametrize(("other", "full", "half"), [("motor_speed", 40.0, -20.0), ("disc_temperature", 220.0, 120.0)])
+def test_a_second_signal_multiplies_by_its_size(other, full, half):
+    """Whichever way it points, a temperature from 20 degC on, and no more beyond where it was found."""
+    base = {"name": "term:x", "port": "torque", "signal": "brake_torque", "shape": "odd_power", "coefficient": 0.5}
+    term = Term(**base, low=0.0, high=1.0, other=other, other_high=full)
+    sizes = np.array([half, full, 1.5 * full, term.other_from, np.nan])
+    np.testing.assert_allclose(over(term, np.ones(5), **{other: sizes}), [0.25, 0.5, 0.5, 0.0, 0.0])
+    # What follows slowly follows the product: after the brake is hot it needs no heat to go on.
+    slow = Term(
+        **base | {"shape": "even_power"}, memory="response", memory_scale=2.0, low=0.0, high=1.0, other=other, other_high=full
+    )
+    there = np.where(np.arange(1000) < 500, full, term.other_from)
+    found = over(slow, np.ones(1000), **{other: there})
+    lag = lambda x: 1.0 - np.exp(-x / 2.0)  # noqa: E731
+    assert found[0] == 0.5 and found[999] == pytest.approx(0.5 * (1.0 - lag(500 * DT)), rel=1e-6)
+
+
 def test_a_signal_that_is_not_known_adds_nothing():
     term = Term(name="term:x", port="force", signal="pad_temperature", shape="constant", coefficient=7.0, low=0.0, high=1.0)
     assert over(term, np.array([np.nan])) == 0.0
@@ -252,6 +269,7 @@ _GOOD = {
         ({"sine": 0.1}, "only a harmonic"),
         ({"scale": 0.0}, "> 0.0"),
         ({"shape": "exec"}, "Invalid enum value"),
+        ({"other": "disc_temperature", "other_high": 20.0}, "other_high: expected more than 20"),
     ],
 )
 def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed, said):
@@ -343,9 +361,12 @@ np.save(sys.argv[3] + ".npy", np.stack([trace[name] for name in ("force", "torqu
         Term(name="term:x", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
              scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
         Term(name="term:x", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
-             coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0),
+             coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
+             other="clamp_force", other_high=8e3),
+        Term(name="term:x", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
+             high=2e4, other="motor_speed", other_high=5.0),
     ],
-    ids=lambda term: term.memory,
+    ids=lambda term: f"{term.memory} {term.other}",
 )  # fmt: skip
 def test_an_exported_effect_is_the_term(term, calibration, tmp_path):
     """By the command, in the form of a file of one's own: the estimator with it gives what it gives with the term."""

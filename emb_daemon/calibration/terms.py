@@ -19,13 +19,15 @@ _FACTOR = 0.9
 #: times as much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor
 #: constant twice as large is another machine's.
 _GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
+#: Temperature (degC) from which one that multiplies counts.
+_COLD_C = 20.0
 
 
 class Term(Struct, kw_only=True):
     """A term that `emb-daemon diagnose` made for a residual that no effect of the catalogue explains.
 
-    It adds coefficient × shape(u) × gate at one port of the physics. Here u = (z − centre)/scale, and z is the signal after
-    its memory."""
+    It adds coefficient × shape(u) × gate × share of the other signal at one port of the physics. Here u = (z − centre)/scale, and z
+    is the signal after its memory."""
 
     #: Name; begins with ``term:``.
     name: Annotated[str, Meta(pattern="^term:.+")]
@@ -63,6 +65,12 @@ class Term(Struct, kw_only=True):
     low: float
     #: High end of that range.
     high: float
+    #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The hidden
+    #: state of a response follows the product.
+    other: Literal[tuple(SIGNALS)] | None = None
+    #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. Beyond it the term
+    #: stays the same, and sigma grows.
+    other_high: float = 0.0
     #: Date and logs from which the term was found.
     provenance: str = ""
 
@@ -71,6 +79,8 @@ class Term(Struct, kw_only=True):
             raise InvalidValue("high: expected more than low")
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
+        if self.other and not self.other_high > self.other_from:
+            raise InvalidValue(f"other_high: expected more than {self.other_from:g}")
         if not self.is_bounded:
             least, most = self.reach
             beyond, kind = (most, f"{self.growth:g} at most") if most > self.growth else (least, f"{-self.limit:g} at least")
@@ -80,6 +90,11 @@ class Term(Struct, kw_only=True):
     def unit(self) -> str:
         """Of the coefficient."""
         return HOOKS[self.port].unit
+
+    @property
+    def other_from(self) -> float:
+        """Size at which the other signal is nothing, in its unit."""
+        return _COLD_C if self.other and SIGNALS[self.other] == "°C" else 0.0
 
     @property
     def limit(self) -> float:
@@ -92,11 +107,16 @@ class Term(Struct, kw_only=True):
         return _GROWS.get(self.port, self.limit)
 
     @property
+    def is_held(self) -> bool:
+        """Whether the kernel holds it within its limits: how long its signal stays says what a response reaches, and two
+        signals are hardly at their largest at once."""
+        return self.memory == "response" or (self.other is not None and self.growth == self.limit)
+
+    @property
     def is_bounded(self) -> bool:
-        """Whether it stays within its limits. How far a response goes depends on how long its signal lasts; the kernel limits
-        it."""
+        """Whether it stays within its limits."""
         least, most = self.reach
-        return self.memory == "response" or (least >= -self.limit and most <= self.growth)
+        return self.is_held or (least >= -self.limit and most <= self.growth)
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -127,9 +147,11 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["port"], row["signal"] = PORTS.index(term.port), list(SIGNALS).index(term.signal)
         row["memory"], row["shape"] = MEMORIES.index(term.memory), SHAPES.index(term.shape)
         row["gate"] = GATES.index(term.gate)
+        row["other"] = list(SIGNALS).index(term.other) if term.other else -1
+        row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
-        row["limit"] = term.limit if term.memory == "response" else np.inf
+        row["limit"] = term.limit if term.is_held else np.inf
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

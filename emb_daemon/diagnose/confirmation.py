@@ -37,7 +37,7 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
     Returns it with the errors on left-out episodes. ``judges``: the validation logs.
     """
     bench = selection.model.bench
-    before, main, held = errors(bench, bench.calibration), whole(bench), _sizes(bench.residuals({}))
+    before, main, held = errors(bench, bench.calibration), whole(bench), bench.residuals({})
     while True:
         for name in _beyond_bounds(selection):
             selection = selection.without(name, TOO_LARGE)
@@ -100,18 +100,36 @@ def _sizes(residual: Mapping[str, np.ndarray]) -> dict[str, float]:
     return {channel: rmse(residual[channel]) for channel in FORCE_CHANNELS if channel in residual}
 
 
-def _own_harm(selection: Selection, before: Mapping[str, float]) -> tuple[str, str] | None:
-    """The suspect that does least on left-out episodes of a path that is no better for its suspects, and what is left of that
-    path then; ``before`` by channel, RMS in N."""
-    after = _sizes(_left_out_residuals(selection))
-    for channel in sorted(selection.touched & set(before)):
-        if after[channel] < before[channel]:
-            continue
-        own = [suspect for suspect in selection.suspects if selection.channel_of(suspect) == channel]
-        rest = {suspect: _sizes(_left_out_residuals(selection, suspect))[channel] for suspect in own}
-        told = f"what is left of the {channel} path goes from {before[channel]:.4g} to {after[channel]:.4g} N"
-        return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
+def _own_harm(selection: Selection, before: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
+    """The suspect that does least on left-out episodes of a path that is no better for its suspects, all over or clearly so on
+    one log, and what is left of that path then; ``before`` by channel, residuals in N."""
+    after = _left_out_residuals(selection)
+    for channel in sorted(selection.touched & set(FORCE_CHANNELS)):
+        if worse := _where_worse(selection, channel, before[channel], after[channel]):
+            rows, told = worse
+            own = [suspect for suspect in selection.suspects if selection.channel_of(suspect) == channel]
+            rest = {suspect: rmse(_left_out_residuals(selection, suspect)[channel][rows]) for suspect in own}
+            return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
     return None
+
+
+def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: np.ndarray) -> tuple[slice, str] | None:
+    """Rows in which a path's residual is no better than before: all of them, or those of the log where it has risen most, if
+    that is clear and by what matters; and what became of it. What many logs gain does not outweigh what one shows to be
+    wrong: a torque constant that is low where the motor is warm may hide in an inertia that is too small."""
+    first, last = rmse(before), rmse(after)
+    if last >= first:
+        return slice(None), f"what is left of the {channel} path goes from {first:.4g} to {last:.4g} N"
+    bench, floor = selection.model.bench, selection.screening.floor(selection.model, channel)
+    ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])
+    logs = [slice(end - len(trial.log.samples), end) for trial, end in zip(bench.trials, ends, strict=True)]
+    pairs = [(rmse(before[rows]), rmse(after[rows])) for rows in logs]
+    worst = int(np.argmax([last / first if first > 0.0 else 0.0 for first, last in pairs]))
+    first, last = pairs[worst]
+    if last <= _LOG_HARM * first or last**2 - first**2 < floor**2:
+        return None
+    name = bench.trials[worst].log.path.name
+    return logs[worst], f"what is left of the {channel} path on {name} goes from {first:.4g} to {last:.4g} N"
 
 
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:

@@ -46,6 +46,12 @@ _RESPONSE = """    y = {shaped}
         s.begun, s.memory = True, y
     s.memory += (1.0 - exp(-dt / p.memory_scale)) * (y - s.memory)
 """
+#: In proportion to what it acts.
+_OTHER = """    y = signals[_OTHER]
+    if not np.isfinite(y):
+        return 0.0
+    share = min(max(({size}) / (_FULL - _NONE), 0.0), 1.0)
+"""
 #: With which the file is a command as well.
 _MAIN = """\
 if __name__ == "__main__":
@@ -85,6 +91,7 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
     used = "\n".join(kernel)
     functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in used]
     looked_at = {"_SIGNAL": term.signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
+    looked_at |= {"_OTHER": term.other} if term.other else {}
     lines = [
         f'"""{equation}."""',
         "",
@@ -102,6 +109,12 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         f"#: {words} ({SIGNALS[term.signal]}) between which it was found; outside it stays what it is at the edge.",
         f"_LOW, _HIGH = {term.low!r}, {term.high!r}",
     ]
+    if term.other:
+        own = f"{term.other.replace('_', ' ').capitalize()} ({SIGNALS[term.other]})"
+        lines += [
+            f"#: {own} at which it is nothing, and acts in full.",
+            f"_NONE, _FULL = {term.other_from!r}, {term.other_high!r}",
+        ]
     if term.gate == "load":
         lines += ["#: Clamp force at which it acts in full, N.", f"_LARGEST_N = {maximum_force_N!r}"]
     if term.memory != "none":
@@ -113,11 +126,12 @@ def _kernel(term: Term) -> list[str]:
     """The compiled function that says what the term adds."""
     harmonic = term.shape == "harmonic"
     shaped = "p.coefficient * cos(u) + p.sine * sin(u)" if harmonic else _SHAPED[term.shape]
+    shaped = f"share * ({shaped})" if term.other else shaped
     response = _RESPONSE.format(shaped=shaped) if term.memory == "response" else ""
     body = ("s.memory" if response else f"({shaped})") + (f" * {_GATES[term.gate]}" if _GATES[term.gate] else "")
     if not harmonic:
         body = f"p.coefficient * {body}"
-    if response and np.isfinite(term.limit):
+    if term.is_held and np.isfinite(term.limit):
         body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
     z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
     arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
@@ -128,6 +142,7 @@ def _kernel(term: Term) -> list[str]:
         "    x = signals[_SIGNAL]",
         f"    if p.coefficient == 0.0{' and p.sine == 0.0' if harmonic else ''} or not np.isfinite(x):",
         "        return 0.0",
+        *(_OTHER.format(size="y - _NONE" if term.other_from else "abs(y)").splitlines() if term.other else []),
         *_MEMORIES.get(term.memory, "").splitlines(),
         *([] if term.shape == "constant" else [f"    u = ({z} - p.centre) / p.scale"]),
         *response.splitlines(),

@@ -6,7 +6,8 @@ lags are stable by construction. Sizes are shares of what the signals cover in t
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
@@ -50,6 +51,10 @@ _GATES: dict[str, tuple[str, ...]] = {
     "torque": ("always", "load", "closing", "opening"),
     "gear_friction": ("always", "load", "closing", "opening"),
 }
+#: Ports at which two signals may multiply: factors and lengths. What counts from the power on multiplies nothing, and places
+#: along the screw are asked by bumps.
+_MULTIPLIED = ("thickness", "stiffness", "torque_constant", "relaxation_time", "gear_gain", "gear_friction")
+_ALONE = ("motor_angle", "travel", "energy", "time_clamped", "time_since_last_clamp")
 #: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
 _EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
 _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
@@ -61,7 +66,7 @@ _STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4, 
 
 @dataclass(frozen=True)
 class Form:
-    """Structure of a term, with its sizes as tried."""
+    """Structure of a term, with its sizes as tried. ``straight``: the exponent is one, and no number to be found."""
 
     port: str
     signal: str
@@ -74,6 +79,14 @@ class Form:
     memory_scale: float
     low: float
     high: float
+    other: str | None = None
+    other_high: float = 0.0
+    straight: bool = False
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """What it follows."""
+        return (self.signal, self.other) if self.other else (self.signal,)
 
     @property
     def fitted(self) -> tuple[str, ...]:
@@ -82,6 +95,7 @@ class Form:
             "odd_power": ("exponent",), "even_power": ("exponent",), "saturation": ("scale",), "decay": ("scale",),
             "onset": ("centre",), "harmonic": ("scale",), "bump": ("centre", "scale"),
         }.get(self.shape, ())  # fmt: skip
+        own = () if self.straight else own
         if self.memory == "none":
             return own
         if self.memory == "lag" and self.signal != "clamp_force":
@@ -90,10 +104,11 @@ class Form:
 
     @property
     def numbers(self) -> int:
-        """How many numbers it takes to state it: coefficients, sizes, one for a gate, and where a count began: no brake's
-        physics starts at zero with the power."""
+        """How many numbers it takes to state it: coefficients, sizes, one for a gate, two for a second signal, which is one of
+        many, and where a count began: no brake's physics starts at zero with the power."""
         counted = self.signal in ("energy", "time_since_last_clamp")
-        return 1 + (self.shape == "harmonic") + len(self.fitted) + (self.gate != "always") + counted
+        gated = (self.gate != "always") + 2 * (self.other is not None)
+        return 1 + (self.shape == "harmonic") + len(self.fitted) + gated + counted
 
     @property
     def step(self) -> float:
@@ -104,7 +119,7 @@ class Form:
         sizes = {key: getattr(self, key) for key in ("scale", "centre", "exponent", "memory_scale", "low", "high")}
         return Term(
             name=name, port=self.port, signal=self.signal, memory=self.memory, shape=self.shape, gate=self.gate,
-            coefficient=coefficient, sine=sine, **sizes,
+            coefficient=coefficient, sine=sine, other=self.other, other_high=self.other_high, **sizes,
         )  # fmt: skip
 
     def bounds(self, size: str) -> tuple[float, float, float]:
@@ -130,6 +145,31 @@ def enumerate_forms(covered: Mapping[str, tuple[float, float]], ports: tuple[str
             for gate in _GATES.get(port, ("always",)):
                 for memory, shape, scale, centre, exponent, memory_scale in _shapes(port, signal, low, high):
                     found.append(Form(port, signal, memory, shape, gate, scale, centre, exponent, memory_scale, low, high))
+    return found
+
+
+def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[str, ...]) -> list[Form]:
+    """Terms that follow what a shape makes of one signal times another, at once or slowly."""
+    found = []
+    for port in (port for port in ports if port in _MULTIPLIED):
+        signals = [signal for signal in _TYPED[port] if signal in covered and signal not in _ALONE]
+        for signal, other in permutations(signals, 2):
+            low, high = covered[signal]
+            centre, nothing = (_COLD_C if name in _TEMPERATURES else 0.0 for name in (signal, other))
+            most = max(map(abs, covered[other])) if not nothing else covered[other][1]
+            farthest = max(abs(low - centre), abs(high - centre))
+            if most <= nothing:
+                continue
+            power = "even_power" if low < 0.0 and not centre else "odd_power"
+            shapes = [("none", power, farthest, centre, exponent, 1.0) for exponent in _EXPONENTS]
+            shapes.append(("none", "onset", high - low, low + _PLACES[0] * (high - low), 1.0, 1.0))
+            shapes += [("response", "even_power", farthest, centre, 1.0, time) for time in _TIMES_S]
+            for memory, shape, scale, middle, exponent, time in shapes:
+                form = Form(port, signal, memory, shape, "always", scale, middle, exponent, time, low, high, other, most)
+                straight = shape != "onset" and exponent == 1.0
+                found += [form] if memory == "response" or not straight else []
+                # Of the plain product once is enough.
+                found += [replace(form, straight=True)] if straight and signal < other else []
     return found
 
 
@@ -195,6 +235,10 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):
         # Of the power one a response is the lag of above.
         yield from _responses(reach, (2.0,))
+        for time in _TIMES_S:
+            for place in _PLACES:
+                yield "response", "onset", width, low + place * width, 1.0, time
+            yield "response", "decay", _SCALES[-1] * reach, 0.0, 1.0, time
 
 
 def _responses(reach: float, exponents: tuple[float, ...] = _EXPONENTS) -> Iterator[_Shape]:
@@ -243,6 +287,12 @@ def equation(term: Term) -> str:
         "deficit": f"[what of {x} is still to come with {term.memory_scale:.3g} s, negative]",
         "slip": f"[slip of {x}, ±1 within {term.memory_scale:.3g} {own}]",
     }[term.memory]
+    times = ""
+    if term.other:
+        # Its size, a temperature's from where it is nothing.
+        least = f" − {term.other_from:g}" if term.other_from else ""
+        y = f"{term.other.replace('_', ' ')}{least}"
+        times = f" × ({y})/{term.other_high - term.other_from:.3g} {SIGNALS[term.other]}"
     place = f" − {term.centre:.4g}" if term.centre and term.shape != "harmonic" else ""
     u = f"({z}{place})/{term.scale:.3g}{'' if term.memory == 'slip' else ' ' + own}"
     shaped = {
@@ -256,8 +306,8 @@ def equation(term: Term) -> str:
         "bump": f"exp(−[{u}]²)",
     }[term.shape]
     if term.memory == "response":
-        shaped = f"lag of {term.memory_scale:.3g} s of {shaped}"
-    gate = {"always": "", "load": " × F/F_max"}.get(term.gate, f", {term.gate}")
+        shaped, times = f"lag of {term.memory_scale:.3g} s of {shaped}{times}", ""
+    gate = times + {"always": "", "load": " × F/F_max"}.get(term.gate, f", {term.gate}")
     size = f"{np.hypot(term.coefficient, term.sine):.3g}" if term.shape == "harmonic" else f"{term.coefficient:.3g}"
     if not term.coefficient and not term.sine:
         size = "c"

@@ -130,8 +130,9 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if signals is None:
         return selection
     search = Search(model, channel, signals)
-    prospects = search.prospects()
-    if not prospects or model.rms(prospects[0].evidence.gain, channel) < screening.floor(model, channel):
+    floor = screening.floor(model, channel)
+    prospects = search.prospects(floor)
+    if not prospects or model.rms(prospects[0].evidence.gain, channel) < floor:
         return selection
     shares = _shares(search.screen, prospects)
     for prospect in prospects:
@@ -177,7 +178,7 @@ def _with(
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
         undecided_N=search.undecided(best, rivals),
-        over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)],
+        over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)], signals=best.form.signals,
     )  # fmt: skip
     if against:
         return selection.noted([candidate])
@@ -243,12 +244,12 @@ def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[s
 
 
 def _words(form: Form) -> str:
-    return f"{form.port} over {form.signal}".replace("_", " ")
+    return f"{form.port} over {' times '.join(form.signals)}".replace("_", " ")
 
 
 def _manoeuvre(form: Form, other: Form) -> str:
-    """What would tell two forms apart: of one signal only the port, which shows over the force."""
-    return MANOEUVRES[form.signal if form.signal != other.signal else "clamp_force"]
+    """What would tell two forms apart: of the same signals only the port, which shows over the force."""
+    return MANOEUVRES[next((signal for signal in form.signals if signal not in other.signals), "clamp_force")]
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
@@ -265,7 +266,7 @@ def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, st
 
 
 def _name(form: Form, selection: Selection) -> str:
-    name = f"term:{form.port}:{form.signal}"
+    name = ":".join(["term", form.port, *form.signals])
     taken = {term.name for term in selection.model.bench.calibration.terms}
     return name if name not in taken else next(f"{name}:{n}" for n in range(2, MOST + 2) if f"{name}:{n}" not in taken)
 

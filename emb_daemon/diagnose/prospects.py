@@ -12,7 +12,7 @@ import numpy as np
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.diagnose.coordinates import Coordinate, Move
 from emb_daemon.diagnose.evidence import Averaging, Evidence, leave_out
-from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, harmonic, rippling
+from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import Bench, Probe
@@ -29,6 +29,9 @@ _SHORTLIST = 10
 #: Forms whose sizes are fitted before that, and tries for each size: exponents and times as enumerated are a factor of two and
 #: more apart, and between two signals that resemble each other the better guess of an exponent would decide.
 _SHARPENED, _TRIES = 24, 8
+#: Signals at their ports that are multiplied by others: what says nothing alone rarely does in a product (weak heredity,
+#: Chipman, Canadian J. Statistics 24, 1996).
+_LEADING = 10
 #: Shifts of all signals in time, and of the chosen one's.
 _CHANCES, _SHIFTS = 99, 5
 #: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
@@ -101,8 +104,8 @@ class Prospect:
 
     @property
     def means(self) -> tuple[str, str]:
-        """What it says: port and signal."""
-        return self.form.port, self.form.signal
+        """What it says: port and signals."""
+        return self.form.port, " times ".join(sorted(self.form.signals))
 
 
 class Search:
@@ -120,13 +123,31 @@ class Search:
 
     @cached_property
     def forms(self) -> list[Form]:
-        """All but ripples."""
+        """All of one signal but ripples."""
         return enumerate_forms(self.covered, self.ports)
 
     @cached_property
-    def scores(self) -> Scores:
-        """What left-out episodes say of the forms."""
-        return _screen_forms(self.screen, self.forms, self.sensitivities, self.signals)
+    def gains(self) -> np.ndarray:
+        """What left-out episodes gain by each of them."""
+        return self._screened(self.forms)
+
+    @cached_property
+    def products(self) -> list[Form]:
+        """Those of two signals, one of which leads alone."""
+        best: dict[tuple[str, str], float] = {}
+        for form, gain in zip(self.forms, self.gains, strict=True):
+            best[form.port, form.signal] = max(gain, best.get((form.port, form.signal), 0.0))
+        leading = set(sorted(best, key=best.__getitem__)[-_LEADING:])
+        every = enumerate_products(self.covered, self.ports)
+        return [form for form in every if any((form.port, signal) in leading for signal in form.signals)]
+
+    @cached_property
+    def product_gains(self) -> np.ndarray:
+        """What left-out episodes gain by each of those."""
+        return self._screened(self.products)
+
+    def _screened(self, forms: Sequence[Form]) -> np.ndarray:
+        return _screen_forms(self.screen, forms, self.sensitivities, self.signals).gain
 
     def ripples(self) -> list[Prospect]:
         """The strongest ripples over the motor angle at each port that may have one, through the estimator."""
@@ -137,15 +158,24 @@ class Search:
         found = [self.model.evidence(self.channel, own, samples=LASTING[self.channel]) for own in columns]
         return [Prospect(*one) for one in zip(forms, columns, found, strict=True)]
 
-    def prospects(self) -> list[Prospect]:
-        """The best forms, through the estimator, with their sizes fitted; shortest description first."""
+    def prospects(self, floor: float = 0.0) -> list[Prospect]:
+        """The best forms, through the estimator, with their sizes fitted; shortest description first. Of two signals only
+        where one leaves more than ``floor`` (RMS, in the channel's unit) that lasts, and if the best is one of them."""
         model, own, samples = self.model, self.model.own(self.channel), LASTING[self.channel]
-        found = [*self._run(_sharpen(self)), *self.ripples()]
         moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
         alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
         alone -= noise_left(model, self.channel, samples)
-        kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
-        return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+        def shortest(found: Sequence[Prospect]) -> list[Prospect]:
+            kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+            return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+
+        single = shortest([*self._run(_sharpen(self, self.forms, self.gains)), *self.ripples()])
+        most = max((p.evidence.gain for p in single), default=0.0)
+        if model.rms(alone - most, self.channel) <= floor:
+            return single
+        every = shortest([*single, *self._run(_sharpen(self, self.products, self.product_gains))])
+        return every if every and every[0].form.other else single
 
     def undecided(self, best: Prospect, rivals: Sequence[Prospect]) -> float:
         """Largest RMS by which a rival does otherwise than the best, beside all that the path's parameters can do."""
@@ -153,14 +183,18 @@ class Search:
         return max((self.model.rms(float(np.square(does[0] - other).sum()), self.channel) for other in does[1:]), default=0.0)
 
     def chance(self, best: Prospect) -> float:
-        """That of the best among all forms; a ripple's is that of its order among as many."""
+        """That of the best among all forms, with two signals if it has two; a ripple's is that of its order among as many."""
         if best.form.shape == "harmonic":
             return min(1.0, best.evidence.p_value * len(self.forms))
-        return self._chance
+        return self._chance_of_two if best.form.other else self._chance
 
     @cached_property
     def _chance(self) -> float:
-        return _chance(self)
+        return _chance(self, self.forms, self.gains)
+
+    @cached_property
+    def _chance_of_two(self) -> float:
+        return _chance(self, [*self.forms, *self.products], np.append(self.gains, self.product_gains))
 
     def at_another_time(self, form: Form) -> float:
         """Largest gain of a term with its signal moved in time, as if the log were a circle; none for a ripple."""
@@ -250,19 +284,19 @@ def _record_of(form: Form) -> np.void:
     return record["term"][0]
 
 
-def _chance(search: Search) -> float:
-    """Chance that the best of all forms gains as much with their signals moved in time."""
+def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray) -> float:
+    """Chance that the best of some forms gains as much with their signals moved in time."""
     screen = Screen(search.model, search.channel, COARSE)
-    shapes = list(dict.fromkeys(replace(form, port="") for form in search.forms))
+    shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
     row = {shape: index for index, shape in enumerate(shapes)}
     every = [screen.means.of(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
     values = np.column_stack(every) * screen.means.per_mean[:, None]
     by_port = []
     for port, column in search.sensitivities.items():
-        rows = [row[replace(form, port="")] for form in search.forms if form.port == port]
+        rows = [row[replace(form, port="")] for form in forms if form.port == port]
         if rows:
             by_port.append((screen.means.of((column * screen.keep)[:, None]), values[:, rows]))
-    gain = search.scores.gain.max()
+    gain = gains.max()
     for number in range(_CHANCES):
         shift = int(len(values) * search.random.uniform(0.1, 0.9))
         if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
@@ -276,7 +310,7 @@ def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
     chosen: list[Form] = []
     for index in np.argsort(-gains):
         form = forms[index]
-        relatives = [f for f in chosen if (f.port, f.signal, f.memory) == (form.port, form.signal, form.memory)]
+        relatives = [f for f in chosen if (f.port, {*f.signals}, f.memory) == (form.port, {*form.signals}, form.memory)]
         if gains[index] > 0.0 and len(relatives) < 2:
             chosen.append(form)
         if len(chosen) == most:
@@ -284,9 +318,9 @@ def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
     return chosen
 
 
-def _sharpen(search: Search) -> list[Form]:
-    """The best forms with their sizes where left-out episodes gain most."""
-    best = _best_of(search.forms, search.scores.gain, _SHARPENED)
+def _sharpen(search: Search, forms: Sequence[Form], gains: np.ndarray) -> list[Form]:
+    """The best of some forms with their sizes where left-out episodes gain most."""
+    best = _best_of(forms, gains, _SHARPENED)
     found = list(search.model.bench.map(lambda form: _fit_sizes(search, form), best))
     gains = np.array([gain for _, gain in found])
     return _best_of([form for form, _ in found], gains, _SHORTLIST)

@@ -103,11 +103,12 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
         "in_calibration": finding.in_calibration,
     }
     if finding.made:
-        entry |= {"made": True, "port": effect.hook, "signals": [effect.signal]}
+        entry |= {"made": True, "port": effect.hook, "signals": [*finding.signals]}
         terms = {term.name: term for term in diagnosis.calibration.terms}
         if effect.name in terms:
             term = terms[effect.name]
             entry |= {"shape": term.shape, "memory": term.memory, "gate": term.gate, "range": [term.low, term.high]}
+            entry |= {"full_at": term.other_high} if term.other else {}
     if finding.placebos:
         entry |= {"placebo_share": max(finding.placebos.values()), "placebos": dict(finding.placebos)}
     if finding.confounded_with:

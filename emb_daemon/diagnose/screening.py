@@ -58,7 +58,7 @@ class Candidate:
         reason: why it is not accepted, or what it rests on.
         values, sigmas: by parameter; before: as calibrated, for an effect that was.
         contribution: what it takes from the channel's residual, at every sample.
-        over: its signal at every sample, for a term.
+        over: its signal at every sample, for a term; signals: that and what multiplies.
         names: the term in whose place it stands, by which its chance was judged.
         undecided_N: RMS by which rivals that these logs cannot tell from it do otherwise.
     """
@@ -86,6 +86,7 @@ class Candidate:
     undecided_N: float = 0.0
     contribution: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     over: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    signals: tuple[str, ...] = ()
 
     @property
     def made(self) -> bool:
@@ -117,7 +118,7 @@ class Screening:
         if channel == "temperature":
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
-        return max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel])
+        return float(max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel]))
 
     def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
         """RMS that a channel's residual need not exceed: what the calibration achieved on its own data, by what it states

@@ -38,7 +38,8 @@ def number(value: float, sigma: float = 0.0) -> str:
 
 def title(finding: Candidate) -> str:
     if finding.made:
-        return f"a term of {finding.effect.signal.replace('_', ' ')} at {_PORTS.get(finding.effect.hook, finding.effect.hook)}"
+        follows = " times ".join(finding.signals).replace("_", " ")
+        return f"a term of {follows} at {_PORTS.get(finding.effect.hook, finding.effect.hook)}"
     return finding.effect.name.replace("_", " ")
 
 

@@ -1,8 +1,8 @@
 """Terms that are not in the catalogue: data in a calibration, evaluated by one bounded kernel in the estimator's step.
 
-A term is coefficient × shape(memory(signal)) × gate at one port of the physics. `emb_daemon.diagnose.grammar` makes them;
-`Calibration.terms` contains them, checked when the file is loaded. A file never contains code. Without terms the kernel is not
-called.
+A term is coefficient × shape(memory(signal)) × gate × other signal at one port of the physics. `emb_daemon.diagnose.grammar`
+makes them; `Calibration.terms` contains them, checked when the file is loaded. A file never contains code. Without terms the
+kernel is not called.
 """
 
 from math import cos, exp, hypot, sin, sqrt
@@ -63,11 +63,12 @@ CLAMPED_N = 150.0
 
 TERM = np.dtype(
     [
-        *fields("i8", "port signal memory shape gate"),
-        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit"),
+        *fields("i8", "port signal memory shape gate other"),
+        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit other_from other_high"),
     ],
     align=True,
 )
+#: ``other``: the signal that multiplies; negative for none.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
 #: ``added`` by port; ``sigma`` and ``torque_sigma``: standard deviations of the static force (N) and of the torque (N m) that
 #: terms outside of their range cause.
@@ -160,26 +161,39 @@ def _gate(q, signal, maximum_force):
 
 
 @njit
+def _of_other(q, signal):
+    """Size of the signal that multiplies, a temperature's from where it is nothing, over the largest that was found."""
+    y = signal[q.other]
+    return (y - q.other_from if q.other_from > 0.0 else abs(y)) / (q.other_high - q.other_from)
+
+
+@njit
 def _value(q, t, k, dt, maximum_force):
     """Amount that term ``k`` adds at its port, in the port's unit; outside its range the amount at the edge."""
-    x = t.signal[q.signal]
-    if not np.isfinite(x):
+    x, share = t.signal[q.signal], 1.0
+    if q.other >= 0:
+        share = _of_other(q, t.signal)
+    if not (np.isfinite(x) and np.isfinite(share)):
         return 0.0
+    share = min(max(share, 0.0), 1.0)
     x = min(max(x, q.low), q.high)
     if q.memory == _RESPONSE:
-        shaped = _remembered(q, t, k, _shaped(q, x), dt)
+        shaped = _remembered(q, t, k, share * _shaped(q, x), dt)
     else:
-        shaped = _shaped(q, _remembered(q, t, k, x, dt))
+        shaped = share * _shaped(q, _remembered(q, t, k, x, dt))
     shaped *= _gate(q, t.signal, maximum_force)
     added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
     return min(max(added, -q.limit), q.limit)
 
 
 @njit
-def _outside_sigma(q, x, added):
-    """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of the signal
-    from its range, in widths of the range."""
+def _outside_sigma(q, signal, added):
+    """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of its
+    signals from their range, in widths of the range."""
+    x = signal[q.signal]
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
+    if q.other >= 0:
+        outside += max(_of_other(q, signal) - 1.0, 0.0)
     if not outside > 0.0:
         return 0.0
     return hypot(q.sigma, outside * max(abs(added), q.sigma))
@@ -219,7 +233,7 @@ def look(e, s, p, m):
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
-        sigma = _outside_sigma(q, t.signal[q.signal], value)
+        sigma = _outside_sigma(q, t.signal, value)
         if sigma > 0.0 and q.port <= _STATIC_FORCE:
             of_force += (sigma * _of_force(q.port, s)) ** 2
         elif sigma > 0.0:
@@ -230,8 +244,8 @@ def look(e, s, p, m):
 @njit
 def _follow_all(e, t, signals, dt, maximum_force, values):
     for row in range(len(signals)):
-        # The term's own signal, and those of the gates.
-        for which in (e.signal, _FORCE, _SPEED, _WHEEL):
+        # The term's own signals, and those of the gates.
+        for which in (e.signal, max(e.other, 0), _FORCE, _SPEED, _WHEEL):
             t.signal[which] = signals[row, which]
         values[row] = _value(e, t, 0, dt[row], maximum_force)
 
