@@ -26,8 +26,8 @@ _COLD_C = 20.0
 class Term(Struct, kw_only=True):
     """A term that `emb-daemon diagnose` made for a residual that no effect of the catalogue explains.
 
-    It adds coefficient × shape(u) × gate × share of the other signal at one port of the physics. Here u = (z − centre)/scale, and z
-    is the signal after its memory."""
+    It adds coefficient × shape(u) × gate × share of the other signal at one port of the physics. Here u = (z − centre)/scale,
+    and z is the signal after its memory."""
 
     #: Name; begins with ``term:``.
     name: Annotated[str, Meta(pattern="^term:.+")]
@@ -65,11 +65,11 @@ class Term(Struct, kw_only=True):
     low: float
     #: High end of that range.
     high: float
-    #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The hidden
-    #: state of a response follows the product.
+    #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The
+    #: hidden state of a response follows the product.
     other: Literal[tuple(SIGNALS)] | None = None
-    #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. Beyond it the term
-    #: stays the same, and sigma grows.
+    #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. Beyond it the
+    #: term stays the same, and sigma grows.
     other_high: float = 0.0
     #: Date and logs from which the term was found.
     provenance: str = ""
