@@ -733,7 +733,7 @@ def test_the_delays_of_a_busy_machine_are_no_other_rate(rig):
     assert at_our_rate(frames) is frames
 
 
-def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys):
+def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys, recwarn):
     """A heated rod, one value every two seconds: temperatures arrive, and nothing is said of a motor."""
     (tmp_path / "m.yaml").write_text(
         "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
@@ -752,6 +752,11 @@ def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys):
     assert samples["outer_backplate"][half] == pytest.approx(21.5, abs=0.1)
     times, pads = log.reference.pads["inner"]
     assert pads[0][len(times) // 2] == pytest.approx(27.5, abs=0.2)
+    foreignkit.write_rig(tmp_path)
+    arguments = ["diagnose", "rod.csv", "--mapping", "m.yaml", "--calibration", "calibration.yaml", "--output", "found"]
+    assert main([word if "." not in word and word != "found" else str(tmp_path / word) for word in arguments]) == 2
+    assert "neither a clamp force reference nor motor current to judge by" in capsys.readouterr().err.splitlines()[-1]
+    assert not [str(found.message) for found in recwarn if issubclass(found.category, RuntimeWarning)]
     text = (tmp_path / "m.yaml").read_text() + "  RIG_FL_Force.ClampForceRef: {signal: near, unit: N}\n"
     (tmp_path / "m.yaml").write_text(text)
     fine = load_log(tmp_path / "rod.csv", read=Mapping(tmp_path / "m.yaml").read)
