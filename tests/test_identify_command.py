@@ -150,6 +150,13 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(rig, tmp_pat
         assert expected in capsys.readouterr().err
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(rig, tmp_path, capsys, monkeypatch):
+    campaign = _campaign(tmp_path, rig, "curves: [{log: RIG/static/curve_6p5mm.log.gz}]\n")
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    assert main(["identify", str(campaign), "--output", str(tmp_path / "c.yaml")]) == 2
+    assert capsys.readouterr().err == f"{tmp_path / 'c.yaml'}: the folder cannot be written: {tmp_path}\n"
+
+
 def test_a_disc_that_turns_otherwise_than_the_campaign_says_is_left_out(rig, tmp_path):
     campaign = load_campaign(_campaign(tmp_path, rig, ""))
     log = f"{rig}/thermal/disc_cooling_1tps.log.gz"

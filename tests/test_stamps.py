@@ -314,7 +314,7 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
     """A motor to and fro against a torque sensor, load and stroke of their own; and one that turns free, at either end of its
     travel with a current of its own (cogging), which is nothing that clamps."""
     rng, time_s = np.random.default_rng(4), 0.004 * np.arange(5000)
-    angle = 30.0 * np.sin(2.0 * np.pi * 0.37 * time_s)
+    angle = 60.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * 0.37 * time_s))
     speed = np.gradient(angle, time_s)
     force = load * np.sin(2.0 * np.pi * 0.11 * time_s)
     current = 0.02 * force + 0.8 * np.sign(speed) + 2e-4 * np.gradient(speed, time_s) + rng.normal(0.0, 0.1, len(time_s))

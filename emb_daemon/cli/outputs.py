@@ -1,5 +1,6 @@
 """Checks of an output before the work."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,6 +17,8 @@ def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, 
 
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: no such folder: {path.absolute().parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise InputError(f"{path}: the folder cannot be written: {path.absolute().parent}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is not a regular file, and writing would replace it")
     if path.resolve() in [given.resolve() for given in inputs if given]:

@@ -33,6 +33,8 @@ CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 _MOST_BEYOND = 0.01
 #: Silence of every motor over which slow messages go on: what cools in between is warm for an hour, ns.
 _SILENT_NS = 3_600_000_000_000
+#: Between two samples of a motor that stands and of which nothing was measured, ns.
+_STANDING_NS = 1_000_000_000
 #: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
 #: Periods from which a step of time is a pause.
@@ -237,11 +239,13 @@ def fill_missing(name: str, signals: Signals) -> Signals:
 
 
 def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Series]:
-    """Resolver signals of a motor that stands for as long as anything of ``messages`` was measured."""
-    measured = [source.time_ns for signals in messages.values() for source in signals.values() if isinstance(source, Series)]
-    measured = np.sort(np.concatenate(measured))
+    """Resolver signals of a motor that stands for as long as anything of ``messages`` was measured: at our rate where a
+    current or a force is, which may be fast, else once a second, which is enough for what cools."""
+    series = [(name, s) for name, signals in messages.items() for s in signals.values() if isinstance(s, Series)]
+    measured = np.sort(np.concatenate([source.time_ns for _, source in series]))
+    step_ns = CYCLE_NS if any(name.endswith(("_Current", "_Force")) for name, _ in series) else _STANDING_NS
     stretches = _stretches(measured, _SILENT_NS) if len(measured) else []
-    times = np.concatenate([np.arange(first, last + 1, CYCLE_NS) for first, last in stretches] or [measured])
+    times = np.concatenate([np.arange(first, last + 1, step_ns) for first, last in stretches] or [measured])
     return {
         name: Series(times, np.full(len(times), value)) for name, value in (("MotorAngle", angle_rad), ("MotorSpeed", 0.0))
     }
