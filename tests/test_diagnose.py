@@ -546,7 +546,7 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
 def test_two_signals_that_multiply_are_seen_as_both(calibration):
     """A gear whose friction rises for seconds with the force, more on a faster disc: neither explains it alone."""
     of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}
-    frames = next(_logs(calibration, 35, {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}, stops=8))
+    frames = next(_logs(calibration, 35, {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}, stops=12))
     model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
     best = Search(model, "torque", grammar._signals(model)).prospects()[0]
     assert best.means == ("gear_friction", "clamp_force times disc_speed") and best.form.memory == "response"
