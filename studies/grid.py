@@ -40,6 +40,9 @@ _PARK_S = 34.0
 _STRETCH = 20
 #: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
 _POWER_ON_S = 0.5
+#: Radius of our own car's wheels, m, and of a stranger's: they turn no faster than its campaign's, up to 60 rad/s, beyond
+#: which a drawn effect that grows with speed or friction power has never been seen.
+_WHEEL_M, _STRANGERS_WHEEL_M = 0.31, 0.42
 #: Phases shorter than this, s, are not judged.
 _SHORTEST_S = 1.0
 #: Time that learning has before the drive's second half, s, for its promises to be asked for.
@@ -171,13 +174,15 @@ class _Daemon:
 
 
 class Brake(NamedTuple):
-    """What is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive) and size."""
+    """What is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive), size, and
+    radius of the wheels, m."""
 
     calibration: Calibration
     own: Calibration
     effects: dict[str, dict[str, float]]
     unit: int | None
     size: Size
+    wheel_m: float
 
 
 @cache
@@ -189,12 +194,13 @@ def brake_of(stranger: Path | None) -> Brake:
     """
     own = load_calibration(resource("config/calibration.yaml"))
     if stranger is None:
-        return Brake(own, own, {}, None, Size())
+        return Brake(own, own, {}, None, Size(), _WHEEL_M)
     identified = load_calibration(stranger / "c.yaml")
     if not stranger.name.isdecimal():
         raise InputError(f"{stranger}: expected a folder named after the stranger's seed")
     drawn = draw_stranger(int(stranger.name))
-    return Brake(identified, drawn.calibration, drawn.effects, int(stranger.name), size_of(drawn.calibration, own))
+    size = size_of(drawn.calibration, own)
+    return Brake(identified, drawn.calibration, drawn.effects, int(stranger.name), size, _STRANGERS_WHEEL_M)
 
 
 def _with_effects(calibration: Calibration, effects: dict) -> Calibration:
@@ -208,7 +214,7 @@ def drive(
     """Drive number ``number`` of `brake_of` ``stranger`` with faults of these families: (fault, moments, ESTIMATE rows, true
     force at each, N)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
-    calibration, own, effects, unit, size = brake_of(stranger)
+    calibration, own, effects, unit, size, wheel_m = brake_of(stranger)
     # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(own)
@@ -226,7 +232,8 @@ def drive(
     schedule.drives["ambient"] = fault.ambient_C
     car = Car(np.atleast_1d(plant), seed=int(rng.integers(1 << 32)), ambient=fault.ambient_C)
     for name in ("mass", "drag", "rolling"):
-        car.motion[name] *= size.force
+        car.motion[name] *= size.force * _WHEEL_M / wheel_m
+    car.motion["wheel_radius"] = wheel_m
     if fault.warm_C:
         disc, plate, remembered = fault.warm_C
         car.states["softening_memory"] = remembered * (0.5 * (disc + plate) - plant["curve_temperature"])
