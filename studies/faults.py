@@ -1,14 +1,16 @@
 """Faults and changes that a drive of the simulated car can have, by family, with sizes and onsets drawn at random.
 
-A family is a function of a random generator and of the drive's moments (s, by name); it returns a `Fault`, which acts on the
-brake before the drive, on the running car every 80 ms, or on the frames on their way to the daemon.
+A family is a function of a random generator, of the drive's moments (s, by name) and of the brake's `Size`; it returns a
+`Fault`, which acts on the brake before the drive, on the running car every 80 ms, or on the frames on their way to the daemon.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.jit import njit
 from emb_daemon.plant.records import EFFECTS
 from emb_daemon.wire import layout as wire
@@ -50,6 +52,24 @@ class Fault:
     power_on_s: float = 0.0
     restarts: tuple[tuple[float, float], ...] = ()
     latched_N: float = 0.0
+
+
+class Size(NamedTuple):
+    """A brake over another one, where sizes of faults are in newtons, amperes or N m s/rad."""
+
+    force: float = 1.0
+    current: float = 1.0
+    damping: float = 1.0
+
+
+def size_of(brake: Calibration, other: Calibration) -> Size:
+    """Largest forces, currents that hold them, and their torques over the motors' largest speeds."""
+
+    def of(c):
+        force, torque = c.stiffness.maximum_force_N, c.motor.gear_gain_m_per_rad * c.stiffness.maximum_force_N
+        return np.array([force, torque / c.motor.torque_constant_Nm_per_A, torque / c.motor.maximum_speed_rad_per_s])
+
+    return Size(*(of(brake) / of(other)).tolist())
 
 
 FAMILIES: dict[str, Callable] = {}
@@ -217,24 +237,20 @@ def _effect(name: str, **values) -> Callable:
     return action
 
 
-#: Clamp travel per motor angle, m/rad, by the datasheet of the simulated rig: what micrometres are in radians.
-_GEAR_GAIN = 3.98e-5
-
-
-def _rad(um: float) -> float:
-    return 1e-6 * um / _GEAR_GAIN
+def _move_contact(plants, um: float) -> None:
+    plants["contact_angle"] += 1e-6 * um / plants["gear_gain"]
 
 
 # Nothing wrong, and units within the datasheet's tolerances.
 
 
 @_family
-def nominal(rng, moments):
+def nominal(rng, moments, size):
     return Fault("a well calibrated unit")
 
 
 @_family
-def tolerance(rng, moments):
+def tolerance(rng, moments, size):
     """A unit that nobody calibrated: torque constant within 3 %, what else the datasheet states within 15 %."""
     drawn = {"torque_constant": 0.03} | dict.fromkeys(
         ("inertia", "load_friction", "offset_friction", "presliding_angle", "curve", "conductivity", "specific_heat"), 0.15
@@ -251,65 +267,65 @@ def tolerance(rng, moments):
 
 
 @_family
-def contact_jump(rng, moments):
+def contact_jump(rng, moments, size):
     um, at = _draw_signed(rng, 10.0, 150.0), _pick_driving(rng, moments)
-    return Fault(f"{um:+.0f} um", at, car=_once(at, _move("contact_angle", _rad(um))))
+    return Fault(f"{um:+.0f} um", at, car=_once(at, lambda plants: _move_contact(plants, um)))
 
 
 @_family
-def contact_slow(rng, moments):
+def contact_slow(rng, moments, size):
     um, at, seconds = _draw_signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
     state = [0.0]
 
     def car(car, time_s):
         share = min(max((time_s - at) / seconds, 0.0), 1.0)
-        car.plants["contact_angle"] += _rad(um) * (share - state[0])
+        _move_contact(car.plants, um * (share - state[0]))
         state[0] = share
 
     return Fault(f"{um:+.0f} um over 25 s", at, car=car)
 
 
 @_family
-def knock_back(rng, moments):
+def knock_back(rng, moments, size):
     """Between stops the contact moves, as cornering and run-out push pads back."""
     um, times = _draw_size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
     state = [0, 0.0]
 
     def car(car, time_s):
         if state[0] < len(times) and time_s >= times[state[0]]:
-            shift = _rad(um * rng.standard_normal())
-            car.plants["contact_angle"] += shift - state[1]
+            shift = um * rng.standard_normal()
+            _move_contact(car.plants, shift - state[1])
             state[:] = state[0] + 1, shift
 
     return Fault(f"{um:.0f} um standard deviation", times[0], car=car)
 
 
 @_family
-def disc_growth(rng, moments):
+def disc_growth(rng, moments, size):
     growth = _draw_size(rng, 0.1, 0.5)
     return Fault(f"{growth:.2f} um/K", brake=_effect("disc_thermal_expansion", growth_um_per_K=growth))
 
 
 @_family
-def pads_thickness(rng, moments):
+def pads_thickness(rng, moments, size):
     thickness = float(rng.uniform(3.0, 11.5))
     return Fault(f"{thickness:.1f} mm", pads_mm=thickness)
 
 
 @_family
-def pads_compound(rng, moments):
+def pads_compound(rng, moments, size):
     factor = float(rng.uniform(0.7, 1.3))
     return Fault(f"curve x {factor:.2f}", brake=_scale(factor, "curve"))
 
 
 @_family
-def wear(rng, moments):
+def wear(rng, moments, size):
     wear = _draw_size(rng, 10.0, 200.0)
     return Fault(f"{wear:.0f} um/MJ", brake=_effect("pad_wear", wear_um_per_MJ=wear))
 
 
 @_family
-def thickness_variation(rng, moments):
+def thickness_variation(rng, moments, size):
     um = _draw_size(rng, 5.0, 20.0)
     return Fault(f"{um:.0f} um", brake=_effect("disc_thickness_variation", order_1_cosine_um=um, order_2_sine_um=0.3 * um))
 
@@ -318,15 +334,15 @@ def thickness_variation(rng, moments):
 
 
 @_family
-def torque_constant(rng, moments):
+def torque_constant(rng, moments, size):
     factor, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
     return Fault(f"x {factor:.3f}", at, car=_once(at, _scale(factor, "torque_constant")))
 
 
 @_family
-def torque_constant_fade(rng, moments):
+def torque_constant_fade(rng, moments, size):
     """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
-    heating = _draw_size(rng, 0.5, 3.0)
+    heating = _draw_size(rng, 0.5, 3.0) / size.current**2
 
     def brake(plant):
         plant["magnet_heating"], plant["copper_per_K"] = heating, 0.0039
@@ -337,40 +353,40 @@ def torque_constant_fade(rng, moments):
 
 
 @_family
-def current_gain(rng, moments):
+def current_gain(rng, moments, size):
     gain, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
     change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
     return Fault(f"x {gain:.3f}", at, bus=_during(change, at))
 
 
 @_family
-def current_offset(rng, moments):
-    offset = _draw_signed(rng, 0.2, 3.0)
+def current_offset(rng, moments, size):
+    offset = size.current * _draw_signed(rng, 0.2, 3.0)
     return Fault(f"{offset:+.2f} A", bus=_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
 
 
 @_family
-def current_offset_later(rng, moments):
-    offset = _draw_signed(rng, 0.2, 3.0)
+def current_offset_later(rng, moments, size):
+    offset = size.current * _draw_signed(rng, 0.2, 3.0)
     at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
     return Fault(f"{offset:+.2f} A", at, bus=_during(change, at))
 
 
 @_family
-def current_offset_drift(rng, moments):
-    rate, at = _draw_signed(rng, 0.005, 0.1), moments["go_1"]
+def current_offset_drift(rng, moments, size):
+    rate, at = size.current * _draw_signed(rng, 0.005, 0.1), moments["go_1"]
     change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
     return Fault(f"{rate:+.3f} A/s", at, bus=_during(change, at))
 
 
 @_family
-def current_late(rng, moments):
+def current_late(rng, moments, size):
     return Fault("a third of a cycle", brake=_effect("current_delay", delay_s=0.004 / 3.0))
 
 
 @_family
-def angle_late(rng, moments):
+def angle_late(rng, moments, size):
     delay = float(rng.uniform(0.001, 0.009))
     return Fault(f"{1e3 * delay:.1f} ms", brake=_effect("signal_delay", delay_s=delay))
 
@@ -379,33 +395,34 @@ def angle_late(rng, moments):
 
 
 @_family
-def friction_scale(rng, moments):
+def friction_scale(rng, moments, size):
     factor, at = _draw_size(rng, 0.5, 2.0), _pick_sometime(rng, moments)
     return Fault(f"x {factor:.2f}", at, car=_once(at, _scale(factor, "load_friction", "offset_friction")))
 
 
 @_family
-def cold_grease(rng, moments):
-    ambient, grease, viscous = float(rng.uniform(-30.0, -10.0)), _draw_size(rng, 0.005, 0.03), _draw_size(rng, 1e-5, 1e-4)
+def cold_grease(rng, moments, size):
+    ambient, grease = float(rng.uniform(-30.0, -10.0)), _draw_size(rng, 0.005, 0.03)
+    viscous = size.damping * _draw_size(rng, 1e-5, 1e-4)
     action = _effect("cold_grease", per_K=grease, viscous_Nms_per_rad=viscous)
     return Fault(f"{ambient:.0f} degC, {100 * grease:.1f} %/K, {1e6 * viscous:.0f} uNms/rad", brake=action, ambient_C=ambient)
 
 
 @_family
-def stribeck(rng, moments):
+def stribeck(rng, moments, size):
     rise, speed = float(rng.uniform(0.3, 1.0)), _draw_size(rng, 2.0, 15.0)
     action = _effect("stribeck_friction", rise=rise, speed_rad_per_s=speed)
     return Fault(f"+{100 * rise:.0f} % below {speed:.0f} rad/s", brake=action)
 
 
 @_family
-def viscous(rng, moments):
-    value = _draw_size(rng, 1e-4, 1e-3)
+def viscous(rng, moments, size):
+    value = size.damping * _draw_size(rng, 1e-4, 1e-3)
     return Fault(f"{1e6 * value:.0f} uNms/rad", brake=_effect("viscous_friction", viscous_Nms_per_rad=value))
 
 
 @_family
-def gear_wear(rng, moments):
+def gear_wear(rng, moments, size):
     """A gear that has run in or worn: friction, its presliding and play of another size."""
     friction, play = float(rng.uniform(0.7, 1.4)), _draw_size(rng, 0.01, 0.15)
 
@@ -417,7 +434,7 @@ def gear_wear(rng, moments):
 
 
 @_family
-def friction_asymmetry(rng, moments):
+def friction_asymmetry(rng, moments, size):
     share = _draw_signed(rng, 0.05, 0.4)
     return Fault(f"{100 * share:+.0f} %", brake=_effect("friction_asymmetry", asymmetry=share))
 
@@ -434,12 +451,12 @@ def _freeze(rng, moments, speed: Callable) -> Fault:
 
 
 @_family
-def resolver_frozen_speed_zero(rng, moments):
+def resolver_frozen_speed_zero(rng, moments, size):
     return _freeze(rng, moments, _alter(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
 
 
 @_family
-def resolver_frozen_speed_noise(rng, moments):
+def resolver_frozen_speed_noise(rng, moments, size):
     """The resolver's rotor has come off its shaft; its angle may flicker."""
     flicker = 1e-3 if rng.random() < 0.5 else 0.0
 
@@ -454,7 +471,7 @@ def resolver_frozen_speed_noise(rng, moments):
 
 
 @_family
-def resolver_frozen_last(rng, moments):
+def resolver_frozen_last(rng, moments, size):
     return _freeze(rng, moments, _hold(wire.RESOLVER, wire.MOTOR_SPEED))
 
 
@@ -463,19 +480,19 @@ def _angle_fault(size: str, at: float, change: Callable) -> Fault:
 
 
 @_family
-def resolver_jump(rng, moments):
+def resolver_jump(rng, moments, size):
     jump, at = _draw_signed(rng, 0.2, 20.0), _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     return _angle_fault(f"{jump:+.2f} rad", at, lambda values, _: values + jump)
 
 
 @_family
-def resolver_drift(rng, moments):
+def resolver_drift(rng, moments, size):
     rate, at = _draw_signed(rng, 0.01, 0.5), moments["go_1"]
     return _angle_fault(f"{rate:+.3f} rad/s", at, lambda values, time_s: values + rate * (time_s - at))
 
 
 @_family
-def resolver_gain(rng, moments):
+def resolver_gain(rng, moments, size):
     gain, first = 1.0 + _draw_signed(rng, 0.005, 0.1), []
 
     def change(values, _):
@@ -487,7 +504,7 @@ def resolver_gain(rng, moments):
 
 
 @_family
-def resolver_loses_counts(rng, moments):
+def resolver_loses_counts(rng, moments, size):
     """A share of the travel in one direction is not counted."""
     share, at = _draw_size(rng, 0.001, 0.05), moments["go_1"]
     state = [np.nan, 0.0]
@@ -504,7 +521,7 @@ def resolver_loses_counts(rng, moments):
 
 
 @_family
-def resolver_slips(rng, moments):
+def resolver_slips(rng, moments, size):
     """The rotor slips a little whenever the motor starts fast."""
     slip, at, state = _draw_size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
 
@@ -525,25 +542,25 @@ def resolver_slips(rng, moments):
 
 
 @_family
-def current_frozen(rng, moments):
+def current_frozen(rng, moments, size):
     at = _pick_clamped(rng, moments)
     return Fault("", at, bus=_during(_hold(wire.CURRENT, wire.CURRENT_Q), at))
 
 
 @_family
-def current_zero(rng, moments):
+def current_zero(rng, moments, size):
     at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
     return Fault("", at, bus=_during(_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
 
 
 @_family
-def current_lost(rng, moments):
+def current_lost(rng, moments, size):
     at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
     return Fault("", at, bus=_during(_lose(wire.CURRENT), at))
 
 
 @_family
-def current_degraded(rng, moments):
+def current_degraded(rng, moments, size):
     """The current sensor reads wrong and its sender's status says Degraded."""
     gain, at = float(rng.uniform(0.3, 0.8)), _pick_driving(rng, moments)
     change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
@@ -554,13 +571,13 @@ def current_degraded(rng, moments):
 
 
 @_family
-def wheel_speed_lost(rng, moments):
+def wheel_speed_lost(rng, moments, size):
     at = moments["drag_1"] + 1.0
     return Fault("", at, bus=_during(_lose(wire.WHEEL_SPEED), at))
 
 
 @_family
-def wheel_speed_zero(rng, moments):
+def wheel_speed_zero(rng, moments, size):
     at = moments["drag_1"] + 1.0
     return Fault("", at, bus=_during(_alter(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
 
@@ -572,46 +589,46 @@ _KNOWN_VARIATION = {"disc_thickness_variation": _VARIATION}
 
 
 @_family
-def wheel_pulses_pause(rng, moments):
+def wheel_pulses_pause(rng, moments, size):
     at, seconds = moments["go_2"] + 1.0, float(rng.uniform(0.5, 8.0))
     return Fault(f"{seconds:.1f} s", at, bus=_during(_lose(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
 
 
 @_family
-def wheel_phase_restart(rng, moments):
+def wheel_phase_restart(rng, moments, size):
     """The daemon restarts on a disc whose thickness variation it knows."""
     at = _pick_driving(rng, moments)
     return Fault("", at, restarts=((at, 0.5),), effects=_KNOWN_VARIATION)
 
 
 @_family
-def thermocouple_drifts(rng, moments):
+def thermocouple_drifts(rng, moments, size):
     rate, at, side = _draw_signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
     change = _alter(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
     return Fault(f"{rate:+.1f} K/s", at, bus=_during(change, at))
 
 
 @_family
-def thermocouple_stuck(rng, moments):
+def thermocouple_stuck(rng, moments, size):
     at = moments["go_1"]
     return Fault("both", at, bus=_during(_chain(_hold(wire.THERMOCOUPLE, 0), _hold(wire.THERMOCOUPLE, 1)), at))
 
 
 @_family
-def thermocouple_stuck_noise(rng, moments):
+def thermocouple_stuck_noise(rng, moments, size):
     at = moments["go_1"]
     change = _chain(_toggle(rng, wire.THERMOCOUPLE, 0, 0.1), _toggle(rng, wire.THERMOCOUPLE, 1, 0.1))
     return Fault("both, one least count", at, bus=_during(change, at))
 
 
 @_family
-def thermocouple_lost(rng, moments):
+def thermocouple_lost(rng, moments, size):
     at = moments["go_1"]
     return Fault("", at, bus=_during(_lose(wire.THERMOCOUPLE), at))
 
 
 @_family
-def power_on_hot(rng, moments):
+def power_on_hot(rng, moments, size):
     """Power comes on a brake that has just stopped from a long descent: hot disc, pads between it and their plates."""
     disc, plate = float(rng.uniform(200.0, 500.0)), float(rng.uniform(60.0, 140.0))
     # Minutes of descent against the half hour and more of the softening's memory.
@@ -619,7 +636,7 @@ def power_on_hot(rng, moments):
 
 
 @_family
-def ambient_cold(rng, moments):
+def ambient_cold(rng, moments, size):
     return Fault("-30 degC", ambient_C=-30.0)
 
 
@@ -627,19 +644,19 @@ def ambient_cold(rng, moments):
 
 
 @_family
-def start_clamped(rng, moments):
+def start_clamped(rng, moments, size):
     at = _pick_clamped(rng, moments)
     return Fault(f"at {at:.0f} s", at, power_on_s=at)
 
 
 @_family
-def start_latched(rng, moments):
-    force = float(rng.uniform(3000.0, 25000.0))
+def start_latched(rng, moments, size):
+    force = size.force * float(rng.uniform(3000.0, 25000.0))
     return Fault(f"{force:.0f} N", 0.0, power_on_s=6.0, latched_N=force)
 
 
 @_family
-def power_cycle(rng, moments):
+def power_cycle(rng, moments, size):
     """Everything loses power for a second, and the resolver counts from another zero."""
     at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     shift = float(rng.uniform(-100.0, 100.0))
@@ -648,13 +665,13 @@ def power_cycle(rng, moments):
 
 
 @_family
-def daemon_restart(rng, moments):
+def daemon_restart(rng, moments, size):
     at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
     return Fault("", at, restarts=((at, 0.5),))
 
 
 @_family
-def bursts_lost(rng, moments):
+def bursts_lost(rng, moments, size):
     """Bursts of up to 100 ms, of one message or all, about two a second."""
     slots = [(wire.RESOLVER,), (wire.CURRENT,), tuple(_IDS)][rng.integers(3)]
     share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], _lose(*slots)

@@ -1,4 +1,9 @@
-"""Drives of the simulated car, each with a fault or two of `studies.faults`, judged phase by phase."""
+"""Drives of the simulated car, each with a fault or two of `studies.faults`, judged phase by phase.
+
+The brake is our own, of which the daemon has the calibration that the plant is made from, or a stranger of
+`studies.strangers`, of which it has what `identify` made of the campaign. Forces, the mass of the car and sizes of faults are
+those of a brake of 30 kN; other brakes have their share.
+"""
 
 import tempfile
 import zlib
@@ -7,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -14,7 +20,8 @@ import numpy as np
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.types import to_parameters
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
@@ -23,8 +30,9 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import LATCH
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
-from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault
+from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
+from studies.strangers import draw_stranger
 
 #: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
 _PARK_S = 34.0
@@ -32,6 +40,9 @@ _PARK_S = 34.0
 _STRETCH = 20
 #: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
 _POWER_ON_S = 0.5
+#: Radius of our own car's wheels, m, and of a stranger's: they turn no faster than its campaign's, up to 60 rad/s, beyond
+#: which a drawn effect that grows with speed or friction power has never been seen.
+_WHEEL_M, _STRANGERS_WHEEL_M = 0.31, 0.42
 #: Phases shorter than this, s, are not judged.
 _SHORTEST_S = 1.0
 #: Time that learning has before the drive's second half, s, for its promises to be asked for.
@@ -57,43 +68,48 @@ def _park_on_latch(force_N: float) -> sc.Schedule:
     return clamp + hold + sc.rest(1.0)
 
 
-def draw_drive(plant: np.void, rng: np.random.Generator, latched_N: float = 0.0) -> tuple[sc.Schedule, dict[str, float]]:
+def draw_drive(
+    plant: np.void, rng: np.random.Generator, latched_N: float = 0.0, share: float = 1.0
+) -> tuple[sc.Schedule, dict[str, float]]:
     """A drive of two minutes or so and when its parts begin, s: stops, holds, reversals, long drags, park brake with
-    time for a training stroke, driving again, random angle."""
+    time for a training stroke, driving again, random angle. ``share``: of the forces of a brake of 30 kN."""
 
     def between(low, high):
         return float(rng.uniform(low, high))
 
+    def force(low, high):
+        return share * between(low, high)
+
     # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
-    cold = (("park_0", sc.park(between(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
+    cold = (("park_0", sc.park(force(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
     parts = (
         ("stand", _park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
         *cold,
-        ("hold_1", sc.stop(between(6e3, 11e3), 3.0)),
+        ("hold_1", sc.stop(force(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
-        ("stop_1", sc.stop(between(4e3, 8e3), 4.0)),
+        ("stop_1", sc.stop(force(4e3, 8e3), 4.0)),
         ("go_2", sc.accelerate(between(16.0, 20.0), 5.0)),
-        ("drag_1", sc.drag(between(2e3, 4e3), 18.0, 8.0)),
-        ("stop_2", sc.stop(between(8e3, 14e3), 3.5)),
-        ("reversals", _reversals(4.0, 5e3, 8e3)),
+        ("drag_1", sc.drag(force(2e3, 4e3), 18.0, 8.0)),
+        ("stop_2", sc.stop(force(8e3, 14e3), 3.5)),
+        ("reversals", _reversals(4.0, share * 5e3, share * 8e3)),
         ("go_3", sc.accelerate(between(20.0, 25.0), 6.0)),
-        ("stop_3", sc.stop(between(14e3, 22e3), 3.5)),
+        ("stop_3", sc.stop(force(14e3, 22e3), 3.5)),
         ("stand_2", sc.rest(1.5)),
         ("go_4", sc.accelerate(10.0, 3.0)),
-        ("stop_4", sc.stop(between(2e3, 5e3), 4.0)),
+        ("stop_4", sc.stop(force(2e3, 5e3), 4.0)),
         ("go_5", sc.accelerate(between(10.0, 18.0), 4.5)),
-        ("stop_5", sc.stop(between(5e3, 12e3), 4.0)),
+        ("stop_5", sc.stop(force(5e3, 12e3), 4.0)),
         ("stand_3", sc.rest(1.0)),
-        ("park", sc.park(between(1e4, 1.5e4), _PARK_S)),
+        ("park", sc.park(force(1e4, 1.5e4), _PARK_S)),
         ("go_6", sc.accelerate(14.0, 4.0)),
-        ("stop_6", sc.stop(between(5e3, 9e3), 4.0)),
+        ("stop_6", sc.stop(force(5e3, 9e3), 4.0)),
         ("go_7", sc.accelerate(18.0, 4.5)),
-        ("drag_2", sc.drag(between(2e3, 4e3), 16.0, 6.0)),
-        ("stop_7", sc.stop(between(1e4, 2e4), 3.5)),
-        ("hold_2", sc.stop(between(6e3, 11e3), 3.0)),
+        ("drag_2", sc.drag(force(2e3, 4e3), 16.0, 6.0)),
+        ("stop_7", sc.stop(force(1e4, 2e4), 3.5)),
+        ("hold_2", sc.stop(force(6e3, 11e3), 3.0)),
         ("go_8", sc.accelerate(between(10.0, 18.0), 4.5)),
-        ("stop_8", sc.stop(between(3e3, 8e3), 4.0)),
-        ("random", sc.random_angle(plant, 4.0, rng, high_N=12e3)),
+        ("stop_8", sc.stop(force(3e3, 8e3), 4.0)),
+        ("random", sc.random_angle(plant, 4.0, rng, high_N=share * 12e3)),
         ("end", sc.rest(1.0)),
     )
     ends = np.cumsum([part.seconds for _, part in parts])
@@ -157,31 +173,67 @@ class _Daemon:
         return self._pipeline.estimates[:count], self._pipeline.broadcast(count)
 
 
+class Brake(NamedTuple):
+    """What is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive), size, and
+    radius of the wheels, m."""
+
+    calibration: Calibration
+    own: Calibration
+    effects: dict[str, dict[str, float]]
+    unit: int | None
+    size: Size
+    wheel_m: float
+
+
 @cache
-def _calibration():
-    return load_calibration(resource("config/calibration.yaml"))
+def brake_of(stranger: Path | None) -> Brake:
+    """Our own, or the stranger whose seed is the name of a folder that `studies.strangers` kept.
+
+    Raises:
+        InputError: the folder holds no calibration, or its name is no seed.
+    """
+    own = load_calibration(resource("config/calibration.yaml"))
+    if stranger is None:
+        return Brake(own, own, {}, None, Size(), _WHEEL_M)
+    identified = load_calibration(stranger / "c.yaml")
+    if not stranger.name.isdecimal():
+        raise InputError(f"{stranger}: expected a folder named after the stranger's seed")
+    drawn = draw_stranger(int(stranger.name))
+    size = size_of(drawn.calibration, own)
+    return Brake(identified, drawn.calibration, drawn.effects, int(stranger.name), size, _STRANGERS_WHEEL_M)
 
 
-def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
-    """Drive number ``number`` with faults of these families: (fault, moments, ESTIMATE rows, true force at each, N)."""
+def _with_effects(calibration: Calibration, effects: dict) -> Calibration:
+    changed = msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | effects}
+    return msgspec.convert(changed, Calibration)
+
+
+def drive(
+    names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None
+) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
+    """Drive number ``number`` of `brake_of` ``stranger`` with faults of these families: (fault, moments, ESTIMATE rows, true
+    force at each, N)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
-    calibration = _calibration()
+    calibration, own, effects, unit, size, wheel_m = brake_of(stranger)
     # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
     drive_seed = int(rng.integers(1 << 32))
-    plain = plant_from_calibration(calibration)
-    moments = draw_drive(plain, np.random.default_rng(drive_seed), 1e4 if "start_latched" in names else 0.0)[1]
-    fault = _join([FAMILIES[name](rng, moments) for name in names])
+    plain = plant_from_calibration(own)
+    latched_N = size.force * 1e4 if "start_latched" in names else 0.0
+    moments = draw_drive(plain, np.random.default_rng(drive_seed), latched_N, size.force)[1]
+    fault = _join([FAMILIES[name](rng, moments, size) for name in names])
     if fault.effects:
-        calibration = msgspec.convert(
-            msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | fault.effects}, type(calibration)
-        )
-    plant = plant_from_calibration(calibration, int(rng.integers(1 << 32)), pad_thickness_mm=fault.pads_mm)
+        calibration, own = _with_effects(calibration, fault.effects), _with_effects(own, fault.effects)
+    another = int(rng.integers(1 << 32))
+    plant = plant_from_calibration(own, another if unit is None else unit, effects, fault.pads_mm)
     for name in ("current_noise", "speed_noise", "angle_noise", "temperature_noise"):
         plant[name] *= rng.uniform(0.8, 1.2)
     fault.brake(plant)
-    schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N)
+    schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N, size.force)
     schedule.drives["ambient"] = fault.ambient_C
     car = Car(np.atleast_1d(plant), seed=int(rng.integers(1 << 32)), ambient=fault.ambient_C)
+    for name in ("mass", "drag", "rolling"):
+        car.motion[name] *= size.force * _WHEEL_M / wheel_m
+    car.motion["wheel_radius"] = wheel_m
     if fault.warm_C:
         disc, plate, remembered = fault.warm_C
         car.states["softening_memory"] = remembered * (0.5 * (disc + plate) - plant["curve_temperature"])
@@ -215,9 +267,9 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
     return fault, moments, estimates, force_N[row]
 
 
-def judge_drive(names: tuple[str, ...], number: int, seed: int) -> dict:
+def judge_drive(names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None) -> dict:
     """Verdict of one drive."""
-    fault, moments, estimates, force_N = drive(names, number, seed)
+    fault, moments, estimates, force_N = drive(names, number, seed, stranger)
     time_s = 1e-9 * estimates["time_ns"]
     onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, fault.power_on_s), *fault.restarts)))
     park, after = moments["park"], moments["after"]
@@ -263,10 +315,11 @@ def pairs_of(count: int, seed: int, names: list[str]) -> list[tuple[str, str]]:
     return pairs
 
 
-def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, processes: int):
+def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, stranger: Path | None, processes: int):
     """Verdicts of (families, number) in turn, as they come."""
     if processes == 1:
-        yield from (judge_drive(names, number, seed) for names, number in tasks)
+        yield from (judge_drive(names, number, seed, stranger) for names, number in tasks)
         return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(judge_drive, *zip(*tasks, strict=True), [seed] * len(tasks), chunksize=4)
+        rest = [seed] * len(tasks), [stranger] * len(tasks)
+        yield from pool.map(judge_drive, *zip(*tasks, strict=True), *rest, chunksize=4)

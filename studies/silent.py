@@ -4,6 +4,8 @@
         logs of a (simulated) rig with reference force: nothing, one thing, changed; training from 242 to 284 s.
     python -m studies.silent grid [--faults NAME,NAME | --pair NAME,NAME] [--count N] [--seed S] [--drives] [--json]
         drives of our own simulated car, with one fault or change each, and with pairs of them (`studies.faults`).
+    python -m studies.silent grid --stranger DIR/SEED ...
+        the same with another brake and the calibration that `python -m studies.strangers --seeds SEED --kept DIR` made of it.
 
 Before the estimator was written anew against this study (seed 1): 24 of 33 phases of the service logs failed, and 1317 of
 3520 phases on the simulated car; in 355 of 1000 drives an unflagged error was beyond 1 kN for long or often, in 125 of these
@@ -194,7 +196,9 @@ def _seconds(value: float) -> str:
 def grid(arguments: argparse.Namespace) -> int:
     """Drives of the simulated car; returns the number of phases that fail."""
     from studies.faults import FAMILIES
-    from studies.grid import pairs_of, run_grid
+    from studies.grid import brake_of, pairs_of, run_grid
+
+    brake_of(arguments.stranger)
 
     chosen = (arguments.faults or arguments.pair or ",".join(FAMILIES)).split(",")
     if unknown := sorted(set(chosen) - set(FAMILIES)):
@@ -208,7 +212,7 @@ def grid(arguments: argparse.Namespace) -> int:
     begun, reports = time.monotonic(), []
     if arguments.drives:
         print(f"  {HEADINGS}")
-    for report in run_grid(tasks, arguments.seed, arguments.processes):
+    for report in run_grid(tasks, arguments.seed, arguments.stranger, arguments.processes):
         reports.append(report)
         if arguments.drives:
             flag = report["first_flag_s"]
@@ -249,6 +253,7 @@ def main(argv: list[str] | None = None) -> int:
     drives.add_argument("--count", type=int, default=18, metavar="N", help="drives of each family (default 18)")
     drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
     drives.add_argument("--pairs", type=int, metavar="N", help="drives with two faults (default 100, none with --faults)")
+    drives.add_argument("--stranger", type=Path, metavar="DIR/SEED", help="a brake of `studies.strangers`, not our own")
     drives.add_argument("--seed", type=int, default=1, metavar="S")
     drives.add_argument("--processes", type=int, default=2, metavar="N")
     drives.add_argument("--drives", action="store_true", help="print every drive")

@@ -15,10 +15,10 @@ from emb_daemon.adapt import fit as fit_module
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.files import decode, encode
-from emb_daemon.adapt.fit import fit_training
+from emb_daemon.adapt.fit import _is_excited, fit_training
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, curve_values, why_out_of_bounds, with_learned
 from emb_daemon.adapt.memory import FORMAT, Memory, Store, state_directory, with_entry
-from emb_daemon.adapt.pairs import FORCE, pairs_of_passes
+from emb_daemon.adapt.pairs import FORCE, MODEL, pairs_of_passes
 from emb_daemon.adapt.training import apply_learned
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.types import to_parameters
@@ -549,6 +549,32 @@ def test_pairs_of_passes_need_no_friction_model(ideal):
     true = np.array([characteristic_curve(angle - ideal["clearance"], ideal["curve"])[0] for angle in pairs[:, 0]])
     assert len(pairs) > 50
     assert np.sqrt(np.mean((pairs[:, FORCE] - true) ** 2)) < 0.05 * true.max()
+
+
+def test_pairs_see_the_current_as_the_calibration_corrects_it(ideal):
+    """A sensor whose offset is calibrated: without it the pairs are a twentieth of the force off, and no training passes."""
+    base = adaptkit.shipped(effects={"current_offset": {"offset_A": 0.9}})
+    rows = trained_rows(ideal)
+    rows["current_q"] -= 0.9
+    found = fit(rows, base)
+    assert found.outcome == r.ACCEPTED, found.note
+    assert found.evidence["pairs_difference"] < 0.02
+
+
+def test_pairs_are_held_against_the_force_of_the_stiffness_path(ideal):
+    """Where the contact angle is known, whatever lies between angle and force."""
+    rows, state = trained_rows(ideal, noise=False), new_state(1)[0]
+    state["contact_angle"] = ideal["clearance"]
+    pairs = pairs_of_passes(rows, ideal, state)
+    assert np.abs(pairs[:, FORCE] - pairs[:, MODEL]).max() < 0.02 * pairs[:, MODEL].max()
+
+
+def test_pads_that_still_relax_do_not_hide_the_clearance():
+    """Of 1 % of the training's force for a second after they have opened, while the motor passes the clearance."""
+    angle = np.concatenate([np.linspace(-2.0, 10.0, 600), np.linspace(10.0, -2.0, 600)])
+    force = 1000.0 * np.maximum(angle, 0.0) + np.where(angle > 0.0, 0.0, 150.0)
+    passed = lambda contact: _is_excited(angle, contact, force, 0.0 * angle, 100.0, 8000.0, IDEAL.adaptation)  # noqa: E731
+    assert passed(0.0) and not passed(-2.0)
 
 
 @pytest.mark.parametrize(

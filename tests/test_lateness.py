@@ -54,6 +54,22 @@ def test_an_older_speed_says_nothing_of_the_angle():
     assert _age(speed_late_s=0.003) == 0.0
 
 
+def _gain(**signals):
+    a = np.zeros(1, LATENESS)[0]
+    _follow(a, *_signals(**signals))
+    return float(a["gain"])
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.006])
+@pytest.mark.parametrize("gain", [0.992, 1.01])
+def test_a_gain_of_under_a_hundredth_is_found_within_some_strokes(gain, late_s):
+    assert _gain(gain=gain, late_s=late_s) == pytest.approx(abs(gain - 1.0), abs=0.002)
+
+
+def test_a_gain_that_the_integration_of_the_speed_may_make_is_none():
+    assert _gain(gain=1.003) == _gain(gain=0.997) == _gain(late_s=0.006) == 0.0
+
+
 def test_no_angle_is_older_than_the_oldest():
     assert _age(late_s=0.016) == 0.015
 

@@ -31,11 +31,11 @@ class Watched:
         self.p, self.w, self.m = p, np.zeros(1, MONITOR), np.zeros(1, SAMPLE)
         self.m["dt"], self.m["has_current"], self.m["has_status"] = _DT, True, True
 
-    def hold(self, torque, speed=HOLDING, samples=200):
+    def hold(self, torque, speed=HOLDING, samples=200, friction=1.0):
         """Steady motor torque, N m, as the datasheet's torque constant would make of the current. Returns low and high."""
         self.m["current_q"], self.m["speed"] = torque / self.p["torque_constant"], speed
         for _ in range(samples):
-            bound(self.w[0], self.p, self.m[0])
+            bound(self.w[0], self.p, self.m[0], friction)
         return float(self.w["low"][0]), float(self.w["high"][0])
 
 
@@ -259,3 +259,13 @@ def test_what_is_no_number_is_another_facts_business(p):
     watched.w["force"] = 0.5 * (low + high)
     assert not any(_said(watched, np.nan, 200))
     assert not any(_said(watched, 0.5 * (low + high), 200)) and watched.w["force"][0] == pytest.approx(0.5 * (low + high))
+
+
+def test_friction_that_effects_add_widens_the_bounds_and_friction_that_they_take_does_not_narrow_them(p):
+    """A calibrated breakaway friction of three times the sliding one holds a force that twice the sliding one does not."""
+    torque, slope = 0.5, p["gear_gain"]
+    plain, more, less = (Watched(p).hold(torque, friction=friction) for friction in (1.0, 1.5, 0.5))
+    assert less == plain
+    assert more[0] < plain[0] and more[1] > plain[1]
+    held = 1.5 * MOST_FRICTION * (p["offset_friction"] + p["load_friction"] * more[0])
+    assert more[0] * slope + held + OFFSET_SHARE * slope * p["maximum_force"] == pytest.approx(LEAST_GAIN * torque, rel=1e-3)

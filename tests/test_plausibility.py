@@ -4,10 +4,17 @@ The brake is the simulated one, not the estimator's own model.
 """
 
 import city
+import msgspec
 import numpy as np
 import pytest
 from city import BEFORE_RELEASE, CLAMPING, HOLDING, RELEASED, drive, estimated
 
+from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.offline import estimate, log_of
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import accelerate, rest, simulate_log, stop
+from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 
 _LASTING = 500
@@ -62,6 +69,21 @@ def test_no_alarm_on_a_good_brake(seed):
     samples, _ = drive(seed)
     estimates = estimated(samples)
     assert not len(_alarm(estimates)) and not np.any(estimates["reasons"] & r.STUCK)
+
+
+@pytest.mark.parametrize(("rise", "seed"), [(0.9, 0), (1.5, 1), (1.2, 2)])
+def test_breakaway_friction_that_the_calibration_knows_holds_a_motor_that_stands(rise, seed):
+    """Twice the sliding one and more: without it the torque of a held brake is beyond what friction at rest can carry."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    known = {"stribeck_friction": {"rise": rise, "speed_rad_per_s": 6.0}} | calibration.effects
+    friction = msgspec.structs.replace(calibration.friction, load_m_per_rad=1.3 * calibration.friction.load_m_per_rad)
+    calibration = msgspec.structs.replace(calibration, friction=friction, effects=known)
+    stops = accelerate(12.0, 4.0) + stop(7000.0, 4.0) + accelerate(18.0, 5.0) + stop(16000.0, 5.0)
+    frames, _ = simulate_log(plant_from_calibration(calibration, seed), rest(1.0) + stops, seed=seed)
+    log = log_of(frames)
+    estimates = estimate(log.samples, to_parameters(calibration))
+    assert not len(_alarm(estimates)) and _honest(estimates, log.force_N, slice(25, None))
+    assert np.all(estimates["source"][25:] == r.FUSED) and np.median(estimates["sigma"][log.force_N > 2000.0]) < 200.0
 
 
 @pytest.mark.parametrize("begin", [CLAMPING, HOLDING, BEFORE_RELEASE])

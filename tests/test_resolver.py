@@ -127,6 +127,20 @@ def test_a_gain_error_of_the_resolver_is_covered_though_a_torque_constant_would_
     assert np.mean(error > 4.0 * np.hypot(estimates["sigma"][clamped], 25.0)) < 0.1
 
 
+@pytest.mark.parametrize(("gain", "seed"), [(0.99, 0), (0.99, 4), (1.012, 1)])
+def test_a_gain_error_that_the_speed_contradicts_counts_in_sigma(gain, seed):
+    """A hundredth of the way is two of the force, and no standstill shows it."""
+
+    def change(samples):
+        samples["angle"] = samples["angle"][0] + gain * (samples["angle"] - samples["angle"][0])
+
+    estimates, force = city.changed(change, seed, seconds=45.0)
+    clamped = (force > 2000.0) & (np.arange(len(force)) > 2500)
+    error = np.abs(estimates["force"] - force)[clamped]
+    assert np.median(error) > 100.0
+    assert np.mean(error > 2.0 * np.hypot(estimates["sigma"][clamped], 25.0)) < 0.01
+
+
 def test_a_resolver_that_is_frozen_while_the_brake_is_latched_leaves_no_small_sigma():
     """The latch holds 7 kN without a current: the torque alone would say 0."""
 

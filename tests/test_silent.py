@@ -12,7 +12,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RESULT_ACCEPTED, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies.faults import FAMILIES, _alter, _lose
+from studies.faults import FAMILIES, Size, _alter, _lose
 from studies.grid import draw_drive, drive
 from studies.phases import first_flag_s, judge
 
@@ -145,7 +145,7 @@ def test_a_lost_message_is_lost_alone(frames):
 def test_every_family_draws_a_fault_within_the_drive(plant, name):
     moments = draw_drive(plant, np.random.default_rng(1))[1]
     for seed in range(5):
-        fault = FAMILIES[name](np.random.default_rng(seed), moments)
+        fault = FAMILIES[name](np.random.default_rng(seed), moments, Size())
         assert 0.0 <= fault.onset_s <= moments["park"]
 
 

@@ -31,15 +31,7 @@ from emb_daemon.adapt.learned import (
     curve_values,
     why_out_of_bounds,
 )
-from emb_daemon.adapt.pairs import (
-    ANGLE,
-    FORCE,
-    WEIGHT,
-    curve_from_pairs,
-    friction_from_pairs,
-    pairs_of_passes,
-    turned_angles,
-)
+from emb_daemon.adapt.pairs import FORCE, MODEL, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes, turned_angles
 from emb_daemon.calibration.parameters import (
     INERTIA,
     LOAD_FRICTION,
@@ -137,6 +129,13 @@ class _Training:
             PRESLIDING_ANGLE: exp(min(max(x[_PRESLIDING], -12.0), 2.0)),
         }
 
+    def trial(self, x):
+        """The calibration with the fitted values ``x``, motor and inertia included."""
+        motor = self._calibration.motor
+        torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
+        inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
+        return moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
+
     def simulate(self, x):
         """Residuals that `_improve` minimises; unexplained motor torque (N m; NaN: unknown) and stiffness force (N) at each
         row.
@@ -144,10 +143,7 @@ class _Training:
         A residual is the mean torque of `_BLOCK` samples, in standard deviations of its noise *with the trial's torque
         constant*. Current and acceleration are both measured (Deming's regression): without this scaling a small torque
         constant would seem to explain more, only because it makes the current's noise small."""
-        motor = self._calibration.motor
-        torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
-        inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
-        trial = moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
+        trial = self.trial(x)
         self._states[0] = self._state
         self._states["contact_angle"] = x[_CONTACT]
         residual, force = np.zeros(len(self._rows)), np.zeros(len(self._rows))
@@ -179,7 +175,7 @@ def compile_fit(calibration, state):
     x = np.zeros(_CURVE + curve_terms(calibration))
     x[_CURVE] = 1.0
     _Training(rows, calibration, state, np.ones(len(x) - _CURVE)).simulate(x)
-    pairs_of_passes(rows, p, 0.0)
+    pairs_of_passes(rows, p)
     travel_at(0.0, p["curve"])
     characteristic_curve(0.0, p["curve"])
 
@@ -357,14 +353,14 @@ def _force_sigma(curve, scale, covariance, top):
     return sqrt(constant), sqrt(share), sqrt(variance.max())
 
 
-def _is_excited(angle, force, residual, low, high, limits):
+def _is_excited(angle, contact_angle, force, residual, low, high, limits):
     """Whether each of equal force ranges, and the clearance if it was requested, was passed in both directions with enough
-    samples."""
+    samples. Pads that have just opened still relax, so the ``angle`` too tells the clearance."""
     known = np.isfinite(residual)
     known[0] = False
     clamping = np.diff(angle, prepend=angle[0]) > 0.0
     place = np.minimum(_RANGES * (force - low) / (high - low), _RANGES - 1).astype(int)
-    place[force <= low] = _RANGES
+    place[(force <= low) | (angle <= contact_angle)] = _RANGES
     known &= force <= high
     counts = [np.bincount(place[known & side], minlength=_RANGES + 1) for side in (clamping, ~clamping)]
     asked = _RANGES if limits.low_force_N > 0.0 else _RANGES + 1
@@ -387,8 +383,8 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})
     terms = curve_terms(calibration)
-    zero = float(state["gear_zero"])
-    pairs, highest = pairs_of_passes(rows, now, zero), turned_angles(rows, now, zero).max()
+    pairs, turned = pairs_of_passes(rows, now, state), turned_angles(rows, now, float(state["gear_zero"]))
+    highest = turned.max()
     x, scale = _guess(highest, pairs, now, terms)
     if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
@@ -435,10 +431,10 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
             "torque_gain": exp(x[_GAIN]),
             "torque_gain_sigma": float(sigmas[_GAIN]),
             "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
-            "pairs_difference": _pairs_difference(pairs, x, curve, rows, now["gear_gain"]),
+            "pairs_difference": _pairs_difference(rows, to_parameters(training.trial(x)), state, x),
         },
     )
-    found.outcome, found.note = _judge(rows, fit, base, found)
+    found.outcome, found.note = _judge(turned, fit, base, found)
     return found
 
 
@@ -453,17 +449,20 @@ def _residual_evidence(fit, calibration):
     }
 
 
-def _pairs_difference(pairs, x, curve, rows, gear_gain):
-    """RMS difference between the pairs' forces and the curve, as a share of the largest force, at the pads' temperature and
-    with the fitted torque constant and offset."""
-    factor = rows["factor"].mean()
-    force = factor * np.array([characteristic_curve(angle - x[_CONTACT], curve)[0] for angle in pairs[:, ANGLE]])
-    seen = exp(x[_GAIN]) * pairs[:, FORCE] - x[_TORQUE_OFFSET] / gear_gain
+def _pairs_difference(rows, p, state, x):
+    """RMS difference between the pairs' forces and those of the stiffness path, as a share of the largest force, with the
+    fitted PARAMETERS ``p``, contact angle and torque offset."""
+    found = state.copy()
+    found["contact_angle"] = x[_CONTACT]
+    pairs = pairs_of_passes(rows, p, found)
+    seen, force = pairs[:, FORCE] - x[_TORQUE_OFFSET] / p["gear_gain"], pairs[:, MODEL]
+    if not len(pairs):
+        return np.inf
     return sqrt(np.average((seen - force) ** 2, weights=pairs[:, WEIGHT])) / max(force.max(), 1.0)
 
 
-def _judge(rows, fit, base, found):
-    """(ACCEPTED or the first reason for a rejection, a note with numbers)."""
+def _judge(angle, fit, base, found):
+    """(ACCEPTED or the first reason for a rejection, a note with numbers); ``angle``: equivalent angle (rad) of each row."""
     limits, evidence = base.adaptation, found.evidence
     covered = limits.coverage * base.training_force_N
     uncertain = evidence["contact_sigma_rad"] + evidence["force_sigma_N"] + evidence["residual_A"]
@@ -472,7 +471,7 @@ def _judge(rows, fit, base, found):
     if evidence["top_force_N"] < covered:
         return r.NOT_COVERED, f"{evidence['top_force_N']:.0f} N of {covered:.0f} N"
     low = max(0.01 * base.training_force_N, limits.low_force_N)
-    if not _is_excited(rows["angle"], fit.force, fit.residual, low, covered, limits):
+    if not _is_excited(angle, found.contact_angle, fit.force, fit.residual, low, covered, limits):
         return r.NOT_EXCITED, ""
     if evidence["residual_ratio"] > limits.residual_ratio:
         return r.RESIDUAL, f"{evidence['residual_ratio']:.2f} times the noise"

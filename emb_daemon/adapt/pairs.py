@@ -8,11 +8,12 @@ does not share the model of the fit that follows.
 import numpy as np
 
 from emb_daemon.adapt.records import TRAINING
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
+from emb_daemon.estimator.records import PARAMETERS, STATE, new_state
 from emb_daemon.jit import Array, entry
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.gear import through_gear
-from emb_daemon.models.torque import friction_state, unexplained_torque
+from emb_daemon.models.torque import unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Width of an angle bin, as a share of the travel, and the friction state that a sample must have reached to count.
@@ -25,8 +26,8 @@ _FAR = 8.0
 #: Contact is searched below the angle at which this share of the largest force is reached, at so many angles.
 _SEARCHED_SHARE, _CANDIDATES = 0.2, 60
 
-#: Columns of a pair: angle, clamp force, friction torque, weight.
-ANGLE, FORCE, FRICTION, WEIGHT = range(4)
+#: Columns of a pair: angle, clamp force, friction torque, weight, and the clamp force by the stiffness path.
+ANGLE, FORCE, FRICTION, WEIGHT, MODEL = range(5)
 
 
 @entry(Array(TRAINING), PARAMETERS, float, Array(np.float64))
@@ -36,20 +37,25 @@ def _turn(rows, p, gear_zero, turned):
         turned[i] = gear_zero + through_gear(p.gear, rows[i].angle - gear_zero)[0] if p.gear.step > 0.0 else rows[i].angle
 
 
-@entry(Array(TRAINING), PARAMETERS, float, Array(np.float64), Array(np.float64))
-def _sliding(rows, p, gear_zero, direction, torque):
+@entry(Array(TRAINING), PARAMETERS, Array(STATE), Array(np.float64), Array(np.float64), Array(np.float64))
+def _sliding(rows, p, states, direction, torque, force):
     """``direction``: +1 where friction has fully developed in clamping, -1 in releasing, else 0. ``torque``: motor torque (N
-    m) without inertia and release spring, over the gear's slope."""
-    state, variance = 0.0, 1.0
+    m) without inertia and release spring, over the gear's slope. ``force``: of the stiffness path, N. All with the
+    calibration's effects."""
+    s = states[0]
+    settle_paths(s, p, rows[0], rows[0].factor)
     direction[0] = 0.0
     for i in range(1, len(rows)):
-        row, last = rows[i], rows[i - 1]
-        state, mean, variance = friction_state(state, variance, row.angle - last.angle, p.presliding_angle, 0.0, row.dt)
+        row, angle, speed, before = rows[i], s.angle, s.speed, s.force
+        stiffness_path(s, p, row, row.factor)
+        torque_path(s, p, row)
+        s.angle, s.speed, mean = row.angle, row.speed, s.friction_mean
+        force[i] = 0.5 * (before + s.force)
         usable = row.has_current and abs(mean) >= _TURNED_OVER
         direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
-        torque[i] = unexplained_torque(p.torque_constant * row.current_q, p.inertia, row.speed - last.speed, row.dt, 0.0, mean)
-        past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + last.angle) - gear_zero)
-        torque[i] = torque[i] / slope - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
+        torque[i] = unexplained_torque(s.motor_torque, p.inertia, row.speed - speed, row.dt, 0.0, mean)
+        past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + angle) - s.gear_zero)
+        torque[i] = torque[i] / (slope * s.gear_gain) - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
 
 
 def turned_angles(rows, p, gear_zero):
@@ -59,14 +65,18 @@ def turned_angles(rows, p, gear_zero):
     return turned
 
 
-def pairs_of_passes(rows, p, gear_zero=0.0):
-    """Pairs of one training (arguments of `turned_angles`); returns (pairs, 4): equivalent angle in rad, N, N m, samples."""
-    angle = turned_angles(rows, p, gear_zero)
+def pairs_of_passes(rows, p, state=None):
+    """Pairs of one training: TRAINING rows, PARAMETERS record ``p``, STATE record at its end (None: of a brake that is not
+    known); returns (pairs, 5): equivalent angle in rad, N, N m, samples, N."""
+    states = new_state(1)
+    if state is not None:
+        states[0] = state
+    angle = turned_angles(rows, p, float(states["gear_zero"][0]))
     low = angle.min()
     width = max(angle.max() - low, 1e-9) / _BINS
     sigma, _ = torque_sigma(p["torque_constant"] * p["current_sigma"], p["inertia"] * p["speed_sigma"] / CYCLE_S)
-    direction, torque = np.zeros(len(rows)), np.zeros(len(rows))
-    _sliding(rows, p, gear_zero, direction, torque)
+    direction, torque, force = np.zeros((3, len(rows)))
+    _sliding(rows, p, states, direction, torque, force)
     middle = 0.5 * (angle + np.concatenate([angle[:1], angle[:-1]]))
     # Clamping passes in the first half of the bins, releasing ones in the second.
     bins = np.minimum((middle - low) / width, _BINS - 1).astype(int) + np.where(direction > 0.0, 0, _BINS)
@@ -78,14 +88,15 @@ def pairs_of_passes(rows, p, gear_zero=0.0):
     used &= np.abs(torque - mean(used, torque)[bins]) <= _FAR * sigma
     count = np.bincount(bins[used], minlength=2 * _BINS).reshape(2, _BINS)
     up, down = count[:, np.min(count, axis=0) >= _SAMPLES]
-    angles, torques = (
-        mean(used, values).reshape(2, _BINS)[:, np.min(count, axis=0) >= _SAMPLES] for values in (middle, torque)
+    angles, torques, forces = (
+        mean(used, values).reshape(2, _BINS)[:, np.min(count, axis=0) >= _SAMPLES] for values in (middle, torque, force)
     )
-    pairs = np.zeros((len(up), 4))
+    pairs = np.zeros((len(up), 5))
     pairs[:, ANGLE] = angles.mean(axis=0)
     pairs[:, FORCE] = torques.mean(axis=0) / p["gear_gain"]
     pairs[:, FRICTION] = 0.5 * (torques[0] - torques[1])
     pairs[:, WEIGHT] = 2.0 * up * down / (up + down)
+    pairs[:, MODEL] = forces.mean(axis=0)
     return pairs
 
 

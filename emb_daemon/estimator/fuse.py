@@ -65,6 +65,7 @@ from emb_daemon.models.fusion import (
     LOAD,
     OFFSET,
     SCALE,
+    SLOW,
     VISCOUS,
     force_variance,
     predict_errors,
@@ -128,7 +129,7 @@ def needed_torque(s, p, m, mean_force, leverage):
     accelerating, load = p.inertia * _clear_acceleration(s, m), mean_force + s.spring_force
     friction = s.friction_mean * (p.offset_friction + p.load_friction * load * s.gear_slope)
     slow = friction * exp(-0.5 * abs(m.speed + s.speed) / SLOW_RAD_PER_S)
-    return slow, accelerating, leverage * load + p.offset_friction * s.friction_mean + accelerating
+    return slow, accelerating, leverage * load + p.offset_friction * s.gear_friction * s.friction_mean + accelerating
 
 
 @njit
@@ -197,6 +198,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     h, speed, s_mean = s.sensitivity[0], 0.5 * (m.speed + s.speed), s.friction_mean
     moving = _moving_variance(s, p, m)
     friction_torque = p.offset_friction + p.load_friction * max(mean_force + s.spring_force, 0.0) * s.gear_slope
+    friction_torque *= s.gear_friction
     doubted = s.effects.terms.torque_sigma
     lasting = p.torque_lasting_sigma * leverage * max(mean_force + s.spring_force, 0.0)
     white = moving + friction_torque * friction_torque * friction_variance + doubted * doubted + lasting * lasting
@@ -282,6 +284,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     if not known:
         out.force += uneven.applied(s.uneven)
         out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
+        # Of the way from the released position, by a resolver whose ways are off.
+        out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
     # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
@@ -290,10 +294,10 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
 
 
 @njit
-def _motor_torque(s, p, m, x):
+def _motor_torque(s, x):
     """Motor torque (N m) by what a hypothesis with the errors ``x`` makes of the current."""
     gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
-    return p.torque_constant * m.current_q * max(gain, _LEAST_GAIN) - x[OFFSET]
+    return s.motor_torque * max(gain, _LEAST_GAIN) - x[OFFSET]
 
 
 @njit
@@ -309,16 +313,19 @@ def _beside_force(s, p):
 
 
 @njit
-def _gear(p, x, slope):
-    """Gear gain and load friction (m/rad) and offset friction (N m) of a hypothesis with the errors ``x``."""
-    return p.gear_gain * slope, max(p.load_friction + x[LOAD], 0.0) * slope, max(p.offset_friction + x[COULOMB], 0.0)
+def _gear(s, p, m, x, slope):
+    """Gear gain and load friction (m/rad) and offset friction (N m) of a hypothesis with the errors ``x``, effects and a rise
+    at low speed included: a motor that stands is held by all of it."""
+    rise = s.gear_friction + x[SLOW] * exp(-abs(m.speed) / SLOW_RAD_PER_S)
+    load, coulomb = rise * p.load_friction + x[LOAD], rise * p.offset_friction + x[COULOMB]
+    return p.gear_gain * s.gear_gain * slope, max(load, 0.0) * slope, max(coulomb, 0.0)
 
 
 @njit
 def _beyond_friction(s, p, m, x, force, accelerating, spread):
     """`beyond_friction` of a hypothesis with the errors ``x`` and the clamp force ``force`` N."""
-    torque = _motor_torque(s, p, m, x) - accelerating - x[VISCOUS] * m.speed
-    gain, load, coulomb = _gear(p, x, s.gear_slope)
+    torque = _motor_torque(s, x) - accelerating - x[VISCOUS] * m.speed
+    gain, load, coulomb = _gear(s, p, m, x, s.gear_slope)
     return beyond_friction(torque, force + s.spring_force, spread, gain, load, coulomb)
 
 
@@ -327,8 +334,8 @@ def _torque_alone(s, p, m):
     """Clamp force and its standard deviation (N) by the torque alone if nothing has jumped, then that torque
     (N m), the gear gain, load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
-    gain, load, coulomb = _gear(p, s.error, slope)
-    torque = _motor_torque(s, p, m, s.error) - gain * spring
+    gain, load, coulomb = _gear(s, p, m, s.error, slope)
+    torque = _motor_torque(s, s.error) - gain * spring
     force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
     sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:

@@ -1,8 +1,8 @@
 """An independent monitor: bounds on the clamp force from motor current and direction of motion alone.
 
 It shares no state and nothing learned with the filter, and of the calibration it takes what a datasheet states: torque
-constant, gear, friction, largest force. Each is allowed to be wrong by the bounds below. Over torque smoothed for
-`SMOOTHED_S`, less what accelerates the motor,
+constant, gear, friction with what effects add to it, largest force. Each is allowed to be wrong by the bounds below. Over
+torque smoothed for `SMOOTHED_S`, less what accelerates the motor,
 
     lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
 
@@ -44,8 +44,9 @@ MONITOR = np.dtype([("started", "?"), *fields("f8", "torque speed low high force
 
 
 @njit
-def bound(w, p, m):
-    """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``."""
+def bound(w, p, m, friction=1.0):
+    """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``; gear ``friction`` over theirs as the
+    calibration's effects have it, of which no less than theirs is believed."""
     if not m.has_current:
         w.started, w.low, w.high = False, 0.0, p.maximum_force
         return
@@ -54,7 +55,8 @@ def bound(w, p, m):
     w.torque += share * (p.torque_constant * m.current_q - accelerating - w.torque)
     w.speed, w.started = m.speed, True
     offset = OFFSET_SHARE * p.gear_gain * p.maximum_force
-    dry, load = MOST_FRICTION * p.offset_friction, MOST_FRICTION * p.load_friction
+    most_friction = MOST_FRICTION * max(friction, 1.0)
+    dry, load = most_friction * p.offset_friction, most_friction * p.load_friction
     least, most = (LEAST_GAIN, MOST_GAIN) if w.torque > 0.0 else (MOST_GAIN, LEAST_GAIN)
     # Friction holds the force up unless the motor closes, and takes torque unless it opens.
     closing, opening = m.speed > _TURNING_RAD_PER_S, m.speed < -_TURNING_RAD_PER_S

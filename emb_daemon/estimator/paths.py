@@ -121,17 +121,18 @@ def torque_path(s, p, m):
     )
     s.friction_mean = mean
     e, state, mean_speed = p.effects, s.effects, 0.5 * (m.speed + s.speed)
-    gear = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
-    friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.gear_gain = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.gear_friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.motor_torque = p.torque_constant * m.current_q
     # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
     middle, slope = turned(s, p, m.angle - 0.5 * travel)
     s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
-    leverage = (p.gear_gain * gear + p.load_friction * friction * mean) * slope
+    leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0
-    motor_torque = effects.motor_torque(e, state, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
-    offset_friction = p.offset_friction * friction
-    torque = unexplained_torque(motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
+    s.motor_torque = effects.motor_torque(e, state, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
+    offset_friction = p.offset_friction * s.gear_friction
+    torque = unexplained_torque(s.motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)
     torque -= leverage * s.spring_force
     return torque, leverage, s.friction_variance + turning * turning

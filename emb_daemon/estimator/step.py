@@ -118,7 +118,7 @@ def step(s, p, m, out):
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
     facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
-    bound(s.monitor, p, m)
+    bound(s.monitor, p, m, s.gear_friction)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
     _tell_contact(s, p, out.contact_sigma, out)

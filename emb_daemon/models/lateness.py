@@ -1,12 +1,12 @@
-"""By how much the resolver's angle is older than the speed that comes with it.
+"""By how much the resolver's angle is older than the speed that comes with it, and by which share its ways differ.
 
 What the angle lacks of the integrated speed is then the time times the speed. Both are followed over a tenth of a second.
-A gain of the resolver lacks a share of the way: it is fitted beside the time and not used, because without it a gain of seven
-hundredths looks like an age. Neither signal can be ahead of the motor: a speed that is older, as a filtered one is, says
-nothing of the angle.
+A gain of the resolver lacks a share of the way: it is fitted beside the time, because without it a gain of seven hundredths
+looks like an age. Neither signal can be ahead of the motor: a speed that is older, as a filtered one is, says nothing of the
+angle.
 """
 
-from math import exp
+from math import exp, sqrt
 
 import numpy as np
 
@@ -22,14 +22,17 @@ _NOISE_RAD, _ALIKE = 0.01, 25.0
 #: Standard deviation of ages before anything is known, s: a value of any moment of the last cycle of 4 ms. The oldest, s: a
 #: sample, a frame and a gateway each a cycle late; an older one is a fault that `plausibility` tells.
 _AGE_S, _OLDEST_S = 0.002, 0.015
-#: Standard deviation of a resolver's gain, share.
-_GAIN = 0.02
+#: Standard deviation of a resolver's gain, share; and what the trapezoid may miss of the way of a stroke: where a motor goes
+#: over from speeding up at 8000 rad/s2 to its full speed T^2 / 8 of that, twice, on some 10 rad.
+_GAIN, _MISSED = 0.02, 0.003
+#: Standard deviations by which a gain is sure.
+_SURELY = 3.0
 #: How much further off than the oldest angle makes it a sample may be, rad: ten times its noise; beyond is another fault's.
 _BEYOND_RAD = 0.1
 
 #: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. The others:
-#: normal equations of the two, and ``age`` s as they solve them.
-LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age"), align=True)
+#: normal equations of the two, and ``age`` s as they solve them; ``gain``: share by which ways are surely off, or 0.
+LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age gain"), align=True)
 
 
 @njit
@@ -49,8 +52,10 @@ def follow(a, travel, turned, gained, dt):
     a.aw = old * a.aw + a.apart * a.gone
     noise = _ALIKE * _NOISE_RAD * _NOISE_RAD
     ss, ww = a.ss + noise / (_AGE_S * _AGE_S), a.ww + noise / (_GAIN * _GAIN)
-    age = (a.aw * a.sw - a.as_ * ww) / (ss * ww - a.sw * a.sw)
+    determinant = ss * ww - a.sw * a.sw
+    age, gain = (a.aw * a.sw - a.as_ * ww) / determinant, abs(a.aw * ss - a.as_ * a.sw) / determinant
     a.age = min(max(age, 0.0), _OLDEST_S)
+    a.gain = gain if gain > _MISSED + _SURELY * sqrt(noise * ss / determinant) else 0.0
 
 
 @njit
