@@ -162,15 +162,15 @@ def _calibration():
     return load_calibration(resource("config/calibration.yaml"))
 
 
-def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
-    """Drive number ``number`` with faults of these families: (fault, moments, ESTIMATE rows, true force at each, N)."""
+def prepare(names: tuple[str, ...], number: int, seed: int, calibration, families: dict = FAMILIES):
+    """Drive number ``number`` with faults of these ``families``: (fault, moments, calibration with the effects that brake and
+    calibration share, car, schedule)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
-    calibration = _calibration()
     # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(calibration)
     moments = draw_drive(plain, np.random.default_rng(drive_seed), 1e4 if "start_latched" in names else 0.0)[1]
-    fault = _join([FAMILIES[name](rng, moments) for name in names])
+    fault = _join([families[name](rng, moments) for name in names])
     if fault.effects:
         calibration = msgspec.convert(
             msgspec.to_builtins(calibration) | {"effects": dict(calibration.effects) | fault.effects}, type(calibration)
@@ -189,6 +189,12 @@ def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, 
         car.states["pads"][:] = np.linspace(disc, plate, car.states["pads"].shape[-1])
         for name in ("plate", "plate_reading", "caliper"):
             car.states[name] = plate
+    return fault, moments, calibration, car, schedule
+
+
+def drive(names: tuple[str, ...], number: int, seed: int) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
+    """Such a drive of the shipped calibration's brake: (fault, moments, ESTIMATE rows, true force at each, N)."""
+    fault, moments, calibration, car, schedule = prepare(names, number, seed, _calibration())
     commands = sc.commands_of(schedule, ("FL",))
     silences = [(0.0, fault.power_on_s)] + [(at, at + off) for at, off in fault.restarts]
     restarts = sorted(at + off for at, off in fault.restarts)
