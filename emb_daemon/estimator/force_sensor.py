@@ -39,7 +39,7 @@ from emb_daemon.models.stiffness import characteristic_curve
 FORCE_SENSOR_PARAMETERS = np.dtype(fields("f8", "limit noise offset walk per_kelvin gain"), align=True)
 
 #: ``offset`` N and its ``variance``, as the clearance showed it when the caliper had ``zeroed`` degC; ``clear_s``: for how
-#: long the pads have not touched; ``force`` and ``sigma`` N: what the sensor says now, infinitely unsure where that is nothing;
+#: long the pads have not touched; ``force`` and ``sigma`` N: what the sensor says now, infinite where nothing;
 #: ``value`` N that it last read, and ``value_force`` N that the brake had when it began to read that; ``contradiction``:
 #: summed squares; ``asked``: whether a change has been looked for since the last release because of it; ``wrong``: whether it
 #: is disbelieved.
