@@ -98,6 +98,7 @@ _ARRAYS = {
     "caliper_C": ("EMB_{}_Thermocouple", "CaliperTemp"),
     "wheel_speed_rad_per_s": ("VEH_WheelSpeed", "WheelSpeed{}"),
     "wheel_pulse": ("VEH_WheelPulse", "WheelPulse{}"),
+    "sensor_force_N": ("EMB_{}_ForceSensor", "SensorForce"),
     "force_N": ("RIG_{}_Force", "ClampForceRef"),
     "brake_torque_Nm": ("RIG_{}_Force", "BrakeTorqueRef"),
 }
@@ -125,8 +126,9 @@ def log_of_arrays(
         current_mean_s: time before its sample over which the current is a mean; None: the sampling period; 0: the current is
             instantaneous.
         ambient_C: as in `Estimator.step`; the park brake counts as released.
-        columns: ``inner_backplate_C``, ``outer_backplate_C``, ``caliper_C``, ``wheel_speed_rad_per_s``, ``wheel_pulse``, and
-            of reference instruments ``force_N``, ``brake_torque_Nm``; arrays of shape (n,), with NaN where nothing was
+        columns: ``inner_backplate_C``, ``outer_backplate_C``, ``caliper_C``, ``wheel_speed_rad_per_s``, ``wheel_pulse``,
+            ``sensor_force_N`` of a force sensor of low range that the calibration has, and of reference instruments
+            ``force_N``, ``brake_torque_Nm``; arrays of shape (n,), with NaN where nothing was
             measured, or constants. If only one backing plate is given, it is used for both.
 
     Raises:
@@ -210,6 +212,7 @@ class Estimator:
         wheel_speed_rad_per_s: float | None = None,
         wheel_pulse: float | None = None,
         vehicle_speed_m_per_s: float = 0.0,
+        sensor_force_N: float | None = None,
     ) -> Answer:
         """Take one sample and return its estimate.
 
@@ -222,6 +225,7 @@ class Estimator:
             backplates_C: inner and outer backing plate; None if unknown, and the pads' temperatures then stay unknown.
             caliper_C: if None, the mean of the backing plates is used.
             wheel_speed_rad_per_s, wheel_pulse: speed of the disc, and 96 counts per turn modulo 4096; None if unknown.
+            sensor_force_N: of a force sensor of low range at the sample; counts where the calibration has one.
 
         An argument that may be None may also be NaN or infinite; both mean missing.
 
@@ -236,12 +240,15 @@ class Estimator:
             raise ValueError(f"dt_s = {dt_s}: expected a time above zero")
         current_A, caliper_C = _finite(current_A), _finite(caliper_C)
         wheel_speed_rad_per_s, wheel_pulse = _finite(wheel_speed_rad_per_s), _finite(wheel_pulse)
+        sensor_force_N = _finite(sensor_force_N)
         if backplates_C is not None and not all(map(isfinite, backplates_C)):
             backplates_C = None
         row = self._sample[0]
         row["dt"] = dt_s if self._state["started"][0] else 0.0
         row["angle"], row["speed"] = angle_rad, speed_rad_per_s
         row["has_current"], row["current_q"] = current_A is not None, _NAN if current_A is None else current_A
+        row["has_sensor_force"] = sensor_force_N is not None
+        row["sensor_force"] = _NAN if sensor_force_N is None else sensor_force_N
         row["has_thermocouple"] = backplates_C is not None
         inner, outer = backplates_C or (_NAN, _NAN)
         row["inner_backplate"], row["outer_backplate"] = inner, outer

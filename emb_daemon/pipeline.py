@@ -193,7 +193,7 @@ def _collect(b, frames, start, predictions, count):
         slot, verdict = receive(frame, b.receptions, b.layout[0])
         if verdict == SECOND_SENDER:
             _record_second_sender(b, frame)
-        if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES == wire.THERMOCOUPLE:
+        if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES > wire.CURRENT:
             continue
         index = slot // wire.CORNER_MESSAGES
         corner = b.corners[index]
@@ -207,16 +207,16 @@ def _collect(b, frames, start, predictions, count):
             corner.pending_ns = resolver.time_ns
             corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
             corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
-        if corner.pending >= 0 and _paired(b, index):
+        if corner.pending >= 0 and _paired(b, index, wire.CURRENT):
             count = _complete(b, index, count)
     return start, count
 
 
 @njit
-def _paired(b, index):
-    """Whether the current that belongs to the pending resolver sample has arrived."""
-    corner, current = b.corners[index], b.receptions[wire.CORNER_MESSAGES * index + wire.CURRENT]
-    return current.counter == corner.pending and abs(current.time_ns - corner.pending_ns) < CYCLE_NS
+def _paired(b, index, kind):
+    """Whether the message that belongs to the pending resolver sample has come: its current, or its force sensor's."""
+    corner, reception = b.corners[index], b.receptions[wire.CORNER_MESSAGES * index + kind]
+    return reception.counter == corner.pending and abs(reception.time_ns - corner.pending_ns) < CYCLE_NS
 
 
 @njit
@@ -300,8 +300,11 @@ def _complete(b, index, count):
     # The error of a value that its sender reports as degraded is unknown. Instead of the current the force can use the
     # stiffness path. If the resolver is degraded as well, or for any other signal, there is no alternative.
     degraded_alone = b.receptions[base + wire.CURRENT].degraded and not b.receptions[base + wire.RESOLVER].degraded
-    row.has_current = _paired(b, index) and not degraded_alone
+    row.has_current = _paired(b, index, wire.CURRENT) and not degraded_alone
     row.current_q = b.receptions[base + wire.CURRENT].values[wire.CURRENT_Q]
+    sensor = b.receptions[base + wire.FORCE_SENSOR]
+    row.has_sensor_force = _paired(b, index, wire.FORCE_SENSOR) and not sensor.degraded
+    row.sensor_force = sensor.values[wire.SENSOR_FORCE]
     thermocouple = b.receptions[base + wire.THERMOCOUPLE]
     row.has_thermocouple = now - thermocouple.time_ns < _USABLE_NS
     row.inner_backplate = thermocouple.values[wire.INNER_BACKPLATE]
@@ -361,7 +364,7 @@ def _head(b, row, index, age):
     ):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
-    for slot in (base, base + 1, base + 2, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
+    for slot in (base, base + 1, base + 2, base + 3, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
         degraded = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < _SHOWN_NS
         if degraded or now - b.receptions[slot].refused_ns < _SHOWN_NS:
             reasons |= contract.E2E_ERROR

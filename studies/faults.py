@@ -679,3 +679,41 @@ def bursts_lost(rng, moments, size):
         f"{100 * share:.0f} % of {len(slots)} messages", at,
         bus=_during(lambda frames, time_s: drop(frames, time_s) if rng.random() < share else frames, at),
     )  # fmt: skip
+
+
+# A force sensor of low range, where the brake has one.
+
+#: Its faults, by family.
+SENSOR_FAULTS: dict[str, Callable] = {}
+
+
+def _sensor_family(function: Callable) -> Callable:
+    SENSOR_FAULTS[function.__name__] = function
+    return function
+
+
+def _sensor_fault(size: str, at: float, change: Callable) -> Fault:
+    return Fault(size, at, bus=_during(_alter(wire.FORCE_SENSOR, wire.SENSOR_FORCE, change), at))
+
+
+@_sensor_family
+def sensor_stuck(rng, moments, size):
+    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
+    return Fault("", at, bus=_during(_hold(wire.FORCE_SENSOR, wire.SENSOR_FORCE), at))
+
+
+@_sensor_family
+def sensor_gain(rng, moments, size):
+    return _sensor_fault("x 0.80", _pick_driving(rng, moments), lambda values, _: 0.8 * values)
+
+
+@_sensor_family
+def sensor_offset(rng, moments, size):
+    offset, at = size.force * _draw_signed(rng, 100.0, 1500.0), _pick_sometime(rng, moments)
+    return _sensor_fault(f"{offset:+.0f} N", at, lambda values, _: values + offset)
+
+
+@_sensor_family
+def sensor_drift(rng, moments, size):
+    rate, at = size.force * _draw_signed(rng, 2.0, 50.0), moments["go_1"]
+    return _sensor_fault(f"{rate:+.1f} N/s", at, lambda values, time_s: values + rate * (time_s - at))

@@ -208,19 +208,17 @@ def _with_effects(calibration: Calibration, effects: dict) -> Calibration:
     return msgspec.convert(changed, Calibration)
 
 
-def drive(
-    names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None
-) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
-    """Drive number ``number`` of `brake_of` ``stranger`` with faults of these families: (fault, moments, ESTIMATE rows, true
-    force at each, N)."""
+def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, families: dict = FAMILIES):
+    """Drive number ``number`` of a brake with faults of these ``families``: (fault, moments, the daemon's calibration with the
+    effects that brake and calibration share, car, schedule)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
-    calibration, own, effects, unit, size, wheel_m = brake_of(stranger)
+    calibration, own, effects, unit, size, wheel_m = brake
     # The moments are needed to draw the fault, and the fault's brake to draw the drive: two draws of the same numbers.
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(own)
     latched_N = size.force * 1e4 if "start_latched" in names else 0.0
     moments = draw_drive(plain, np.random.default_rng(drive_seed), latched_N, size.force)[1]
-    fault = _join([FAMILIES[name](rng, moments, size) for name in names])
+    fault = _join([families[name](rng, moments, size) for name in names])
     if fault.effects:
         calibration, own = _with_effects(calibration, fault.effects), _with_effects(own, fault.effects)
     another = int(rng.integers(1 << 32))
@@ -241,6 +239,14 @@ def drive(
         car.states["pads"][:] = np.linspace(disc, plate, car.states["pads"].shape[-1])
         for name in ("plate", "plate_reading", "caliper"):
             car.states[name] = plate
+    return fault, moments, calibration, car, schedule
+
+
+def drive(
+    names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None
+) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
+    """Such a drive of `brake_of` ``stranger``: (fault, moments, ESTIMATE rows, true force at each, N)."""
+    fault, moments, calibration, car, schedule = prepare(names, number, seed, brake_of(stranger))
     commands = sc.commands_of(schedule, ("FL",))
     silences = [(0.0, fault.power_on_s)] + [(at, at + off) for at, off in fault.restarts]
     restarts = sorted(at + off for at, off in fault.restarts)

@@ -51,9 +51,11 @@ _CONTRACT = (
      "LowForce 32|8 u 0.25 0 kN; HighForce 40|8 u 0.25 0 kN; "
      "DitherAmplitude 48|8 u 0.02 0 rad; DitherFrequency 56|8 u 0.1 0 Hz"),
 )  # fmt: skip
+#: What was added to it.
+_ADDED = (("EMB_{}_ForceSensor", 0x0F0, 4, "SensorForce 16|16 s 1 0 N"),)
 _MESSAGES = [
     (template.format(corner), can_id + index, cycle, signals)
-    for template, can_id, cycle, signals in _CONTRACT
+    for template, can_id, cycle, signals in (*_CONTRACT, *_ADDED)
     for index, corner in enumerate(CORNERS if "{}" in template else ("",))
 ]
 _NAMES = [name for name, *_ in _MESSAGES]

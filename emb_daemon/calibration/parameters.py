@@ -8,6 +8,7 @@ calibration (`types.to_parameters`); what adaptation learns is a partial calibra
 import difflib
 import math
 import re
+import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ _UNITS = {
     "kg_m2": "kg·m²",
     "m_per_rad": "m/rad",
     "N_per_m": "N/m",
+    "N_per_K": "N/K",
+    "N_per_sqrt_s": "N/√s",
     "rad_per_s": "rad/s",
     "rad_per_sqrt_s": "rad/√s",
     "kg_per_m3": "kg/m³",
@@ -239,7 +242,7 @@ def _bounds(names: tuple[str, ...]) -> tuple[float, float, float]:
     """(lowest, highest, usual size) of a number by the names on its path, from the types' annotations."""
     kind: Any = Calibration
     for name in names:
-        while typing.get_origin(kind) in (tuple, typing.Annotated):
+        while typing.get_origin(kind) in (tuple, typing.Annotated, types.UnionType):
             kind = typing.get_args(kind)[0]
         kind = typing.get_type_hints(kind, include_extras=True)[name]
     low, high, usual = -math.inf, math.inf, 0.0

@@ -179,6 +179,23 @@ class Noise(Struct, kw_only=True):
     torque_lasting: Annotated[NonNegative, usual(0.05)] = 0.0
 
 
+class ForceSensor(Struct, kw_only=True):
+    """A clamp force sensor of low range on the bus (`EMB_c_ForceSensor`); without one this section is left out."""
+
+    #: Force up to which it measures; what it says there and beyond is no measurement.
+    limit_N: Positive
+    #: White noise of one value.
+    noise_N: Positive
+    #: Its zero at power-on.
+    offset_N: Annotated[NonNegative, usual(50.0)]
+    #: Random walk of its zero.
+    offset_walk_N_per_sqrt_s: Annotated[NonNegative, usual(1.0)]
+    #: Drift of its zero per kelvin of the caliper.
+    offset_N_per_K: Annotated[NonNegative, usual(1.0)]
+    #: Its gain, as a share of what it says.
+    gain_relative: Annotated[Share, usual(0.01)]
+
+
 class Pad(Struct, kw_only=True):
     """Both brake pads (thesis 7.4 to 8.1). Conductivity is k0 (1 + rise (T - 20 degC)), specific heat C0 likewise."""
 
@@ -380,6 +397,8 @@ class Calibration(Struct, kw_only=True):
     contact: Contact
     noise: Noise
     thermal: Thermal
+    #: Standard deviations are from the datasheet of the sensor.
+    force_sensor: ForceSensor | None = None
     #: Effects of the catalogue that are switched on, by name, with their parameters.
     effects: dict[str, dict[str, float]] = msgspec.field(default_factory=dict)
     #: Terms that are not in the catalogue of effects; `emb-daemon diagnose` makes them.
@@ -507,6 +526,10 @@ def to_parameters(calibration: Calibration) -> np.void:
     p["presliding_sigma"] = c.noise.presliding
     p["torque_relative_sigma"] = c.noise.torque_relative
     p["torque_lasting_sigma"] = c.noise.torque_lasting
+    if (sensor := c.force_sensor) is not None:
+        p["sensor"]["limit"], p["sensor"]["noise"], p["sensor"]["offset"] = sensor.limit_N, sensor.noise_N, sensor.offset_N
+        p["sensor"]["walk"], p["sensor"]["per_kelvin"] = sensor.offset_walk_N_per_sqrt_s, sensor.offset_N_per_K
+        p["sensor"]["gain"] = sensor.gain_relative
     _fill_thermal(p["thermal"], c.thermal, 1e-3 * c.pad_thickness_mm)
     for name, values in c.effects.items():
         for key, value in values.items():

@@ -7,6 +7,7 @@ import numpy as np
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator import uneven
 from emb_daemon.estimator.consistency import forget, model_error, remember
+from emb_daemon.estimator.force_sensor import hear_sensor
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     DRIFT,
@@ -36,6 +37,7 @@ from emb_daemon.estimator.status import (
     CONTACT_UNKNOWN,
     CURRENT_IMPLAUSIBLE,
     DISC_UNEVEN,
+    FORCE_SENSOR_WRONG,
     JUMP_SUSPECTED,
     MODEL_ERROR,
     NO_SOURCE,
@@ -250,6 +252,8 @@ def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
     known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
     uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
+    if p.sensor.limit > 0.0 and not known:
+        hear_sensor(s, p, m, h, spread, warmth, force_before)
     to_force(h, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
@@ -369,6 +373,8 @@ def _facts_of_torque(s, p):
         facts |= DISC_UNEVEN
     if s.late > _TOLD_CYCLES * CYCLE_S:
         facts |= ANGLE_LATE
+    if s.sensor.wrong:
+        facts |= FORCE_SENSOR_WRONG
     return facts
 
 

@@ -101,7 +101,8 @@ _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
 
 #: One hypothesis beside the first, of which ``kind`` a kept jump is. ``log_odds`` against the first, at ``least``, and the
 #: ``share`` that it has by them, none if there is no such hypothesis; ``age_s`` since it was opened, that in the clearance
-#: apart; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over the first one's.
+#: apart; ``slope`` N/rad at its own contact angle; ``shift`` N: its force over the first one's; ``told``: what of the odds a
+#: force sensor gave.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
@@ -113,6 +114,7 @@ ALTERNATIVE = np.dtype(
         ("share", "f8"),
         ("shift", "f8"),
         ("slope", "f8"),
+        ("told", "f8"),
     ],
     align=True,
 )
@@ -160,7 +162,7 @@ def _open(s, p, kind):
     if p.clearance_sigma == 0.0:
         # A brake that is held as exactly known is no other.
         a.log_odds = -np.inf
-    a.shift = a.age_s = 0.0
+    a.shift = a.age_s = a.told = 0.0
     a.kind = kind
 
 
@@ -194,7 +196,7 @@ def _keep(s, a):
     kept = s.alternatives[KEPT_JUMP]
     copy_errors(kept.error, kept.covariance, a.error, a.covariance)
     kept.kind, kept.age_s, kept.log_odds, kept.least = a.kind, a.age_s, a.log_odds, a.least
-    kept.shift, kept.slope = a.shift, a.slope
+    kept.shift, kept.slope, kept.told = a.shift, a.slope, a.told
 
 
 @njit

@@ -4,6 +4,7 @@ import numpy as np
 
 from emb_daemon.effects import REGISTRY, parameter_record, state_record
 from emb_daemon.estimator.consistency import CONSISTENCY
+from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
 from emb_daemon.estimator.uneven import UNEVEN
@@ -56,6 +57,7 @@ PARAMETERS = np.dtype(
             "torque_relative_sigma torque_lasting_sigma contact_walk",
         ),
         ("gear", GEAR),
+        ("sensor", FORCE_SENSOR_PARAMETERS),
         ("thermal", THERMAL),
         ("effects", parameter_record(REGISTRY)),
     ],
@@ -71,10 +73,10 @@ SAMPLE = np.dtype(
         ("is_prediction", "?"),
         *fields(
             "f8",
-            "dt angle speed current_q inner_backplate outer_backplate caliper ambient wheel_speed wheel_pulse vehicle_speed "
-            "park_brake brake_request brake_torque",
+            "dt angle speed current_q sensor_force inner_backplate outer_backplate caliper ambient wheel_speed wheel_pulse "
+            "vehicle_speed park_brake brake_request brake_torque",
         ),
-        *fields("?", "has_current has_thermocouple has_wheel_speed has_wheel_pulse has_status"),
+        *fields("?", "has_current has_sensor_force has_thermocouple has_wheel_speed has_wheel_pulse has_status"),
     ],
     align=True,
 )
@@ -135,6 +137,7 @@ STATE = np.dtype(
         ("housing", "f8"),
         ("consistency", CONSISTENCY),
         ("uneven", UNEVEN),
+        ("sensor", FORCE_SENSOR),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("monitor", MONITOR),
         ("wheel", WHEEL),

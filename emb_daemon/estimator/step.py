@@ -10,6 +10,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
+from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
@@ -19,9 +20,12 @@ from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
     BOUNDS_CONTRADICT,
+    CONTACT_SOUGHT,
+    CONTACT_UNKNOWN,
     CURRENT_IMPLAUSIBLE,
     FORCE_UNCERTAIN,
     NOT_A_NUMBER,
+    RESOLVER_IMPLAUSIBLE,
     TEMPERATURE_UNKNOWN,
     TEMPERATURE_VAGUE,
     THERMOCOUPLE_STUCK,
@@ -118,6 +122,8 @@ def step(s, p, m, out):
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
     facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
+    if p.sensor.limit > 0.0 and facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT):
+        out.force, out.sigma = with_sensor(s.sensor, out.force, out.sigma)
     bound(s.monitor, p, m, s.gear_friction)
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage

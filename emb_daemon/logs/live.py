@@ -224,16 +224,17 @@ class MappedBus(PythonCanBus):
         rows = [
             slow.frame(_complete(slow), time_ns)
             for name, slow in self._messages.items()
-            if not name.endswith(("_Resolver", "_Current")) and self._is_due(slow, time_ns)
+            if not name.endswith(("_Resolver", "_Current", "_ForceSensor")) and self._is_due(slow, time_ns)
         ]
         cycles = max(1, round((time_ns - resolver.sent_ns) / CYCLE_NS)) if resolver.sent_ns else 1
         motion = _motion(resolver, time_ns)
         resolver.counter += cycles
-        current = self._messages.get(f"EMB_{corner}_Current")
-        if current is not None and current.fresh(time_ns):
-            current.counter = resolver.counter
-            values = {name: v.mean() if isinstance(v, _Value) else v for name, v in current.signals.items()}
-            rows.append(current.frame(values, time_ns))
+        for kind in ("ForceSensor", "Current"):
+            fast = self._messages.get(f"EMB_{corner}_{kind}")
+            if fast is not None and fast.fresh(time_ns):
+                fast.counter = resolver.counter
+                means = {name: v.mean() if isinstance(v, _Value) else v for name, v in fast.signals.items()}
+                rows.append(fast.frame(means if kind == "Current" else fast.last(), time_ns))
         rows.append(resolver.frame(motion, time_ns))
         return rows
 

@@ -334,7 +334,9 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     if not any(len(times) for times, _ in ticks.values()):
         return np.zeros(0, FRAME)
     stretches = _stretches(np.unique(np.concatenate([times for times, _ in ticks.values()])), _SILENT_NS)
-    result = np.concatenate([_frames(*ours[name], signals, ticks, stretches) for name, signals in messages.items()])
+    # A force sensor's frame comes before those of its sample, which do not wait for it.
+    in_turn = sorted(messages, key=lambda name: not name.endswith("_ForceSensor"))
+    result = np.concatenate([_frames(*ours[name], messages[name], ticks, stretches) for name in in_turn])
     # Stable: at one instant slow messages come first and the resolver last, as the pipeline pairs it with its current.
     return result[np.argsort(result["time_ns"], kind="stable")]
 
@@ -384,7 +386,7 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
 
 def is_received(message: str) -> bool:
     """Whether the daemon receives a corner's message."""
-    return message.endswith(("_Resolver", "_Current", "_Thermocouple"))
+    return message.endswith(("_Resolver", "_Current", "_Thermocouple", "_ForceSensor"))
 
 
 def _stretches(times: np.ndarray, silent_ns: float) -> list[tuple[int, int]]:
@@ -404,7 +406,7 @@ def _grid(stretches: list[tuple[int, int]], cycle_ns: int) -> tuple[np.ndarray, 
 
 def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tuple[int, int]]) -> np.ndarray:
     corner, kind = (*message.name.split("_"), "")[1:3]
-    if corner in ticks and kind in ("Resolver", "Current", "Force"):
+    if corner in ticks and kind in ("Resolver", "Current", "ForceSensor", "Force"):
         times, cycles = ticks[corner]
         columns = {key: _fast(key, source, times) for key, source in signals.items()}
     else:

@@ -175,6 +175,21 @@ def _fast_frames(w, rng, row, frames, count):
 
 
 @njit
+def _sensor_frame(w, rng, row, frames, count):
+    """The force sensor's, first of its sample and with the counter of the others."""
+    car, p, s, received = w.car[0], w.plants[row], w.states[row], w.wires[0].received
+    slot = wire.CORNER_MESSAGES * w.corners[row] + wire.FORCE_SENSOR
+    s.sensor_zero += p.sensor_walk * np.sqrt(CYCLE_S) * rng.standard_normal()
+    zero = p.sensor_offset + s.sensor_zero + p.sensor_per_K * (s.caliper - p.curve_temperature)
+    value = (1.0 + p.sensor_gain) * s.force + zero + p.sensor_noise * rng.standard_normal()
+    payload = pack(min(max(value, -p.sensor_limit), p.sensor_limit), received[slot, wire.SENSOR_FORCE])
+    counter = car.counter[slot]
+    car.counter[slot] = (counter + 1) % COUNTER_MODULO
+    can_id = w.ids[slot]
+    return _put(frames, count, car.time_ns, can_id, protect(can_id, payload, counter, 0))
+
+
+@njit
 def _slow_frames(w, rng, drive, frames, count, due_ns):
     """Thermocouples, wheels and, ten times a second, the vehicle's status; sampled at ``due_ns``, within this cycle."""
     car, received = w.car[0], w.wires[0].received
@@ -284,6 +299,8 @@ def _tick(w, rng, commands, drive, frames, truth):
         mode, target, rate = _train(s, training, commands[row], drive, car.speed == 0.0)
         _corner_cycle(p, s, mode, target, rate, wheel_speed, car.wheel_speed - wheel_speed, drive.ambient, rng)
         _record(car, p, s, corner, car.counter[wire.CORNER_MESSAGES * corner], drive, training, truth[row])
+        if p.sensor_limit > 0.0:
+            count = _sensor_frame(w, rng, row, frames, count)
         count = _fast_frames(w, rng, row, frames, count)
         if car.reference:
             count = _reference_frames(w, rng, row, frames, count, slow_reference)
@@ -373,11 +390,12 @@ class Car:
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
         motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
         self.states["wheel_angle"] = rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
-        motion["counter"] = rng.integers(0, COUNTER_MODULO, len(motion["counter"]))
-        for corner in range(4):
-            # Both frames of a sample share their counter.
-            base = wire.CORNER_MESSAGES * corner
-            motion["counter"][base + wire.CURRENT] = motion["counter"][base + wire.RESOLVER]
+        fast = wire.CORNER_MESSAGES * np.arange(4)
+        drawn = np.setdiff1d(np.arange(wire.SLOTS), fast + wire.FORCE_SENSOR)
+        motion["counter"][drawn] = rng.integers(0, COUNTER_MODULO, len(drawn))
+        # The frames of a sample share their counter.
+        for kind in (wire.CURRENT, wire.FORCE_SENSOR):
+            motion["counter"][fast + kind] = motion["counter"][fast + wire.RESOLVER]
         layout = wire.default_layout()
         slots = layout["slot"][0]
         ids = np.zeros(wire.SLOTS, np.int64)

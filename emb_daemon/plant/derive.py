@@ -91,10 +91,18 @@ def plant_from_calibration(
     _set_pads(p, calibration.thermal, thickness)
     _set_disc(p, calibration.thermal)
     _set_sensors(p, calibration.noise)
+    if (sensor := calibration.force_sensor) is not None:
+        p["sensor_limit"], p["sensor_noise"] = sensor.limit_N, sensor.noise_N
+        p["sensor_walk"] = sensor.offset_walk_N_per_sqrt_s
     own = {name: values for name, values in calibration.effects.items() if name in EFFECTS}
     _set_effects(p, own | (effects or {}))
     if seed is not None:
-        _scatter(p, np.random.default_rng(seed), set(calibration.effects) - set(effects or {}))
+        rng = np.random.default_rng(seed)
+        _scatter(p, rng, set(calibration.effects) - set(effects or {}))
+        if (sensor := calibration.force_sensor) is not None:
+            spread = {"offset": sensor.offset_N, "per_K": sensor.offset_N_per_K, "gain": sensor.gain_relative}
+            for name, sigma in spread.items():
+                p[f"sensor_{name}"] = sigma * rng.standard_normal()
     return p
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from emb_daemon.jit import fields
 from emb_daemon.wire.contract import CYCLE_NS
+from emb_daemon.wire.layout import SLOTS
 
 #: Integration steps in one 4 ms cycle.
 SUBSTEPS = 16
@@ -193,6 +194,12 @@ PLANT_FIELDS = (
     Field("force_noise", "N", "reference force sensor of the rig"),
     Field("force_lead", "s", "time by which the reference force is younger than the resolver's sample"),
     Field("brake_torque_noise", "N m", "reference torque sensor of the rig"),
+    Field("sensor_limit", "N", "force at which the car's own force sensor ends; 0: it has none"),
+    Field("sensor_gain", "1", "relative error of what it says"),
+    Field("sensor_offset", "N", "its zero at the start, at the curve's temperature"),
+    Field("sensor_walk", "N/sqrt(s)", "random walk of that"),
+    Field("sensor_per_K", "N/K", "its drift with the caliper's temperature"),
+    Field("sensor_noise", "N", "white noise of one value"),
 )
 
 PLANT = np.dtype(
@@ -228,6 +235,8 @@ PLANT_STATE = np.dtype(
         ("current_history", "f8", (HISTORY,)),
         ("history_at", "i8"),
         ("angle_reading", "f8"),
+        # What the force sensor's zero has walked, N.
+        ("sensor_zero", "f8"),
         # Energy balance.
         *fields("f8", "motor_work friction_loss clamp_work friction_heat heat_lost"),
     ],
@@ -260,7 +269,7 @@ CAR = np.dtype(
         *fields("f8", "mass wheel_radius drag rolling acceleration supply_voltage"),
         # s; messages leave up to this late after their sample.
         ("jitter", "f8"),
-        ("counter", "i8", (15,)),
+        ("counter", "i8", (SLOTS,)),
         ("reference", "?"),
     ],
     align=True,

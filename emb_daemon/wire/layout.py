@@ -17,10 +17,10 @@ from emb_daemon.wire.units import conversion
 
 CORNERS = ("FL", "FR", "RL", "RR")
 
-RESOLVER, CURRENT, THERMOCOUPLE = 0, 1, 2
-CORNER_MESSAGES = 3
-WHEEL_SPEED, WHEEL_PULSE, VEHICLE_STATUS = 12, 13, 14
-SLOTS = 15
+RESOLVER, CURRENT, THERMOCOUPLE, FORCE_SENSOR = 0, 1, 2, 3
+CORNER_MESSAGES = 4
+WHEEL_SPEED, WHEEL_PULSE, VEHICLE_STATUS = 16, 17, 18
+SLOTS = 19
 SIGNALS = 4
 
 FOREIGN = -1
@@ -29,13 +29,17 @@ OURS = -2
 MOTOR_ANGLE, MOTOR_SPEED = 0, 1
 CURRENT_Q = 0
 INNER_BACKPLATE, OUTER_BACKPLATE, CALIPER = 0, 1, 2
+SENSOR_FORCE = 0
 PARK_BRAKE, BRAKE_REQUEST, AMBIENT, VEHICLE_SPEED = 0, 1, 2, 3
 
 _RECEIVED = {
     "EMB_{}_Resolver": (RESOLVER, ("MotorAngle", "MotorSpeed")),
     "EMB_{}_Current": (CURRENT, ("CurrentQ", "CurrentD", "DcBusVoltage")),
     "EMB_{}_Thermocouple": (THERMOCOUPLE, ("InnerBackplateTemp", "OuterBackplateTemp", "CaliperTemp")),
+    "EMB_{}_ForceSensor": (FORCE_SENSOR, ("SensorForce",)),
 }
+#: By the last word of its name: a message that a DBC may be without.
+OPTIONAL = ("ForceSensor",)
 _VEHICLE = {
     "VEH_WheelSpeed": (WHEEL_SPEED, tuple(f"WheelSpeed{c}" for c in CORNERS)),
     "VEH_WheelPulse": (WHEEL_PULSE, tuple(f"WheelPulse{c}" for c in CORNERS)),
@@ -53,7 +57,7 @@ SENT_SIGNALS = 7
 #: Where AUTOSAR E2E profile 1A has its fields: first bit and length.
 _HEADER = {"CRC": (0, 8), "Counter": (8, 4), "Status": (12, 4)}
 #: Messages by whose Counter the estimator counts cycles.
-_EVERY_CYCLE = ("_Resolver", "_Current", "_ClampForce")
+_EVERY_CYCLE = ("_Resolver", "_Current", "_ForceSensor", "_ClampForce")
 
 SIGNAL = np.dtype(
     [("start", "i8"), ("length", "i8"), ("signed", "i8"), ("factor", "f8"), ("offset", "f8"), ("low", "f8"), ("high", "f8")],
@@ -221,10 +225,13 @@ def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) ->
         count_of[where] = len(names)
         return found
 
-    received = {template.format(corner): (3 * index + kind, names)
+    received = {template.format(corner): (CORNER_MESSAGES * index + kind, names)
                 for index, corner in enumerate(CORNERS) if corner in corners
                 for template, (kind, names) in _RECEIVED.items()} | _VEHICLE  # fmt: skip
+    known = {message.name for message in database.messages}
     for message, (slot, names) in received.items():
+        if message not in known and message.endswith(OPTIONAL):
+            continue
         if found := fill(message, names, record["received"], record["received_count"], slot):
             record["slot"][found.frame_id] = slot
             record["cycle_ns"][slot] = found.cycle_time * 1_000_000

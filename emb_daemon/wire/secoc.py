@@ -31,7 +31,7 @@ from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, crc
 from emb_daemon.wire.frames import FRAME, UNAUTHENTIC
-from emb_daemon.wire.layout import CORNERS, load_database
+from emb_daemon.wire.layout import CORNERS, OPTIONAL, load_database
 
 #: The 16 bytes of a message's AES-128-CMAC, under one sender's key.
 Mac = Callable[[bytes], bytes]
@@ -57,7 +57,7 @@ _MOST_TRIES = 32
 
 #: Messages that a sender authenticates, set by set, by the name of its authentication message.
 _RECEIVED = {
-    "EMB_{}_Auth": (("EMB_{}_Resolver", "EMB_{}_Current"), ("EMB_{}_Thermocouple",)),
+    "EMB_{}_Auth": (("EMB_{}_Resolver", "EMB_{}_Current"), ("EMB_{}_Thermocouple",), ("EMB_{}_ForceSensor",)),
     "VEH_Auth": (("VEH_WheelSpeed",), ("VEH_WheelPulse",), ("VEH_Status",)),
 }
 _SENT = {
@@ -106,7 +106,10 @@ def load_links(path: Path | None = None, corners: Iterable[str] = CORNERS) -> tu
 
     def link(template: str, sets, corner: str) -> Link:
         name = template.format(corner)
-        ids = tuple(tuple(id_of(message.format(corner)) for message in messages) for messages in sets)
+        names = [[message.format(corner) for message in messages] for messages in sets]
+        # Optional messages are the last of their table.
+        there = [messages for messages in names if messages[0] in known or not messages[0].endswith(OPTIONAL)]
+        ids = tuple(tuple(map(id_of, messages)) for messages in there)
         freshness = name.removesuffix("Auth") + "Freshness"
         return Link(name, corner, id_of(name, _AUTHENTICATION), id_of(freshness, _FRESHNESS), ids)
 
