@@ -1,20 +1,23 @@
 """The judge of the study of silent errors: each promise is kept by an honest estimate and broken by a lie of its own kind."""
 
+import msgspec
 import numpy as np
 import pytest
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.estimator.records import ESTIMATE
 from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.records import FORCE
 from emb_daemon.plant.scenarios import rest, simulate_log
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RESULT_ACCEPTED, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies.faults import FAMILIES, Size, _alter, _lose
+from studies.faults import FAMILIES, Size, _alter, _lose, size_of
 from studies.grid import draw_drive, drive
 from studies.phases import first_flag_s, judge
+from studies.silent import main
 
 TIME_S = 0.004 * np.arange(5000)
 FORCE_N = 5000.0 + 4000.0 * np.sin(TIME_S)
@@ -163,3 +166,23 @@ def test_pads_that_have_moved_are_where_the_training_stroke_found_them():
     after = slice(accepted + 1, accepted + 500)
     assert force_N[after].max() > 12e3
     assert np.abs(estimates["force"] - force_N)[after].max() < 1500.0
+
+
+def test_another_brake_has_its_share_of_forces_and_of_sizes(plant):
+    own, half = (draw_drive(plant, np.random.default_rng(1), share=share) for share in (1.0, 0.5))
+    forces = own[0].commands["mode"] == FORCE
+    assert np.array_equal(half[0].commands["target"][forces], 0.5 * own[0].commands["target"][forces])
+    assert half[1] == own[1]
+    sizes = [FAMILIES["current_offset"](np.random.default_rng(2), own[1], size).size for size in (Size(), Size(current=0.5))]
+    assert float(sizes[1].split()[0]) == pytest.approx(0.5 * float(sizes[0].split()[0]), abs=0.01)
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    constant = 2.0 * calibration.motor.torque_constant_Nm_per_A
+    motor = msgspec.structs.replace(calibration.motor, torque_constant_Nm_per_A=constant)
+    assert size_of(msgspec.structs.replace(calibration, motor=motor), calibration) == Size(1.0, 0.5, 1.0)
+
+
+def test_a_stranger_that_is_not_there_is_one_line(tmp_path, capsys):
+    assert main(["grid", "--stranger", str(tmp_path / "7")]) == 2
+    (tmp_path / "c.yaml").write_text(resource("config/calibration.yaml").read_text())
+    assert main(["grid", "--stranger", str(tmp_path)]) == 2
+    assert all(len(line) > 20 for line in capsys.readouterr().err.splitlines())
