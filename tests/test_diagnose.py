@@ -682,8 +682,8 @@ def test_of_what_logs_cannot_tell_apart_what_is_too_large_is_not_it(coupled, mon
     monkeypatch.setattr(prospects, "enumerate_forms", some)
     found = Search.prospects
 
-    def two(search):
-        first, second, *_ = found(search)
+    def two(search, floor):
+        first, second, *_ = found(search, floor)
         gain = share * first.evidence.gain
         return [first, dataclasses.replace(second, evidence=dataclasses.replace(second.evidence, gain=gain))]
 
