@@ -94,7 +94,7 @@ def test_bounds_and_units():
     assert dimensionless == {
         "presliding", "stiffness_relative", "torque_relative", "torque_lasting", "inner_heat_share", "outer_heat_share",
         "coefficient", "share", "coverage", "residual_ratio", "curve_change", "friction_change", "maximum_friction_share",
-        "pairs_difference", "torque_constant_relative",
+        "pairs_difference", "torque_constant_relative", "gain_relative",
     }  # fmt: skip
 
 
