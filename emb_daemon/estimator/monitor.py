@@ -1,8 +1,8 @@
 """An independent monitor: bounds on the clamp force from motor current and direction of motion alone.
 
 It shares no state and nothing learned with the filter, and of the calibration it takes what a datasheet states: torque
-constant, gear, friction with what effects add to it, largest force. Each is allowed to be wrong by the bounds below. Over
-torque smoothed for `SMOOTHED_S`, less what accelerates the motor,
+constant, gear, friction, largest force. Each is allowed to be wrong by the bounds below. What effects add to the friction,
+which may follow the estimated force, only widens them. Over torque smoothed for `SMOOTHED_S`, less what accelerates the motor,
 
     lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
 
