@@ -559,9 +559,10 @@ def test_whether_something_matters_can_be_written_as_json():
     assert limit == pytest.approx(60.0) and json.dumps(limit <= 70.0) == "true"
 
 
-@pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (9.0, None)])
+@pytest.mark.parametrize(("ruined", "log"), [(160.0, "warm.log"), (140.0, None), (40.0, None), (9.0, None)])
 def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
-    """By half as much again, and by what matters: an error that was small may have grown to one that still is."""
+    """By half as much again, by what matters, and by more than is gained: an error that was small may have grown to one that
+    still is."""
     trials = [
         SimpleNamespace(log=SimpleNamespace(samples=range(n), path=Path(name)))
         for n, name in ((900, "cold.log"), (100, "warm.log"))

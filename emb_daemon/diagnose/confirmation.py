@@ -115,18 +115,20 @@ def _own_harm(selection: Selection, before: Mapping[str, np.ndarray]) -> tuple[s
 
 def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: np.ndarray) -> tuple[slice, str] | None:
     """Rows in which a path's residual is no better than before: all of them, or those of the log where it has risen most, if
-    that is clear and by what matters; and what became of it. What many logs gain does not outweigh what one shows to be
-    wrong: a torque constant that is low where the motor is warm may hide in an inertia that is too small."""
+    that is clear, by what matters, and by more than it has fallen over all logs; and what became of it. A torque constant that
+    is low where the motor is warm may hide in an inertia that is too small, which other logs then show. A large gain may cost
+    a log that had hardly any error a little: such a log is no evidence against it."""
     first, last = rmse(before), rmse(after)
-    if last >= first:
+    gained = first**2 - last**2
+    if gained <= 0.0:
         return slice(None), f"what is left of the {channel} path goes from {first:.4g} to {last:.4g} N"
     bench, floor = selection.model.bench, selection.screening.floor(selection.model, channel)
     ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])
     logs = [slice(end - len(trial.log.samples), end) for trial, end in zip(bench.trials, ends, strict=True)]
     pairs = [(rmse(before[rows]), rmse(after[rows])) for rows in logs]
-    worst = int(np.argmax([last / first if first > 0.0 else 0.0 for first, last in pairs]))
+    worst = int(np.argmax([last**2 - first**2 for first, last in pairs]))
     first, last = pairs[worst]
-    if last <= _LOG_HARM * first or last**2 - first**2 < floor**2:
+    if last <= _LOG_HARM * first or last**2 - first**2 < max(floor**2, gained):
         return None
     name = bench.trials[worst].log.path.name
     return logs[worst], f"what is left of the {channel} path on {name} goes from {first:.4g} to {last:.4g} N"
