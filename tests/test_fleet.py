@@ -107,6 +107,24 @@ def test_a_damaged_drive_of_the_data_set_is_an_error_with_its_name(tmp_path, log
         dataset.read_drive(tmp_path, drive)
 
 
+def test_a_data_set_from_before_force_sensors_is_read_as_one_without(tmp_path, logs):
+    import pyarrow.parquet
+
+    _ingested(tmp_path, logs / "car0")
+    drive = dataset.drives(tmp_path)[0]
+    [path] = (tmp_path / "drives").rglob(f"{drive.digest}.parquet")
+    samples = dataset.read_drive(tmp_path, drive)[0].samples
+    table = pyarrow.parquet.ParquetFile(path).read()
+    pyarrow.parquet.write_table(table.drop_columns(["sensor_force", "has_sensor_force"]), path)
+    again = dataset.read_drive(tmp_path, drive)[0].samples
+    for name in set(samples.dtype.names) - {"sensor_force"}:
+        np.testing.assert_array_equal(again[name], samples[name])
+    assert not again["has_sensor_force"].any()
+    pyarrow.parquet.write_table(table.drop_columns(["angle"]), path)
+    with pytest.raises(InputError, match="angle"):
+        dataset.read_drive(tmp_path, drive)
+
+
 @pytest.mark.parametrize("pattern", ["(", "(?P<car>.)", "(?P<unit>nowhere)"])
 def test_a_pattern_that_finds_no_unit_is_refused(tmp_path, logs, pattern):
     with pytest.raises(InputError, match="--unit"):

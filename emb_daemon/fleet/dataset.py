@@ -29,6 +29,8 @@ from emb_daemon.wire.frames import FRAME
 DIGEST = 16
 _FORMAT, _KEY = 1, b"emb_daemon"
 _FORCE = "clamp_force_ref_N"
+#: Columns that data sets of format 1 need not have: those of before force sensors were read. Zero says that none was heard.
+_OPTIONAL = {"sensor_force", "has_sensor_force"}
 
 
 @dataclass(frozen=True, order=True)
@@ -117,7 +119,8 @@ def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
         described = json.loads(table.schema.metadata[_KEY])
         samples = np.zeros(len(table), SAMPLE)
         for name in SAMPLE.names:
-            samples[name] = table.column(name).to_numpy()
+            if name not in _OPTIONAL or name in table.column_names:
+                samples[name] = table.column(name).to_numpy()
         force = table.column(_FORCE).to_numpy() if _FORCE in table.column_names else np.full(len(samples), np.nan)
     except (OSError, KeyError, TypeError, ValueError, pyarrow.ArrowException) as error:
         raise InputError(f"{path}: not a drive of this data set: {error}") from None
