@@ -20,6 +20,8 @@ from emb_daemon.estimator.records import PARAMETERS, new_state
 
 SHIPPED = adaptkit.shipped()
 LEARNED = np.ones(1, PARAMETERS)[0]
+REACHED = new_state()[0]
+REACHED["force"] = 5.0
 
 
 @pytest.fixture
@@ -32,8 +34,9 @@ def test_an_evaluation_counts_for_the_training_that_asked_for_it_while_it_waits(
     adapter["generation"] = 3
     for phase, generation, taken in ((r.EVALUATING, 2, False), (r.IDLE, 3, False), (r.EVALUATING, 3, True)):
         adapter["phase"] = phase
-        adaptation._take_evaluation(0, generation, Evaluation(r.ACCEPTED, contact_angle=7.0), LEARNED)
+        adaptation._take_evaluation(0, generation, Evaluation(r.ACCEPTED, contact_angle=7.0), LEARNED, REACHED)
         assert adapter["evaluation_ready"] == taken and (adaptation.learned[0] == LEARNED) == taken
+        assert (adaptation.reached[0]["force"] == 5.0) == taken
     assert adapter["contact_angle"] == 7.0
 
 
@@ -70,7 +73,7 @@ def test_an_accepted_evaluation_alone_puts_values_in_use(adaptation, monkeypatch
     )
     calibration = moved(SHIPPED, {"contact.walk_rad_per_sqrt_s": 0.02})
     adaptation._evaluate(0, 5, np.zeros(1, r.TRAINING), SHIPPED, calibration, new_state()[0], 1.5, 0.0)
-    corner, generation, evaluation, learned = adaptation._done.get()
+    corner, generation, evaluation, learned, _ = adaptation._done.get()
     expected = moved(SHIPPED, values | ({CLEARANCE: clearance} if taken else {})) if outcome == r.ACCEPTED else calibration
     assert (corner, generation) == (0, 5) and (CLEARANCE in evaluation.values) == taken
     assert learned == to_parameters(expected)
@@ -90,10 +93,14 @@ def test_what_is_handed_over_the_loop_no_longer_changes(adaptation):
     handed, adapter, state = [], adaptation.adapters[0], new_state()[0]
     adaptation._do = lambda job, *arguments: handed.append(arguments)
     adapter["evaluation_wanted"], state["force"] = True, 1.0
+    # What effects remembered when the training began; since then they have gone on.
+    adaptation._remembered[0]["second_relaxation"]["force"] = 3.0
+    state["effects"]["second_relaxation"]["force"] = 4.0
     adaptation._attend(0, adapter, state, to_parameters(SHIPPED))
     state["force"] = 2.0
     [arguments] = handed
     assert arguments[5]["force"] == 1.0 and not adapter["evaluation_wanted"]
+    assert arguments[5]["effects"]["second_relaxation"]["force"] == 3.0
 
 
 def test_a_job_that_fails_ends_no_other(tmp_path, caplog):

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.fit import compile_fit, fit_training
+from emb_daemon.adapt.fit import compile_fit, fit_training, reach
 from emb_daemon.adapt.learned import Evaluation, with_learned
 from emb_daemon.adapt.memory import Entry, Memory, Store, entry_of, with_entry
 from emb_daemon.adapt.snapshots import Snapshots
@@ -47,6 +47,7 @@ class Adaptation:
         adapters, limits: ADAPTER and LIMITS arrays, shape (4,).
         rows: TRAINING array, shape (4, CAPACITY).
         learned: PARAMETERS array, shape (4,): result of each corner's last accepted evaluation.
+        reached: STATE array, shape (4,): of the path models with these at the end of the training.
     """
 
     def __init__(
@@ -56,7 +57,8 @@ class Adaptation:
         self.limits = np.zeros(4, r.LIMITS)
         self.rows = np.zeros((4, r.CAPACITY), r.TRAINING)
         self.learned = np.zeros(4, PARAMETERS)
-        self._scratch = np.zeros(1, STATE)
+        self.reached = np.zeros(4, STATE)
+        self._remembered = np.zeros(4, r.REMEMBERED)
         self._memory, self._clock, self._threaded = memory, clock, threaded
         self._calibrations: dict[int, Calibration] = {}
         self._stores: dict[int, Store] = {}
@@ -146,8 +148,8 @@ class Adaptation:
             while not self._done.empty():
                 self._take_evaluation(*self._done.get())
             first = answer_adapting(
-                samples, first, count, states, parameters, self.learned, estimates, self.adapters, self.limits, self._scratch,
-                self.rows,
+                samples, first, count, states, parameters, self.learned, self.reached, self._remembered, estimates,
+                self.adapters, self.limits, self.rows,
             )  # fmt: skip
             if any(self.adapters[name].any() for name in ("evaluation_wanted", "ended", "snapshot_wanted")):
                 for corner in self._stores:
@@ -181,8 +183,10 @@ class Adaptation:
             adapter["evaluation_wanted"] = False
             rows = self.rows[corner, : int(adapter["training_rows"])]
             # Records are views to which the loop keeps writing, so the helper thread gets copies.
+            state = state.copy()
+            state["effects"] = self._remembered[corner]
             self._do(self._evaluate, corner, int(adapter["generation"]), rows, self._calibrations[corner],
-                     self.in_use(CORNERS[corner]), state.copy(), float(adapter["power_on_angle"]),
+                     self.in_use(CORNERS[corner]), state, float(adapter["power_on_angle"]),
                      float(adapter["factor_sigma"]))  # fmt: skip
 
     def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
@@ -210,11 +214,13 @@ class Adaptation:
             store = self._stores[corner] = with_entry(self._stores[corner], entry)
         self._do(self._write, CORNERS[corner], outcome, evaluation.note if store else "", store)
 
-    def _take_evaluation(self, corner: int, generation: int, evaluation: Evaluation, learned: np.void) -> None:
+    def _take_evaluation(
+        self, corner: int, generation: int, evaluation: Evaluation, learned: np.void, reached: np.void
+    ) -> None:
         adapter = self.adapters[corner]
         if adapter["phase"] != r.EVALUATING or adapter["generation"] != generation:
             return
-        self._evaluations[corner], self.learned[corner] = evaluation, learned
+        self._evaluations[corner], self.learned[corner], self.reached[corner] = evaluation, learned, reached
         adapter["evaluation"], adapter["evaluation_ready"] = evaluation.outcome, True
         for name in r.FOUND:
             adapter[name] = getattr(evaluation, name)
@@ -258,7 +264,8 @@ class Adaptation:
             evaluation.values[CLEARANCE] = clearance
         accepted = evaluation.outcome == r.ACCEPTED
         learned = to_parameters(with_learned(base, evaluation.values) if accepted else calibration)
-        self._done.put((corner, generation, evaluation, learned))
+        reached = reach(rows, state, evaluation.contact_angle, learned) if accepted else state
+        self._done.put((corner, generation, evaluation, learned, reached))
 
     def _write(self, corner: str, outcome: int, note: str, store: Store | None) -> None:
         words = {"corner": corner, "outcome": r.OUTCOMES[outcome] + (f" ({note})" if note else "")}

@@ -42,7 +42,7 @@ from emb_daemon.calibration.parameters import (
     value_of,
 )
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
+from emb_daemon.estimator.paths import begin_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S
 from emb_daemon.jit import Array, entry, njit
@@ -96,13 +96,24 @@ def unexplained_step(s, p, row):
 
 @entry(Array(STATE), Array(PARAMETERS), Array(r.TRAINING), Array(np.float64), Array(np.float64))
 def _run(states, parameters, rows, residual, force):
-    """`unexplained_step` and stiffness force (N) at each row, both settled at the first, whose residual is NaN."""
+    """`unexplained_step` and stiffness force (N) at each row. At the first, whose residual is NaN, the motor stands, and
+    effects remember what they do in ``states``, shape (1,)."""
     s, p = states[0], parameters[0]
-    settle_paths(s, p, rows[0], rows[0].factor)
+    begin_paths(s, p, rows[0], rows[0].factor)
     residual[0], force[0] = np.nan, s.force
     for i in range(1, len(rows)):
         residual[i] = unexplained_step(s, p, rows[i])
         force[i] = s.force
+
+
+def reach(rows, state, contact_angle, learned):
+    """STATE of the path models at the last of ``rows`` with the ``learned`` PARAMETERS and contact angle (rad).
+
+    ``state``: as in `fit_training`."""
+    reached = np.atleast_1d(state.copy())
+    reached["contact_angle"] = contact_angle
+    _run(reached, np.atleast_1d(learned), rows, *np.zeros((2, len(rows))))
+    return reached[0]
 
 
 class _Training:
@@ -113,7 +124,7 @@ class _Training:
     Args:
         rows: TRAINING array, the samples in order.
         calibration: in use until now.
-        state: STATE record of the estimator at its end.
+        state: STATE record, as in `fit_training`.
     """
 
     def __init__(self, rows, calibration, state, scale):
@@ -373,7 +384,7 @@ def fit_training(rows, calibration, base, state, factor_sigma=0.0):
     Args:
         rows: TRAINING array, the samples in order.
         calibration, base: the one in use until now, and the one of the file.
-        state: STATE record, the estimator's at the end of the training.
+        state: STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning.
         factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
 
     Returns:

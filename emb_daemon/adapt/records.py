@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import fields
 
 #: Phases of a corner's adaptation: none; motion is requested; motion without request; a training is being evaluated.
@@ -70,6 +71,9 @@ ADAPTER = np.dtype(
     ],
     align=True,
 )
+
+#: What a calibration's effects remember.
+REMEMBERED = STATE["effects"]
 
 #: Largest number of samples of one training, and number of samples from the end of a training until its outcome takes effect,
 #: at 4 ms. The latter is fixed, so that a replay does the same as the daemon.

@@ -13,7 +13,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
 from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
-from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
+from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, entry, njit
@@ -33,8 +33,6 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
 #: time over which collecting goes on after a full stroke.
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
-#: Rows over which the path models are run up to the moment at which learned values take effect: many time constants.
-_RUN_UP = 700
 #: States of the motor and its current sensor.
 _OF_THE_MOTOR = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
 _BAD = (
@@ -111,7 +109,9 @@ def _begin(a, phase):
 
 
 @njit
-def _collect(a, s, rows, m):
+def _collect(a, s, remembered, rows, m):
+    if a.rows == 0:
+        remembered[0] = s.effects
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
     # The current is the mean of one cycle, and does not belong to the acceleration over a gap.
@@ -170,9 +170,11 @@ def _restart_fitted(x, P):
 
 
 @njit
-def apply_learned(s, p, scratch, rows, learned, a):
-    """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER); run the path
-    models up to the last of ``rows``.
+def apply_learned(s, p, reached, rows, learned, a):
+    """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER).
+
+    The path models go on from ``reached``, the STATE that they have with the learned values at the end of the training
+    (`adapt.fit.reach`), over ``rows``, what has been collected since.
 
     If the curve is unchanged, driving has shown more of contact and stiffness than one stroke. The stroke's contact angle is
     then combined with the filter's by their variances, unless the pads have moved, and the drift hypothesis keeps its odds."""
@@ -182,17 +184,15 @@ def apply_learned(s, p, scratch, rows, learned, a):
         kept = kept and learned.curve[i] == p.curve[i]
     weight = known / (known + a.contact_sigma**2) if kept else 1.0
     scale = s.scale if kept else 1.0
-    first = max(0, len(rows) - _RUN_UP)
-    scratch[0] = s
-    t = scratch[0]
-    t.contact_angle += weight * moved
-    settle_paths(t, learned, rows[first], rows[first].factor)
-    for i in range(first + 1, len(rows)):
-        unexplained_step(t, learned, rows[i])
-    s.contact_angle, s.past_contact = t.contact_angle, t.past_contact
-    s.drive, s.drive_slope, s.force, s.slope = t.drive, t.drive_slope, t.force, t.slope
-    s.friction_state, s.friction_variance, s.slid_angle = t.friction_state, t.friction_variance, t.slid_angle
-    s.effects = t.effects
+    apart = s.contact_angle + weight * moved - reached.contact_angle
+    reached.contact_angle += apart
+    reached.past_contact -= apart
+    for i in range(len(rows)):
+        unexplained_step(reached, learned, rows[i])
+    s.contact_angle, s.past_contact = reached.contact_angle, reached.past_contact
+    s.drive, s.drive_slope, s.force, s.slope = reached.drive, reached.drive_slope, reached.force, reached.slope
+    s.friction_state, s.friction_variance, s.slid_angle = reached.friction_state, reached.friction_variance, reached.slid_angle
+    s.effects = reached.effects
     _restart_fitted(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
     if not kept:
@@ -218,12 +218,12 @@ def apply_learned(s, p, scratch, rows, learned, a):
 
 
 @njit
-def _conclude(a, s, parameters, learned, scratch, rows):
+def _conclude(a, s, parameters, learned, reached, rows):
     """Apply the outcome of an evaluation at its fixed time; ``parameters`` has shape (1,)."""
     if not a.evaluation_ready:
         end_training(a, r.NOT_IN_TIME, e.RESULT_ABORTED)
     elif a.evaluation == r.ACCEPTED:
-        apply_learned(s, parameters[0], scratch, rows[: a.rows], learned, a)
+        apply_learned(s, parameters[0], reached, rows[a.training_rows : a.rows], learned, a)
         parameters[0] = learned
         # Earlier snapshots belong to the values that were in use until now.
         a.snapshot_ns, a.snapshot_wanted = a.time_ns, True
@@ -234,16 +234,17 @@ def _conclude(a, s, parameters, learned, scratch, rows):
 
 
 @njit
-def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
+def observe(a, s, parameters, learned, reached, remembered, limits, others_hold, rows, m, estimate):
     """Advance one corner's adaptation by one estimate, and write its state into the estimate.
 
     Args:
         a: ADAPTER record.
         s: STATE record of the corner.
         parameters: its PARAMETERS, shape (1,); ``learned``: the PARAMETERS record that an accepted evaluation copies there.
+        reached: STATE record that belongs to them, see `apply_learned`.
+        remembered: what the effects of ``s`` remember at the beginning of the training, shape (1,).
         limits: LIMITS record.
         others_hold: whether the other corners hold the car while this corner is opened.
-        scratch: STATE array, shape (1,).
         rows: TRAINING array, shape (CAPACITY,).
         m, estimate: SAMPLE and ESTIMATE; the sample is old if the estimate is a prediction.
     """
@@ -268,7 +269,7 @@ def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, es
             elif a.parked_time >= limits.settling_time and others_hold:
                 _begin(a, r.ASKING)
     else:
-        _advance(a, s, parameters, learned, limits, scratch, rows, m)
+        _advance(a, s, parameters, learned, reached, remembered, limits, rows, m)
     estimate.adapt_request = e.REQUEST_RUN if a.phase == r.ASKING else e.REQUEST_NONE
     estimate.adapt_progress = 100 if a.result == e.RESULT_ACCEPTED else 0
     if a.phase != r.IDLE:
@@ -309,20 +310,20 @@ def _follow(a, s, p, limits, m, estimate):
 
 
 @njit
-def _advance(a, s, parameters, learned, limits, scratch, rows, m):
+def _advance(a, s, parameters, learned, reached, remembered, limits, rows, m):
     """Advance a phase other than idle; no obstacle is present."""
     a.phase_time += m.dt
     if a.phase == r.EVALUATING:
-        _collect(a, s, rows, m)
+        _collect(a, s, remembered, rows, m)
         if a.rows - a.training_rows >= r.EVALUATION_SAMPLES:
-            _conclude(a, s, parameters, learned, scratch, rows)
+            _conclude(a, s, parameters, learned, reached, rows)
         return
     if a.phase == r.ASKING and a.rows == 0 and a.still_time > 0.0:
         if a.phase_time > limits.answer_time:
             a.tried = True
             end_training(a, r.NO_ANSWER, e.RESULT_ABORTED)
         return
-    _collect(a, s, rows, m)
+    _collect(a, s, remembered, rows, m)
     if _stroke(a, limits, m.dt):
         a.phase, a.training_rows, a.evaluation_ready, a.evaluation_wanted = r.EVALUATING, a.rows, False, True
         a.generation += 1
@@ -334,19 +335,22 @@ def _advance(a, s, parameters, learned, limits, scratch, rows, m):
 
 
 @entry(
-    Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(ESTIMATE), Array(r.ADAPTER),
-    Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
+    Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(STATE), Array(r.REMEMBERED),
+    Array(ESTIMATE), Array(r.ADAPTER), Array(r.LIMITS), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
-def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
+def answer_adapting(
+    samples, first, count, states, parameters, learned, reached, remembered, estimates, adapters, limits, rows
+):
     """Estimate samples from row ``first``, with adaptation.
 
-    Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""
+    Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation or has ended."""
     for number in range(first, count):
         m, estimate = samples[number], estimates[number]
         k = m.corner
         answer_row(m, states[k], parameters[k], estimate)
         a, own, hold = adapters[k], parameters[k : k + 1], others_hold(adapters, limits, k, estimate.time_ns)
-        observe(a, states[k], own, learned[k], limits[k], hold, scratch, rows[k], m, estimate)
-        if a.evaluation_wanted:
+        begun = remembered[k : k + 1]
+        observe(a, states[k], own, learned[k], reached[k], begun, limits[k], hold, rows[k], m, estimate)
+        if a.evaluation_wanted or a.ended:
             return number + 1
     return count

@@ -83,12 +83,28 @@ def rest(s, p, x, factor):
 
 
 @njit
-def settle_paths(s, p, m, factor):
-    """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
+def _stand(s, m):
+    """The motor stands at a first sample, and friction is unknown."""
     s.started = True
     s.angle, s.slid_angle, s.speed = m.angle, m.angle, m.speed
     s.friction_state, s.friction_variance = 0.0, 1.0
+
+
+@njit
+def settle_paths(s, p, m, factor):
+    """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
+    _stand(s, m)
     rest(s, p, position(s, p, m), factor)
+
+
+@njit
+def begin_paths(s, p, m, factor):
+    """The same of pads that have not settled: effects go on from what they remember."""
+    _stand(s, m)
+    s.past_contact = position(s, p, m)
+    static, slope = characteristic_curve(s.past_contact, p.curve)
+    s.force = s.drive = effects.static_force(p.effects, s.effects, factor * static, 0.0, 0.0)
+    s.slope = s.drive_slope = factor * slope
 
 
 @njit
