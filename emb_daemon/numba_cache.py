@@ -16,6 +16,7 @@ import numba
 from numba.core import config, event
 
 from emb_daemon.ahead.library import installed_digest, who_else_writes
+from emb_daemon.ahead.signature import Decorator
 
 
 def _cache_root() -> Path:
@@ -64,7 +65,7 @@ def compiled_for_the_next_start() -> bool:
     return _compilations.count > 0 and _private is None
 
 
-def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
+def compile_beside(function: Callable[..., object], work: Callable[[], object]) -> Callable[[], object]:
     """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
 
     Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Returns a
@@ -90,7 +91,7 @@ _private: tempfile.TemporaryDirectory | None = None
 
 config.CACHE_DIR = str(_cache_folder())
 #: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
-njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+njit: Decorator = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
 def depend_on(source: Path) -> None:

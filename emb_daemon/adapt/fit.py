@@ -45,7 +45,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, Record, entry, njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -78,7 +78,7 @@ _LEAST_SAMPLES, _RANGES = 1000, 5
 
 
 @njit
-def unexplained_step(s, p, row):
+def unexplained_step(s: Record, p: Record, row: Record) -> float:
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
     before, speed = s.force, s.speed
     stiffness_path(s, p, row, row.factor)

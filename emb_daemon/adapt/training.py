@@ -16,7 +16,7 @@ from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S, settle_paths
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, Record, Records, entry, njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, GROWTH, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
@@ -77,7 +77,7 @@ def _has_rolled(a, m):
 
 
 @njit
-def others_hold(adapters, limits, k, time_ns):
+def others_hold(adapters: Records, limits: Records, k: int, time_ns: int) -> bool:
     """Whether every other corner that this process estimates holds its parking force, so that the car does not move while
     corner ``k`` is opened. A corner that is being trained, or that sends nothing, does not count as holding."""
     for other in range(len(adapters)):
@@ -89,7 +89,7 @@ def others_hold(adapters, limits, k, time_ns):
 
 
 @njit
-def end_training(a, outcome, result):
+def end_training(a: Record, outcome: int, result: int) -> None:
     """Return to idle and discard everything collected."""
     a.phase = r.IDLE
     a.rows = 0
@@ -170,7 +170,7 @@ def _restart_fitted(x, P):
 
 
 @njit
-def apply_learned(s, p, scratch, rows, learned, a):
+def apply_learned(s: Record, p: Record, scratch: Records, rows: Records, learned: Record, a: Record) -> None:
     """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER); run the path
     models up to the last of ``rows``.
 
@@ -234,7 +234,18 @@ def _conclude(a, s, parameters, learned, scratch, rows):
 
 
 @njit
-def observe(a, s, parameters, learned, limits, others_hold, scratch, rows, m, estimate):
+def observe(
+    a: Record,
+    s: Record,
+    parameters: Records,
+    learned: Record,
+    limits: Record,
+    others_hold: bool,
+    scratch: Records,
+    rows: Records,
+    m: Record,
+    estimate: Record,
+) -> None:
     """Advance one corner's adaptation by one estimate, and write its state into the estimate.
 
     Args:
@@ -337,7 +348,19 @@ def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     Array(SAMPLE), int, int, Array(STATE), Array(PARAMETERS), Array(PARAMETERS), Array(ESTIMATE), Array(r.ADAPTER),
     Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
-def answer_adapting(samples, first, count, states, parameters, learned, estimates, adapters, limits, scratch, rows):
+def answer_adapting(
+    samples: Records,
+    first: int,
+    count: int,
+    states: Records,
+    parameters: Records,
+    learned: Records,
+    estimates: Records,
+    adapters: Records,
+    limits: Records,
+    scratch: Records,
+    rows: Records,
+) -> int:
     """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""

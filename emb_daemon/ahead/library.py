@@ -22,7 +22,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from emb_daemon.ahead.signature import Array, is_group
+from emb_daemon.ahead.signature import Array, Kind, is_group
 from emb_daemon.bounded import read_bounded
 from emb_daemon.errors import InputError
 
@@ -121,7 +121,7 @@ def found() -> Path | None:
     return path if named or path.exists() else None
 
 
-def seal(elf: bytes, **manifest) -> bytes:
+def seal(elf: bytes, **manifest: str | tuple[str, ...]) -> bytes:
     """A library's bytes."""
     return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
 
@@ -212,7 +212,7 @@ class _Words(threading.local):
         self.address = ctypes.c_void_p(ctypes.addressof(self.words))
 
 
-def bind(name: str, takes: tuple, returns: int) -> Callable:
+def bind(name: str, takes: tuple[Kind, ...], returns: int) -> Callable[..., int | tuple[int, ...]]:
     """The library's function ``name``, called like the Python function that it was made from.
 
     An argument that is the same object as in the call before costs nothing: it is still where it was."""

@@ -5,9 +5,18 @@ A signature has one element for each argument: `Array`, a numpy dtype for one re
 address and dimensions, for a record its address, for a number itself.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
+
+
+class Decorator(Protocol):
+    """Leaves the signature of what it decorates as it is."""
+
+    def __call__(self, function: _Function, /) -> _Function: ...
 
 
 class Array(NamedTuple):
@@ -17,21 +26,25 @@ class Array(NamedTuple):
     dimensions: int = 1
 
 
+#: One element of a signature.
+Kind: TypeAlias = "Array | np.dtype | type[int] | type[float] | type[bool] | tuple[Kind, ...]"
+
+
 class Entry(NamedTuple):
     """A function that Python calls: its name in C, the ``function`` itself, what it takes, and how many int64 it returns."""
 
     name: str
-    function: object
-    takes: tuple
+    function: Callable[..., object]
+    takes: tuple[Kind, ...]
     returns: int
 
 
-def is_group(kind) -> bool:
+def is_group(kind: Kind) -> bool:
     """Whether an element of a signature is a named tuple of elements."""
     return isinstance(kind, tuple) and not isinstance(kind, Array)
 
 
-def name_in_c(function) -> str:
+def name_in_c(function: Callable[..., object]) -> str:
     """``emb_pipeline_collect`` for ``emb_daemon.pipeline._collect``."""
     module = function.__module__.removeprefix("emb_daemon.").replace(".", "_")
     return f"emb_{module}_{function.__name__.strip('_')}"

@@ -8,7 +8,7 @@ order of the registry, which compiled code then calls directly. numba keeps it o
 from emb_daemon import effects
 from emb_daemon.effects import terms
 from emb_daemon.effects.base import HOOKS, Hook
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 def _source(name: str, hook: Hook) -> str:
@@ -38,7 +38,7 @@ _WATCHED = any("signals" in effect.arguments for effect in effects.REGISTRY)
 
 
 @njit
-def look(e, s, p, m):
+def look(e: Record, s: Record, p: Record, m: Record) -> None:
     """Signals and amounts of terms at this sample."""
     if _WATCHED or e.count > 0:
         terms.look(e, s, p, m)
@@ -60,31 +60,33 @@ disc_cooling = _compose("disc")
 
 
 @njit
-def static_force(e, s, static, travel, dt):
+def static_force(e: Record, s: Record, static: float, travel: float, dt: float) -> float:
     """Static clamp force (N) with what effects add to it after ``travel`` rad in contact."""
     return force(static * stiffness(e, s, travel, dt), e, s, travel, dt)
 
 
 @njit
-def motor_torque(e, s, m, nominal, travel, mean_speed, disc, disc_known):
+def motor_torque(
+    e: Record, s: Record, m: Record, nominal: float, travel: float, mean_speed: float, disc: float, disc_known: bool
+) -> float:
     """Motor torque (N m) that reaches the gear; ``nominal`` is the torque constant at 25 degC."""
     constant = nominal * torque_constant(e, s, m, disc, disc_known, m.dt)
     return torque(constant * current(m.current_q, e, s, m, m.dt), e, s, m, travel, mean_speed, m.dt)
 
 
 @njit
-def backplates(e, s, inner, outer, dt):
+def backplates(e: Record, s: Record, inner: float, outer: float, dt: float) -> tuple[float, float]:
     """Temperatures (degC) of the backing plates from what their thermocouples show."""
     return backplate(inner, e, s, 0, dt), backplate(outer, e, s, 1, dt)
 
 
 @njit
-def thickness_sigma(s):
+def thickness_sigma(s: Record) -> float:
     """Standard deviation (m) of the disc's thickness where its phase is not known."""
     return s.disc_thickness_variation.sigma
 
 
 @njit
-def known_delay(e):
+def known_delay(e: Record) -> float:
     """Age of the motor angle (s) that the calibration knows."""
     return e.signal_delay.delay_s

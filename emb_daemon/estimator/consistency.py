@@ -10,7 +10,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Horizons over which the innovation is smoothed, s, and time over which its square is averaged, s.
 HORIZONS_S = (0.05, 0.2, 1.0)
@@ -41,7 +41,7 @@ CONSISTENCY = np.dtype(
 
 
 @njit
-def remember(c, innovation, sigma, dt):
+def remember(c: Record, innovation: float, sigma: float, dt: float) -> None:
     """Take one innovation and its standard deviation."""
     c.seen_s += dt
     for i in range(HORIZONS):
@@ -54,7 +54,7 @@ def remember(c, innovation, sigma, dt):
 
 
 @njit
-def forget(c):
+def forget(c: Record) -> None:
     """Begin anew: what was left unexplained has been explained."""
     c.seen_s = 0.0
     for i in range(HORIZONS):
@@ -62,7 +62,7 @@ def forget(c):
 
 
 @njit
-def judge(c, horizon):
+def judge(c: Record, horizon: int) -> int:
     """UNKNOWN before enough evidence, CONSISTENT or INCONSISTENT."""
     if c.seen_s < 0.5 * _AVERAGED_S[horizon]:
         return UNKNOWN
@@ -70,7 +70,7 @@ def judge(c, horizon):
 
 
 @njit
-def model_error(c):
+def model_error(c: Record) -> float:
     """Standard deviation (the innovation's unit) of what is left beyond noise; 0 where all that can be judged is noise."""
     worst = 0.0
     for i in range(HORIZONS):

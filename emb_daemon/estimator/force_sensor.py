@@ -29,7 +29,7 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.uneven import applied
 from emb_daemon.estimator.unknown import add_stiffness_jumps
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Floats, Record, fields, njit
 from emb_daemon.models.fusion import CONTACT, FAST, GROWTH, SCALE, maximum_likelihood, update_errors, variance_along
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.models.stiffness import characteristic_curve
@@ -211,7 +211,7 @@ def _open_wider(s, p):
 
 
 @njit
-def hear_sensor(s, p, m, h, spread, warmth, force_before):
+def hear_sensor(s: Record, p: Record, m: Record, h: Floats, spread: float, warmth: float, force_before: float) -> None:
     """Take one sample's value into all hypotheses, or into the sensor's zero where the pads do not touch; ``h``: scratch,
     ``force_before`` N of the stiffness path at the last sample."""
     c, q = s.sensor, p.sensor
@@ -254,7 +254,7 @@ def hear_sensor(s, p, m, h, spread, warmth, force_before):
 
 
 @njit
-def with_sensor(c, force, sigma):
+def with_sensor(c: Record, force: float, sigma: float) -> tuple[float, float]:
     """A force and its standard deviation (N) that do without the angle, with what the sensor says now."""
     if c.sigma == inf:
         return force, sigma

@@ -8,7 +8,7 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
@@ -135,7 +135,7 @@ def _flow(s, t, e, m):
 
 
 @njit
-def heat(s, p, m):
+def heat(s: Record, p: Record, m: Record) -> None:
     """Pads and disc up to this sample, heated by what the last estimate says.
 
     A conduction step costs more than all the rest: one serves several samples, as long as the pads' contact stays the same.
@@ -177,7 +177,7 @@ def heat(s, p, m):
 
 
 @njit
-def tell(s, out):
+def tell(s: Record, out: Record) -> None:
     known = s.temperature_known
     for side in range(2):
         out.surface[side] = s.pads[side, 0] if known else np.nan

@@ -19,7 +19,7 @@ from math import exp
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 from emb_daemon.models.gear import most_of_spring, steepest
 
 #: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
@@ -44,7 +44,7 @@ MONITOR = np.dtype([("started", "?"), *fields("f8", "torque speed low high force
 
 
 @njit
-def bound(w, p, m, friction=1.0):
+def bound(w: Record, p: Record, m: Record, friction: float = 1.0) -> None:
     """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``; gear ``friction`` over theirs as the
     calibration's effects have it, of which no less than theirs is believed."""
     if not m.has_current:
@@ -78,7 +78,7 @@ def bound(w, p, m, friction=1.0):
 
 
 @njit
-def contradicts(w, force, sigma, dt):
+def contradicts(w: Record, force: float, sigma: float, dt: float) -> bool:
     """Whether ``force`` (N) has lain outside the bounds by more than three of its ``sigma`` for longer than tolerated.
 
     It is smoothed as the torque is, which lags behind in a long stroke."""

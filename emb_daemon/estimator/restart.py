@@ -20,7 +20,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     set_priors,
 )
-from emb_daemon.jit import entry, njit
+from emb_daemon.jit import Record, entry, njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
 from emb_daemon.wire.contract import CYCLE_S
@@ -66,7 +66,7 @@ def _copy_pads(to, pads):
 
 
 @entry(STATE, PARAMETERS, SNAPSHOT, returns=1)
-def take_snapshot(s, p, snapshot):
+def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or uncertain."""
     if not s.started or s.unknown or s.contact.lost:
         return False
@@ -112,7 +112,7 @@ def why_implausible(snapshot, p) -> str:
 
 
 @entry(STATE, PARAMETERS, SNAPSHOT, float)
-def resume(s, p, snapshot, elapsed_s):
+def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
 
     Its first sample then starts it as ever, but from these values."""
@@ -138,7 +138,7 @@ def resume(s, p, snapshot, elapsed_s):
 
 
 @njit
-def follow_heat(s, t, m):
+def follow_heat(s: Record, t: Record, m: Record) -> None:
     """Let the heat of a snapshot flow for the time that has passed since, between the plates as they are now."""
     ambient = m.ambient if m.has_status else m.caliper
     if s.rested_s > 0.0:

@@ -12,7 +12,7 @@ from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.stiffness import first_order_lag
 from emb_daemon.models.wheel import TURNING_RAD_PER_S, WHEEL, track
 
@@ -106,7 +106,7 @@ def _wheel_angle(u, m):
 
 
 @njit
-def turn(u, m, slope, gear_gain, relaxation_time):
+def turn(u: Record, m: Record, slope: float, gear_gain: float, relaxation_time: float) -> None:
     """Advance by one sample: what each amplitude does to the force. ``slope`` N/rad of the static force."""
     if not u.known:
         u.log_odds = _PRIOR_ODDS
@@ -130,7 +130,7 @@ def turn(u, m, slope, gear_gain, relaxation_time):
 
 
 @njit
-def applied(u):
+def applied(u: Record) -> float:
     """What the fused force follows of it, N."""
     return u.share * u.shift
 
@@ -157,7 +157,7 @@ def _weigh(u, leverage, without, variance):
 
 
 @njit
-def learn(u, leverage, without, variance, dt):
+def learn(u: Record, leverage: float, without: float, variance: float, dt: float) -> None:
     """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt``
     s of motion."""
     u.stroke_s += dt
@@ -181,7 +181,7 @@ def learn(u, leverage, without, variance, dt):
 
 
 @njit
-def force_sigma(u):
+def force_sigma(u: Record) -> float:
     """Standard deviation (N) that it leaves in the fused force."""
     variance = (1.0 - u.share) * u.shift * u.shift
     for i in range(STATES):
@@ -191,7 +191,7 @@ def force_sigma(u):
 
 
 @njit
-def unproven(u):
+def unproven(u: Record) -> float:
     """How far apart the force with and without such a disc are over a turn, N, times the probability of the less likely."""
     crest = 0.0
     for k in range(0, STATES, 2):

@@ -4,7 +4,7 @@ from math import exp, pi
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
@@ -34,7 +34,7 @@ WHEEL = np.dtype(
 
 
 @njit
-def disc_speed(w, m):
+def disc_speed(w: Record, m: Record) -> tuple[float, float]:
     """Speed of the disc (rad/s) and its standard deviation; NaN and infinity where nothing tells.
 
     Args:

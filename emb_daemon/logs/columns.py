@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.jit import njit
+from emb_daemon.jit import Booleans, Records, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import crc
@@ -38,7 +38,7 @@ def _decode(frames, rows, signals, values):
 
 
 @njit
-def crc_is_right(frames):
+def crc_is_right(frames: Records) -> Booleans:
     """Of each FRAME row, as an E2E protected message, shape (n,)."""
     right = np.empty(len(frames), np.bool_)
     for row in range(len(frames)):

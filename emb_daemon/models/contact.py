@@ -11,7 +11,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
 #: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
 #: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``early``: what was above it, N m, in the
@@ -52,7 +52,7 @@ _CERTAIN = 4.0
 
 
 @njit
-def threshold(current_share, correlation_time, dt):
+def threshold(current_share: float, correlation_time: float, dt: float) -> float:
     """Alarm threshold of the sums for noise of which ``current_share`` of the variance is correlated over
     ``correlation_time``: the sum of correlated noise wanders further (Siegmund, Sequential Analysis, 1985, ch. 2)."""
     rho = exp(-dt / correlation_time)
@@ -61,7 +61,7 @@ def threshold(current_share, correlation_time, dt):
 
 
 @njit
-def engaged(state, x, contact_sigma):
+def engaged(state: Record, x: float, contact_sigma: float) -> bool:
     """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; keeps what it said
     last while that is open."""
     if x > _CERTAIN * contact_sigma:
@@ -72,7 +72,18 @@ def engaged(state, x, contact_sigma):
 
 
 @njit
-def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, contact_sigma, offset=0.0, offset_sigma=0.0):
+def watch_closing(
+    state: Record,
+    torque: float,
+    predicted: float,
+    friction_mean: float,
+    sigma: float,
+    limit: float,
+    x: float,
+    contact_sigma: float,
+    offset: float = 0.0,
+    offset_sigma: float = 0.0,
+) -> int:
     """Compare torque with belief for one sample.
 
     Args:
@@ -127,7 +138,7 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
 
 
 @njit
-def clearance_level(state, sigma, offset, offset_sigma):
+def clearance_level(state: Record, sigma: float, offset: float, offset_sigma: float) -> tuple[float, float]:
     """Torque in the clearance and its standard deviation, N m: as the clearance showed it to samples of standard deviation
     ``sigma``, or else as the filter believes."""
     if state.samples < _SHOWN:
@@ -136,27 +147,27 @@ def clearance_level(state, sigma, offset, offset_sigma):
 
 
 @njit
-def forget_level(state):
+def forget_level(state: Record) -> None:
     """The clearance level is another now: the offset of the torque has changed."""
     state.level = state.samples = 0.0
 
 
 @njit
-def start_anew(state):
+def start_anew(state: Record) -> None:
     """Forget what was summed: another contact angle is now believed."""
     state.lost, state.confirmed, state.agreed = True, False, 0
     state.rise = state.shortfall = state.excess = state.watched = 0.0
 
 
 @njit
-def clearly_above(state, sigma):
+def clearly_above(state: Record, sigma: float) -> float:
     """Smoothed excess (N m) that noise of standard deviation ``sigma`` per sample does not reach; infinite before the first
     sample."""
     return 5.0 * sigma / sqrt(state.watched) if state.watched > 0.0 else np.inf
 
 
 @njit
-def torque_sigma(current_torque, speed_torque):
+def torque_sigma(current_torque: float, speed_torque: float) -> tuple[float, float]:
     """Standard deviation of one sample's torque from noise of current and of both speeds, N m, and the current's share."""
     variance = current_torque * current_torque + 2.0 * speed_torque * speed_torque
     return sqrt(variance), current_torque * current_torque / variance

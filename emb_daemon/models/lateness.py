@@ -10,7 +10,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
 #: Time over which angle and speed are followed, s: that of a stroke, over which neither an offset of the speed nor a slip of
 #: the resolver adds up. Time over which what they said is kept, s: some stops.
@@ -36,7 +36,7 @@ LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age gain"), 
 
 
 @njit
-def follow(a, travel, turned, gained, dt):
+def follow(a: Record, travel: float, turned: float, gained: float, dt: float) -> None:
     """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s."""
     keep = exp(-dt / _FOLLOWED_S)
     a.apart = keep * a.apart + travel - turned
@@ -59,6 +59,6 @@ def follow(a, travel, turned, gained, dt):
 
 
 @njit
-def interrupt(a):
+def interrupt(a: Record) -> None:
     """A sample was missing or was no motion."""
     a.apart = a.gained = a.gone = 0.0

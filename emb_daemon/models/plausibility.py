@@ -16,7 +16,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
@@ -77,7 +77,9 @@ _AVERAGED_S = 0.04
 
 
 @njit
-def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
+def watch(
+    c: Record, m: Record, angle_before: float, speed_before: float, past_contact: float, contact_sigma: float, confirmed: bool
+) -> int:
     """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is of those before.
 
     Args:
@@ -136,13 +138,15 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
 
 
 @njit
-def frozen(c):
+def frozen(c: Record) -> bool:
     """Whether one sensor repeats itself while the other goes on: then their difference tells nothing of the contact angle."""
     return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
 
 
 @njit
-def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_friction):
+def beyond_friction(
+    torque: float, force: float, sigma: float, gear_gain: float, load_friction: float, offset_friction: float
+) -> float:
     """Torque (N m) that neither the clamp force ``force`` (N) nor friction at rest can carry, in units of its standard
     deviation ``sigma``: where it is not zero, the motor turns."""
     band = (1.0 + _STICTION) * (offset_friction + load_friction * force)
@@ -150,7 +154,7 @@ def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_frict
 
 
 @njit
-def stands(c, angle):
+def stands(c: Record, angle: float) -> bool:
     """Whether the motor angle ``angle``, rad, stands."""
     if abs(angle - c.held_angle) <= _STANDS_RAD:
         c.held += 1
@@ -162,7 +166,15 @@ def stands(c, angle):
 
 
 @njit
-def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_angle):
+def hold(
+    c: Record,
+    force: float,
+    sigma: float,
+    gear_gain: float,
+    load_friction: float,
+    offset_friction: float,
+    presliding_angle: float,
+) -> int:
     """How often the motor must have turned though the angle stands: the smoothed torque went up or down by more than friction
     at rest carries in both directions under a clamp force of ``force`` N, as far as it turns over within that angle. Once
     alone may be an offset of the current, there and back is none.
@@ -180,7 +192,7 @@ def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_
 
 
 @njit
-def due(c, acceleration, delay, dt):
+def due(c: Record, acceleration: float, delay: float, dt: float) -> bool:
     """Whether the motor must have turned though the angle stands, which is ``delay`` s late, by an ``acceleration``, rad/s²,
     that is beyond doubt."""
     # What a torque does at a sample it has done since the last only if it did it then: it may have just begun.
@@ -195,14 +207,14 @@ def due(c, acceleration, delay, dt):
 
 
 @njit
-def disbelieve_resolver(c):
+def disbelieve_resolver(c: Record) -> None:
     """Until the angle moves as the speed says."""
     if c.verdict != STIFFNESS_WRONG:
         c.verdict, c.alike, c.frozen_s = STIFFNESS_WRONG, 0, _AVERAGED_S
 
 
 @njit
-def count_contradiction(c, ratio):
+def count_contradiction(c: Record, ratio: float) -> None:
     """Add one contradiction, in standard deviations, to the sum; NaN says nothing."""
     if np.isfinite(ratio):
         total = max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0)
@@ -210,7 +222,9 @@ def count_contradiction(c, ratio):
 
 
 @njit
-def force_of_torque_alone(c, torque, has_current, dt, gear_gain, load_friction, offset_friction):
+def force_of_torque_alone(
+    c: Record, torque: float, has_current: bool, dt: float, gear_gain: float, load_friction: float, offset_friction: float
+) -> tuple[float, float]:
     """Clamp force (N) and its standard deviation from motor torque without a resolver.
 
     Which way friction acts and what accelerates the motor is unknown: friction counts in full, and inertia as the torque's

@@ -4,7 +4,7 @@ from math import floor, pi
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
 #: Speed above which a wheel turns, rad/s: sensors' noise at standstill stays below.
@@ -16,7 +16,7 @@ WHEEL = np.dtype([("known", "?"), ("count", "f8"), ("turned", "f8")], align=True
 
 
 @njit
-def track(s, pulse, wheel_speed, dt):
+def track(s: Record, pulse: float, wheel_speed: float, dt: float) -> float:
     """Wheel angle in rad: carried on by ``wheel_speed`` rad/s, corrected when the pulse counter has moved."""
     width = 2.0 * pi / PULSES_PER_TURN
     if not s.known:

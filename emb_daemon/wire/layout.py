@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.units import conversion
@@ -83,7 +83,7 @@ LAYOUT = np.dtype(
 
 
 @njit
-def unpack(data, signal):
+def unpack(data: int, signal: Record) -> float:
     """Physical value of one signal (a SIGNAL record) in a little-endian payload."""
     raw = np.int64((np.uint64(data) >> np.uint64(signal.start)) & ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)))
     if signal.signed and raw >> (signal.length - 1):
@@ -92,7 +92,7 @@ def unpack(data, signal):
 
 
 @njit
-def pack(value, signal):
+def pack(value: float, signal: Record) -> int:
     """The bits of one signal, at their place in the payload; a value beyond the signal's range saturates, NaN is ``low``."""
     if not value > signal.low:
         value = signal.low
