@@ -41,7 +41,7 @@ from emb_daemon.calibration.parameters import (
     moved,
     value_of,
 )
-from emb_daemon.calibration.types import to_parameters
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S
@@ -169,7 +169,7 @@ def _block_noise(calibration):
     return sqrt(current**2 * correlated / _BLOCK + 2.0 * (speed / _BLOCK) ** 2)
 
 
-def compile_fit(calibration, state):
+def compile_fit(calibration: Calibration, state: np.void) -> None:
     """Compile, or load from the cache, all that a fit calls; as `fit_training` gets them."""
     rows, p = np.zeros(2, r.TRAINING), to_parameters(calibration)
     x = np.zeros(_CURVE + curve_terms(calibration))
@@ -367,7 +367,9 @@ def _is_excited(angle, contact_angle, force, residual, low, high, limits):
     return np.min(counts, axis=0)[:asked].min() >= limits.samples_per_range
 
 
-def fit_training(rows, calibration, base, state, factor_sigma=0.0):
+def fit_training(
+    rows: np.ndarray, calibration: Calibration, base: Calibration, state: np.void, factor_sigma: float = 0.0
+) -> Evaluation:
     """Evaluate one training.
 
     Args:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.jit import fields
 
 #: Phases of a corner's adaptation: none; motion is requested; motion without request; a training is being evaluated.
@@ -78,7 +79,7 @@ EVALUATION_SAMPLES = 750
 CAPACITY = TRAINING_SAMPLES + EVALUATION_SAMPLES
 
 
-def to_limits(calibration) -> np.void:
+def to_limits(calibration: Calibration) -> np.void:
     """LIMITS record of a `Calibration`."""
     a, limits = calibration.adaptation, np.zeros(1, LIMITS)[0]
     limits["estimated"], limits["enabled"] = True, a.enabled

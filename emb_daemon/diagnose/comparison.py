@@ -1,5 +1,7 @@
 """Error before and after, on logs (or episodes) that chose neither effect nor value, with intervals over episodes."""
 
+from typing import Any
+
 import numpy as np
 
 from emb_daemon.calibration.types import Calibration, to_parameters
@@ -41,7 +43,7 @@ def whole(bench: Bench) -> str:
     return "fused" if bench.has_current else "stiffness"
 
 
-def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict:
+def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict[str, dict[str, dict[str, Any]]]:
     """RMSE before and after by path and condition, each with a 95 % interval, and one of the ratio, over episodes.
 
     A path that says nothing on these logs is left out."""

@@ -5,10 +5,16 @@ order of the registry, which compiled code then calls directly. numba keeps it o
 (`emb_daemon.jit`), so the same registry finds the same compiled code again.
 """
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 from emb_daemon import effects
 from emb_daemon.effects import terms
 from emb_daemon.effects.base import HOOKS, Hook
 from emb_daemon.jit import Record, njit
+
+#: Called with the quantity where the hook has no start, parameters and states of all effects, and the hook's arguments.
+_Hook: TypeAlias = Callable[..., float]
 
 
 def _source(name: str, hook: Hook) -> str:
@@ -26,11 +32,12 @@ def _source(name: str, hook: Hook) -> str:
     return "\n".join([*lines, "    return value"])
 
 
-def _compose(name: str):
+def _compose(name: str) -> _Hook:
     scope = {effect.name: effect.term for effect in effects.REGISTRY} | {"__name__": __name__}
     # numba's cache on disk needs an existing file; the content of this one and of the registry decide.
     exec(compile(_source(name, HOOKS[name]), __file__, "exec"), scope)
-    return njit(scope[name])
+    function: _Hook = scope[name]
+    return njit(function)
 
 
 #: Whether an effect uses the signals of terms, which must then be computed even without a term.
@@ -44,19 +51,19 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
         terms.look(e, s, p, m)
 
 
-thickness = _compose("thickness")
-motor_angle = _compose("motor_angle")
-stiffness = _compose("stiffness")
-force = _compose("force")
-relaxation_time = _compose("relaxation_time")
-torque_constant = _compose("torque_constant")
-current = _compose("current")
-torque = _compose("torque")
-gear_gain = _compose("gear_gain")
-gear_friction = _compose("gear_friction")
-backplate = _compose("backplate")
-pad_friction = _compose("pad_friction")
-disc_cooling = _compose("disc")
+thickness: _Hook = _compose("thickness")
+motor_angle: _Hook = _compose("motor_angle")
+stiffness: _Hook = _compose("stiffness")
+force: _Hook = _compose("force")
+relaxation_time: _Hook = _compose("relaxation_time")
+torque_constant: _Hook = _compose("torque_constant")
+current: _Hook = _compose("current")
+torque: _Hook = _compose("torque")
+gear_gain: _Hook = _compose("gear_gain")
+gear_friction: _Hook = _compose("gear_friction")
+backplate: _Hook = _compose("backplate")
+pad_friction: _Hook = _compose("pad_friction")
+disc_cooling: _Hook = _compose("disc")
 
 
 @njit

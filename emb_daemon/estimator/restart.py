@@ -82,7 +82,7 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     return True
 
 
-def why_implausible(snapshot, p) -> str:
+def why_implausible(snapshot: Record, p: Record) -> str:
     """What in a SNAPSHOT no brake with PARAMETERS ``p`` can have had, by the record's names; empty if nothing."""
     prior = np.zeros((STATES, STATES))
     set_priors(prior, p)

@@ -9,7 +9,7 @@ import numpy as np
 from emb_daemon.calibration.fields import Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling
+from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Training, Trial
 from emb_daemon.jit import njit
 from emb_daemon.logs.read import read_with_digest
 from emb_daemon.offline import Log, corner_index, load_log
@@ -89,7 +89,7 @@ class Campaign:
         """Of the pads that the calibration is for."""
         return self.file.pad_thickness_mm or self.datasheet.pad.thickness_mm
 
-    def thickness(self, entry) -> float:
+    def thickness(self, entry: Trial | Training) -> float:
         """Pad thickness of an entry in mm; the campaign's where it states none."""
         return entry.pad_thickness_mm or self.pad_thickness_mm
 
@@ -218,7 +218,7 @@ def _missing(value, folder: Path, key: str = "") -> list[str]:
     return [f"{key}: {folder / value}: no such file"] if is_log and not (folder / value).is_file() else []
 
 
-def load_campaign(path: str | Path, read=read_with_digest) -> Campaign:
+def load_campaign(path: str | Path, read: Callable[[Path], tuple[np.ndarray, str]] = read_with_digest) -> Campaign:
     """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`.
 
     Raises:

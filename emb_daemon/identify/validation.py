@@ -1,6 +1,7 @@
 """Calibrations validated on logs that fitted nothing, by the estimator as it runs."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class Validation:
     log: Log = field(repr=False)
     calibration: Calibration = field(repr=False)
     estimates: np.ndarray = field(repr=False)
-    figures: dict
+    figures: dict[str, Any]
     innovation_ratio: float
 
     def rmse_N(self, path: str = "fused") -> float:

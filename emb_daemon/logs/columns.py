@@ -101,11 +101,11 @@ class References:
     def __init__(self, frames: np.ndarray, corner: str):
         decoder = Decoder("dbc/rig.dbc")
         force = decoder.columns(frames, f"RIG_{corner}_Force")
-        self.time_ns = force["time_ns"]
-        self.clamp_force_N = force["ClampForceRef"]
-        self.brake_torque_Nm = force["BrakeTorqueRef"]
-        self.disc_C = force["DiscTempRef"]
-        self.pads = {}
+        self.time_ns: np.ndarray = force["time_ns"]
+        self.clamp_force_N: np.ndarray = force["ClampForceRef"]
+        self.brake_torque_Nm: np.ndarray = force["BrakeTorqueRef"]
+        self.disc_C: np.ndarray = force["DiscTempRef"]
+        self.pads: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for side in ("Inner", "Outer"):
             pad = decoder.columns(frames, f"RIG_{corner}_{side}Pad")
             depths = np.array([pad[f"{side}PadTemp{depth}mm"] for depth in DEPTHS_MM])

@@ -1,6 +1,11 @@
 """SAE J1939 as DBC files describe it: parameter groups, whoever sends them, and values that say that there is none."""
 
+from typing import TYPE_CHECKING, TypeVar
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message, Signal
 
 #: Sender's address in a 29-bit id, and the one that nobody has, by which DBC files mean any.
 SENDER, _NOBODY = 0xFF, 0xFE
@@ -10,17 +15,21 @@ _GROUP, _ADDRESSEE, _ADDRESSED = 0x3FFFF00, 0xFF00, 0xEF
 _NO_VALUE = 0xFB
 
 
-def is_group(message) -> bool:
+#: One id or an array of them.
+_Ids = TypeVar("_Ids", int, np.ndarray)
+
+
+def is_group(message: "Message") -> bool:
     """Whether a message of a DBC (cantools) is a parameter group and not one sender's."""
     return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & SENDER == _NOBODY)
 
 
-def group_of(can_id):
+def group_of(can_id: _Ids) -> _Ids:
     """Of a 29-bit id, or an array of them, what says the parameter group: neither priority nor addressee nor sender."""
     return can_id & (_GROUP - _ADDRESSEE * ((can_id >> 16 & 0xFF) <= _ADDRESSED))
 
 
-def known(signal, values: np.ndarray | float) -> np.ndarray:
+def known(signal: "Signal", values: np.ndarray | float) -> np.ndarray:
     """Values of a group's signal (cantools), NaN where it says that there is none."""
     if signal.length < 8 or signal.is_signed or signal.is_float:
         return np.asarray(values, float)

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,11 +17,14 @@ from emb_daemon.logs import j1939
 from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.mapping import Mapping, Source, alone
 from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
-from emb_daemon.runtime.bus import PythonCanBus, open_python_can
+from emb_daemon.runtime.bus import PythonCan, PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME, row_of
 from emb_daemon.wire.layout import CORNERS, pack, signal_columns
+
+if TYPE_CHECKING:
+    from can import Message
 
 #: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
 _DUE = 0.9
@@ -104,13 +108,13 @@ class SeveralBuses:
     """python-can buses by channel as one: frames of all, each with its channel; what is sent goes to its channel's, or to the
     first."""
 
-    def __init__(self, buses: dict):
+    def __init__(self, buses: dict[str, PythonCan]):
         self._buses = buses
 
     def fileno(self) -> int:
         raise NotImplementedError
 
-    def recv(self, timeout_s: float):
+    def recv(self, timeout_s: float) -> "Message | None":
         """The next frame of any, None if none comes in time."""
         until = time.monotonic() + timeout_s
         while True:
@@ -122,7 +126,7 @@ class SeveralBuses:
                 return None
             time.sleep(min(_POLL_S, left))
 
-    def send(self, message) -> None:
+    def send(self, message: "Message") -> None:
         self._buses.get(str(message.channel), next(iter(self._buses.values()))).send(message)
 
     def shutdown(self) -> None:
@@ -190,7 +194,7 @@ class MappedBus(PythonCanBus):
         mapping: by the rig's DBC; its references stay outside.
     """
 
-    def __init__(self, bus, mapping: Mapping):
+    def __init__(self, bus: PythonCan, mapping: Mapping):
         super().__init__(bus, [])
         self._signals = _Signals(mapping, [name for name in mapping.messages if not name.startswith("RIG_")])
         self._messages = self._signals.messages
@@ -208,7 +212,7 @@ class MappedBus(PythonCanBus):
             rows += self.heard(message, time_ns)
         return np.array(rows, FRAME)
 
-    def heard(self, message, time_ns: int) -> list[tuple]:
+    def heard(self, message: "Message", time_ns: int) -> list[tuple[int, ...]]:
         """FRAME rows that a frame of the rig (python-can Message) makes of ours."""
         if not self._signals.take(message, time_ns):
             return []
@@ -273,7 +277,7 @@ def _complete(slow: _Message) -> dict[str, float]:
 class ReferenceBus(PythonCanBus):
     """A bus on which frames of ``ids`` are ours and the rig's force sensors are heard beside them, as RIG_c_Force."""
 
-    def __init__(self, bus, mapping: Mapping, ids: list[int]):
+    def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)
         names = [name for name in mapping.messages if name.startswith("RIG_") and name.endswith("_Force")]
         if not names:
@@ -290,7 +294,7 @@ class ReferenceBus(PythonCanBus):
         return np.array(rows, FRAME)
 
 
-def open_buses(options: dict, mapping: Mapping):
+def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
     """python-can's bus by its options (`cli.busoptions`), or as many as the mapping names channels; for CAN FD if the rig's
     messages are.
 
@@ -309,7 +313,7 @@ def open_buses(options: dict, mapping: Mapping):
     return SeveralBuses({name: open_python_can(options | {"channel": name}) for name in dict.fromkeys([ours, *channels])})
 
 
-def open_mapped(options: dict, mapping: Mapping, layout: np.ndarray) -> MappedBus:
+def open_mapped(options: dict[str, Any], mapping: Mapping, layout: np.ndarray) -> MappedBus:
     """A bus read through a mapping, for a daemon of a LAYOUT.
 
     Raises:

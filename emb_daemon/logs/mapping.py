@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta, field
@@ -25,6 +25,9 @@ from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
 from emb_daemon.wire.units import TRAVELS, UNITS, conversion
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message
 
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
@@ -57,7 +60,7 @@ class Mapped(Struct, kw_only=True):
     #: A constant in our unit, for what the rig does not measure.
     value: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
         alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
@@ -80,7 +83,7 @@ class Time(Struct, kw_only=True):
     #: Of a table without such a column: rows per second.
     rate_Hz: Positive | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.signal is None) == (self.rate_Hz is None):
             raise ValueError("expected either signal (a column) or rate_Hz (rows per second)")
         if UNITS.get(self.unit, ("",))[0] != "s":
@@ -110,7 +113,7 @@ class MappingFile(Struct, kw_only=True):
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.dbc is not None and self.buses:
             raise ValueError("buses: each has a dbc of its own; expected dbc or buses")
         if (self.dbc is not None or self.buses) and self.time is not None:
@@ -122,9 +125,15 @@ class Source:
     ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a sampling period."""
 
     def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
-        self.name, self.bus, self.period = mapped.signal, mapped.bus, mapped.period
-        self.message, _, self.signal = mapped.signal.rpartition(".")
-        self.scale, self.offset, self.span_ns = scale, offset, span_ns
+        self.name: str = mapped.signal
+        self.bus: str | None = mapped.bus
+        self.period: float | None = mapped.period
+        message, _, signal = mapped.signal.rpartition(".")
+        self.message: str = message
+        self.signal: str = signal
+        self.scale = scale
+        self.offset = offset
+        self.span_ns = span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
@@ -149,11 +158,15 @@ class Mapping:
     """
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
-        self.databases = {name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()}
-        self.channels = {name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()}
+        self.databases: dict[str | None, Database] = {
+            name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()
+        }
+        self.channels: dict[str | None, str | None] = {
+            name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
+        }
         self._ours = our_messages()
         self._faults: list[str] = []
         self.notes: list[str] = []
@@ -291,7 +304,7 @@ class Mapping:
         """Whether any of the rig's mapped messages is CAN FD."""
         return any(self.message_of(source).is_fd for name in self.messages for source in self._sources(name).values())
 
-    def message_of(self, source: Source):
+    def message_of(self, source: Source) -> "Message":
         """The rig's message (cantools) that has a signal."""
         return self._message(source.bus, source.name)
 
@@ -427,7 +440,7 @@ class Mapping:
         return np.flatnonzero(mine)
 
 
-def alone(message, name: str) -> Callable[[bytes], float]:
+def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     """What reads one signal of a message (cantools) out of a payload, whatever overlaps with it in other people's DBC files;
     NaN of a payload that is too short for it, and of one that a multiplexer's number gives to others.
 

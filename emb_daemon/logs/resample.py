@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS, signal_columns
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message
 
 #: Deviation of a rig's sampling period from ours up to which its samples are taken as they are.
 _SAME_PERIOD = 0.05
@@ -309,13 +313,13 @@ def _mean(first: Series | float, second: Series | float) -> Series | float:
 
 
 @cache
-def our_messages() -> dict[str, tuple]:
+def our_messages() -> "dict[str, tuple[Message, Database]]":
     """cantools message and its database by name, of what the daemon receives and sends and what rigs add."""
     databases = (shipped_database("dbc/emb.dbc"), shipped_database("dbc/rig.dbc"))
     return {message.name: (message, database) for database in databases for message in database.messages}
 
 
-def cycle_ns(message) -> int:
+def cycle_ns(message: "Message") -> int:
     """Of a cantools message."""
     return (message.cycle_time or _SLOW_MS) * 1_000_000
 

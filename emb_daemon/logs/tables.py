@@ -8,6 +8,7 @@ import sys
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from emb_daemon.logs import arrays
 from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack_gzip
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
+
+if TYPE_CHECKING:
+    from emb_daemon.logs.mapping import Time
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
@@ -54,7 +58,7 @@ _LISTED = 20
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
 
-def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
+def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
     """Times (int64 ns) and values of the named columns or channels, and the SHA-256 of the file.
 
     Args:

@@ -263,7 +263,7 @@ def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None 
     return covariance
 
 
-def valley(cost: Callable[[float], float], grid: np.ndarray, **options) -> float:
+def valley(cost: Callable[[float], float], grid: np.ndarray, **options: float) -> float:
     """Where a cost is least: over a grid, which finds the valley, then between the neighbours of the best.
 
     ``options``: of `scipy.optimize.minimize_scalar`."""

@@ -1,5 +1,6 @@
 """A log, read once: samples by the daemon's own pipeline, slow channels, and what reference instruments measured."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -66,7 +67,7 @@ def _slow_messages(corner: str) -> tuple[str, str, str]:
     return f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"
 
 
-def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
+def load_log(path: str | Path, corner: str = "FL", read: Callable[[Path], np.ndarray] = read_frames) -> Log:
     """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
 
     Raises:

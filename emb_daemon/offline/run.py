@@ -11,6 +11,7 @@ What fits move are PARAMETERS; records are cheap, so that callers copy and chang
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
@@ -136,7 +137,10 @@ def run_step(samples: np.ndarray, parameters: np.ndarray | np.void, heat: np.nda
 
 
 def estimate(
-    samples: np.ndarray, parameters: np.ndarray | np.void, state: np.ndarray | None = None, adaptation=None
+    samples: np.ndarray,
+    parameters: np.ndarray | np.void,
+    state: np.ndarray | None = None,
+    adaptation: Adaptation | None = None,
 ) -> np.ndarray:
     """The whole step as the daemon runs it; returns ESTIMATE rows.
 

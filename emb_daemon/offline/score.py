@@ -1,6 +1,7 @@
 """Error figures of estimates against reference instruments: the one module in which an RMSE is computed."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def first_known(estimates: np.ndarray) -> int:
     return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
 
 
-def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
+def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict[str, Any]:
     """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference.
 
     The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before, or all if the contact angle
@@ -98,7 +99,7 @@ def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.nd
     return result
 
 
-def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: References) -> dict:
+def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: References) -> dict[str, dict[str, float]]:
     """Figures in K for each pad and depth and for the disc, at the reference's own times; empty without a reference."""
     result: dict = {}
     errors = []

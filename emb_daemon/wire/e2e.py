@@ -6,8 +6,9 @@ Source: AUTOSAR FO R22-11 PRS E2EProtocol, section 6.2; the house's wire contrac
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from emb_daemon.jit import Integers, njit
+from emb_daemon.jit import njit
 
 COUNTER_MODULO = 15
 
@@ -37,13 +38,13 @@ def crc(can_id: int, data: int) -> int:
 
 
 @njit
-def counter_of(data: Integers | int) -> Integers | int:
+def counter_of(data: int | NDArray[np.uint64]) -> int | NDArray[np.uint64]:
     """Counter of payloads, integers or uint64 arrays."""
     return (data >> np.uint64(8)) & np.uint64(0xF)
 
 
 @njit
-def status_of(data: Integers | int) -> Integers | int:
+def status_of(data: int | NDArray[np.uint64]) -> int | NDArray[np.uint64]:
     """Status of payloads, integers or uint64 arrays."""
     return (data >> np.uint64(12)) & np.uint64(0xF)
 

@@ -6,6 +6,7 @@ signal is in which column.
 
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from emb_daemon.jit import Record, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.units import conversion
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
 
 CORNERS = ("FL", "FR", "RL", "RR")
 
@@ -103,7 +107,7 @@ def pack(value: float, signal: Record) -> int:
     return (np.uint64(raw) & mask) << np.uint64(signal.start)
 
 
-def signal_columns(database, message: str, names: tuple[str, ...]):
+def signal_columns(database: "Database", message: str, names: tuple[str, ...]) -> np.ndarray:
     """SIGNAL records of the named signals of a cantools message.
 
     Raises:
@@ -131,7 +135,7 @@ def signal_columns(database, message: str, names: tuple[str, ...]):
     return columns
 
 
-def load_database(path: Path, strict: bool = True):
+def load_database(path: Path, strict: bool = True) -> "Database":
     """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252).
 
     Args:
