@@ -1,4 +1,4 @@
-"""What an entry point takes, so that it can be compiled before it is called, and called without a compiler.
+"""Signatures of entry points, by which they are compiled before they are called, and called without a compiler.
 
 A signature has one element for each argument: `Array`, a numpy dtype for one record of it, a named tuple of these, or ``int``,
 ``float``, ``bool``. In C a function takes a pointer to words of eight bytes: first what it returns, then for an array its

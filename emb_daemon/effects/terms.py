@@ -253,5 +253,5 @@ def _follow_all(e, t, signals, dt, maximum_force, values):
 def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
     """Amount that a term (TERM) adds at its port for signals of shape (n, signals), ``dt`` s apart, in the port's unit."""
     values = np.zeros(len(signals))
-    _follow_all(term, np.zeros(1, STATE)[0], signals, dt, maximum_force_N, values)
+    _follow_all(term, np.zeros(1, STATE)[0], signals, np.ascontiguousarray(dt), maximum_force_N, values)
     return values

@@ -9,7 +9,16 @@ from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
 from emb_daemon.jit import Record, njit
-from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
+from emb_daemon.models.thermal import (
+    LONGEST_S,
+    NODES,
+    at_depth,
+    disc_loss,
+    friction_power,
+    heat_step,
+    mean_temperature,
+    stiffness_factor,
+)
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -121,7 +130,8 @@ def _flow(s, t, e, m):
     outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
     _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
-    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
+    power = s.heat_energy / dt
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, LONGEST_S)
     s.disc += effects.disc_cooling(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference

@@ -92,9 +92,9 @@ _SURELY = 9.0
 GATE = 5.0
 
 #: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
-#: first hypothesis. Numbers of numpy, as the states are (`models.fusion`).
+#: first hypothesis.
 ALTERNATIVES = 5
-STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = np.arange(ALTERNATIVES)
+STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)

@@ -44,7 +44,7 @@ MONITOR = np.dtype([("started", "?"), *fields("f8", "torque speed low high force
 
 
 @njit
-def bound(w: Record, p: Record, m: Record, friction: float = 1.0) -> None:
+def bound(w: Record, p: Record, m: Record, friction: float) -> None:
     """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``; gear ``friction`` over theirs as the
     calibration's effects have it, of which no less than theirs is believed."""
     if not m.has_current:

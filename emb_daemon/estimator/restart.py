@@ -82,13 +82,20 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     return True
 
 
+@njit
+def _widen(s, p):
+    """The covariance of a start, with that of all changes that a brake may have seen."""
+    set_priors(s.covariance, p)
+    add_stiffness_jumps(s.covariance, p)
+    add_torque_jumps(s.covariance, p)
+    add_growth(s.covariance, p)
+
+
 def why_implausible(snapshot: Record, p: Record) -> str:
     """What in a SNAPSHOT no brake with PARAMETERS ``p`` can have had, by the record's names; empty if nothing."""
-    prior = np.zeros((STATES, STATES))
-    set_priors(prior, p)
-    for add in (add_stiffness_jumps, add_torque_jumps, add_growth):
-        add(prior, p)
-    covariance = snapshot["covariance"]
+    widest = np.zeros(1, STATE)[0]
+    _widen(widest, p)
+    prior, covariance = widest["covariance"], snapshot["covariance"]
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(np.where(spread > 0.0, spread, 1.0), np.where(spread > 0.0, spread, 1.0))

@@ -449,7 +449,7 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
     frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
     frames["data"] = payload[usable]
     if not is_reference:
-        frames["data"] = _protected(frames["data"], message.frame_id, cycles[usable] % COUNTER_MODULO)
+        frames["data"] = _protected(payload[usable], message.frame_id, cycles[usable] % COUNTER_MODULO)
     return frames
 
 

@@ -23,18 +23,15 @@ for noise, which takes slow model error for white noise. Here the filter estimat
                                           - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
                                           + white noise,  D = gamma + mu s
 
-so that what is slow stays correlated and the standard deviation means what it says.
+so that slow errors stay correlated in time, and the standard deviation is that of the force.
 """
 
 from math import sqrt
 
-import numpy as np
-
 from emb_daemon.jit import Floats, njit
 
-#: Of numpy: numba would compile what takes one of Python's numbers anew for each of them.
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = np.arange(14)
 STATES = 14
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(STATES)
 #: States that the clamp force itself rests on.
 OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
 
@@ -48,7 +45,7 @@ def maximum_likelihood(stiffness: float, stiffness_sigma: float, torque: float, 
 
 @njit
 def copy_errors(x: Floats, P: Floats, from_x: Floats, from_P: Floats) -> None:
-    """Into ``x`` and ``P``. Loops, because each assignment of a whole array costs the compiler a tenth of a second."""
+    """Copy into ``x`` and ``P``, by loops: assigning a whole array takes a tenth of a second to compile."""
     for i in range(STATES):
         x[i] = from_x[i]
         for j in range(STATES):
@@ -76,7 +73,7 @@ def predict_errors(x: Floats, P: Floats, decay: float, noise_decay: float, noise
 @njit
 def variance_along(P: Floats, h: Floats, gain: Floats) -> float:
     """h P h'; ``gain``, shape (STATES,), becomes P h'."""
-    # Columns outside: the sums of a row are independent of each other, and one instruction takes several.
+    # The loop over columns is outside, because then the sums of all rows are independent, and are vectorised.
     for i in range(STATES):
         gain[i] = P[0, i] * h[0]
     for j in range(1, STATES):

@@ -1,8 +1,8 @@
-"""A gear whose travel is no constant times its angle: ball and roller ramps, cams.
+"""A gear whose travel is not proportional to its angle: ball and roller ramps, cams.
 
-Everything that moves with the pads (contact, characteristic curve, hysteresis, thickness) is told in equivalent angle: that by
-which a constant gear of the calibration's gear gain would have moved the pads as far. Only torque sees the gear's own slope,
-dx/dθ over the gear gain, by virtual work. So one brake model serves both kinds of gear, and a constant gear costs nothing.
+Everything that moves with the pads (contact, characteristic curve, hysteresis, thickness) is expressed in equivalent angle:
+the angle by which a constant gear of the calibration's gear gain would move the pads as far. Only the torque depends on the
+gear's own slope, dx/dθ over the gear gain (virtual work). So one brake model serves both kinds of gear.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from emb_daemon.jit import Floats, Record, njit
 from emb_daemon.models.stiffness import travel_at
 
-#: Intervals into which the range of a travel table is divided: a table of a datasheet has fewer points.
+#: Number of intervals into which the range of a travel table is divided; tables in datasheets have fewer points.
 INTERVALS = 64
 
 #: ``step`` rad between nodes, 0 for a constant gear; equivalent angle (rad) at each and its ``slope``.

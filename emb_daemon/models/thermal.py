@@ -29,7 +29,7 @@ LONGEST_S = 0.25
 def mesh(thickness: float) -> np.ndarray:
     """Node positions (m, shape (NODES,)) from the friction surface to the backing plate, spacing growing by a tenth.
 
-    More growth resolves the surface better and thermocouples near the backing plate worse.
+    A larger growth would resolve the surface better, and the region of thermocouples near the backing plate worse.
     """
     steps = _GROWTH ** np.arange(NODES - 1)
     return np.concatenate([[0.0], np.cumsum(steps / steps.sum())]) * thickness
@@ -39,7 +39,7 @@ def mesh(thickness: float) -> np.ndarray:
 def at_depth(temperatures: Floats, positions: Floats, depth: float) -> float:
     """Temperature at ``depth`` m from the friction surface; NaN beyond the pad.
 
-    A cubic through the four nodes around it: a straight line would lose more between two nodes than the mesh itself does.
+    A cubic through the four nodes around it: linear interpolation would have a larger error than the mesh itself.
     """
     if depth > positions[-1] + 1e-9:
         return np.nan
@@ -161,7 +161,7 @@ def heat_step(
     wheel_speed: float,
     dt: float,
     work: Floats,
-    longest: float = LONGEST_S,
+    longest: float,
 ) -> float:
     """Advance pads and disc by ``dt`` seconds.
 
@@ -172,7 +172,7 @@ def heat_step(
         inner_backplate, outer_backplate: measured, degC.
         power: friction power of both pads, W, mean over the step.
         braking: pads press on the disc and exchange heat by contact; else across a gap, which the wheel ventilates.
-        longest: s, of the steps that it is done in.
+        longest: length of a single step at most, s.
         work: scratch, shape (4, CHAIN).
 
     Returns:
@@ -191,7 +191,7 @@ def friction_power(p: Record, force: float, wheel_speed: float, surface: float) 
     """Friction power of both pads in W without a brake torque sensor (thesis 8.5).
 
     2 mu r F w, the friction coefficient interpolated from a table over clamp force (N), disc speed (rad/s) and surface
-    temperature (degC); held at its edges, because a table knows nothing beyond them.
+    temperature (degC), constant beyond its edges.
     """
     if force <= 0.0 or wheel_speed <= 0.0:
         return 0.0

@@ -9,17 +9,17 @@ from math import exp
 
 from emb_daemon.jit import njit
 
-#: Time over which turning back is counted, s: a dozen samples. One reversal makes 0.08 of it.
+#: Time constant over which reversals are counted, s: a dozen samples. One reversal adds 0.08 to the share.
 _OF_LATE_S = 0.05
-#: Share of turning back beyond which an angle's motion is noise: that turns back in two of three samples, in every other if it
-#: is a noisy speed added up, and a motor that swings at 10 Hz in one of twelve.
+#: Share of samples with a reversal above which an angle's motion is noise. Noise of the angle reverses in two of three
+#: samples, a sum of noisy speeds in every other, a motor that swings at 10 Hz in one of twelve.
 NOISE_TURNS_BACK = 0.15
 
 
 @njit
 def turned_back(share: float, direction: float, travel: float, dt: float) -> float:
-    """Share of the samples in which the motor turned back of late, after one of ``travel`` rad in ``dt`` s; ``direction``: its
-    last way, any size."""
+    """Share of recent samples with a reversal of the motor, after a sample of ``travel`` rad in ``dt`` s; the sign of
+    ``direction`` is that of the last motion."""
     return share + ((travel * direction < 0.0) - share) * min(dt / _OF_LATE_S, 1.0)
 
 
@@ -27,8 +27,8 @@ def turned_back(share: float, direction: float, travel: float, dt: float) -> flo
 def slid_angle(before: float, angle: float, flicker: float) -> float:
     """Angle that the gear has slid to: it follows ``angle`` once that leaves ``before`` by more than ``flicker`` rad.
 
-    A reading that flickers between two counts at standstill would otherwise turn the friction state over and over, until it
-    forgets which way the motor came.
+    Otherwise a reading that flickers between two counts at standstill would turn the friction state over again and again, and
+    the direction from which the motor came would be lost.
     """
     return min(max(before, angle - flicker), angle + flicker)
 

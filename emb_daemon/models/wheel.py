@@ -25,13 +25,13 @@ def track(s: Record, pulse: float, wheel_speed: float, dt: float) -> float:
         s.turned = (pulse + 0.5) * width
         return s.turned
     s.turned += wheel_speed * dt
-    # Of the counts that the counter may stand for, the one nearest to where the speed has carried the wheel.
+    # The counter wraps: of all counts that it may mean, take the one nearest to the carried angle.
     wraps = floor((s.turned / width - 0.5 - pulse) / PULSE_MODULO + 0.5)
     count = pulse + wraps * PULSE_MODULO
     if count != s.count:
         s.count = count
         error = (s.count + 0.5) * width - s.turned
-        # More than two pulses off is no interpolation error: frames were missing.
+        # An error of more than two pulses is no interpolation error: frames were missing.
         s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
     return s.turned
 

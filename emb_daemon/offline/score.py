@@ -11,7 +11,7 @@ from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
 _MOVING = 5.0
-#: Reference force (N) below which the pads hang in the clearance.
+#: Reference force (N) below which the pads do not touch.
 _CLEARANCE_N = 100.0
 #: Surface temperature (degC) above which the pads are hot.
 _HOT_C = 100.0
@@ -67,13 +67,13 @@ def conditions(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarr
 
 
 def is_turning(samples: np.ndarray) -> np.ndarray:
-    """Where the disc turns."""
+    """Mask of the rows in which the disc turns."""
     return samples["has_wheel_speed"] & (samples["wheel_speed"] > TURNING_RAD_PER_S)
 
 
 def first_known(estimates: np.ndarray) -> int:
-    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing. The first
-    of all if none does: then there is nothing else to judge."""
+    """First ESTIMATE row with a known contact angle; before it the fused force is flagged as unknown. 0 if there is none, so
+    that all rows are judged."""
     return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
 
 
