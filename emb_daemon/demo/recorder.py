@@ -97,7 +97,7 @@ class Recorder:
         frames, cycle = self.frames[start:stop], self.frame_cycle[start:stop]
         mine = (frames["can_id"] == self._ids[CLAMP_FORCE, corner]) & (cycle > 0)
         frames, newest = frames[mine], cycle[mine] - 1
-        answered = (frames["data"] >> np.uint64(48) & np.uint64(0xF)).astype(np.int64)
+        answered = Decoder().columns(frames, f"EMB_{self.corners[row]}_ClampForce")["InputCounter"].astype(np.int64)
         age = (self.truth["counter"][newest, row] - answered) % COUNTER_MODULO
         known = (answered < COUNTER_MODULO) & (age <= np.minimum(newest, _LATEST_CYCLES))
         known &= self.sent_ns[np.where(known, newest - age, 0)] > 0

@@ -12,9 +12,9 @@ from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import load_database, signal_columns, unpack
 
-#: Depths below the friction surface at which a rig's pads have thermocouples, mm: where the estimator tells temperatures.
+#: Depths below the friction surface at which a rig's pads have thermocouples, mm: those of the estimator's temperatures.
 DEPTHS_MM = tuple(round(1e3 * depth_m) for depth_m in DEPTHS_M)
-#: How far a reference's frame may be from a sample that it belongs to: half a cycle.
+#: Largest distance in time between a sample and its reference's frame: half a cycle.
 _NEAR_NS = CYCLE_NS // 2
 
 
@@ -75,12 +75,12 @@ class Decoder:
 
 
 def absent_raw(length: int) -> int:
-    """Raw value of a signed reference signal that says that the rig has no such instrument: the least there is."""
+    """Raw value of a signed reference signal that means that the rig has no such instrument: the least possible one."""
     return -(1 << (length - 1))
 
 
 def nearest(time_ns: np.ndarray, at_ns: np.ndarray) -> np.ndarray:
-    """Row of the ascending times that is nearest to each of ``at_ns``; there has to be one."""
+    """Row of the ascending times, at least one, that is nearest to each of ``at_ns``."""
     after = np.clip(np.searchsorted(time_ns, at_ns), 0, len(time_ns) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(time_ns[after] - at_ns) < np.abs(at_ns - time_ns[before]), after, before)

@@ -1,7 +1,8 @@
-"""Another rig's live bus as ours: its frames become our messages as they arrive, by the mapping file that reads its logs.
+"""Another rig's live bus as ours: its frames are converted to our messages as they arrive, by the same mapping file as its
+logs.
 
 The motor angle's frames are the clock, as in logs. Faster ones than ours are thinned out to our cycle, the current in between
-averaged; slower ones stay as they are, since nothing can be put between samples of which the second has not come yet.
+averaged; slower ones stay as they are, because interpolation would have to wait for the next sample.
 """
 
 import math
@@ -26,9 +27,9 @@ from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 if TYPE_CHECKING:
     from can import Message
 
-#: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
+#: A sample is due after this share of our cycle since the last one; a bus may delay single frames by the rest.
 _DUE = 0.9
-#: Between two looks at several buses, s: a fraction of our cycle.
+#: Period of polling several buses, s: a fraction of our cycle.
 _POLL_S = 0.0005
 
 
@@ -53,7 +54,7 @@ class _Value:
         self.count += 1
 
     def mean(self) -> float:
-        """Of what came since the last call; the last value where nothing did."""
+        """Mean of the values since the last call; the last value if there were none."""
         mean = self.total / self.count if self.count else self.last
         self.total, self.count = 0.0, 0
         return mean
@@ -82,7 +83,7 @@ class _Message:
         return {name: value.last if isinstance(value, _Value) else value for name, value in self.signals.items()}
 
     def frame(self, values: dict[str, float], time_ns: int) -> tuple | None:
-        """A FRAME row; None where a value is none that the message can carry."""
+        """A FRAME row; None if the message cannot carry a value."""
         payload = 0
         for name, value in values.items():
             layout = self.layout[name]
@@ -141,7 +142,7 @@ class _Signals:
         mapping.require_frames()
         self.messages = {name: _message(name, mapping) for name in names}
         self._readers: dict[tuple[int, bool], list[tuple]] = {}
-        #: The same of J1939's groups, and who was the first to send one: others' frames of it are of something else.
+        #: The same of J1939's groups, and the first sender of each: other senders' frames of a group are ignored.
         self._groups: dict[int, list[tuple]] = {}
         self._senders: dict[int, int] = {}
         for our in self.messages.values():
@@ -178,7 +179,7 @@ class _Signals:
 def _message(name: str, mapping: Mapping) -> _Message:
     message, database = our_messages()[name]
     names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
-    # Each of ours has its own value, for two may come from one of the rig's, by different scales.
+    # Each of our signals has its own value, because two may come from one of the rig's with different scales.
     signals = {
         signal: _Value(source) if isinstance(source, Source) else source for signal, source in mapping.messages[name].items()
     }
@@ -191,7 +192,7 @@ class MappedBus(PythonCanBus):
 
     Args:
         bus: python-can's, without filters; for CAN FD opened with it (`open_buses`).
-        mapping: by the rig's DBC; its references stay outside.
+        mapping: by the rig's DBC; references are not converted.
     """
 
     def __init__(self, bus: PythonCan, mapping: Mapping):
@@ -213,7 +214,7 @@ class MappedBus(PythonCanBus):
         return np.array(rows, FRAME)
 
     def heard(self, message: "Message", time_ns: int) -> list[tuple[int, ...]]:
-        """FRAME rows that a frame of the rig (python-can Message) makes of ours."""
+        """FRAME rows of our messages that follow from a frame of the rig (python-can Message)."""
         if not self._signals.take(message, time_ns):
             return []
         rows = []
@@ -250,7 +251,7 @@ class MappedBus(PythonCanBus):
 
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
-    """Angle and speed at a sample; one that the rig does not measure from the other, since the sample before."""
+    """Angle and speed at a sample; if the rig measures one of them, the other from its change since the sample before."""
     known = resolver.last()
     elapsed_s = 1e-9 * (time_ns - resolver.sent_ns) if resolver.sent_ns else math.inf
     before = resolver.before
@@ -265,7 +266,7 @@ def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
 
 
 def _complete(slow: _Message) -> dict[str, float]:
-    """A slow message's values, with those that others stand in for (`resample.SUBSTITUTES`)."""
+    """A slow message's values, with substitutes for missing ones (`resample.SUBSTITUTES`)."""
     known = slow.last()
     plates = [known[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in known]
     if plates:
@@ -308,7 +309,7 @@ def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
     channels = sorted({channel for channel in mapping.channels.values() if channel is not None})
     if not channels:
         return open_python_can(options)
-    # The daemon's own channel first: what it sends goes there.
+    # The daemon's own channel first, because that is where it sends.
     ours = str(options.get("channel") or channels[0])
     return SeveralBuses({name: open_python_can(options | {"channel": name}) for name in dict.fromkeys([ours, *channels])})
 

@@ -1,7 +1,7 @@
 """Logs of other people's rigs as our frames, by a mapping file: CAN logs by the rig's own DBC, tables and measurements by
 column.
 
-A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
+A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
 import sys
@@ -34,7 +34,7 @@ _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 #: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
-#: Share of the payloads that a gateway or the beginning of a log may leave out of a copy.
+#: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
 
 
@@ -192,7 +192,7 @@ class Mapping:
             signals[signal_name] = mapped.value
             [layout] = signal_columns(self._ours[message_name][1], message_name, (signal_name,))
             if not layout["low"] <= mapped.value <= layout["high"]:
-                # No frame could carry it, and the message would never be heard.
+                # No frame could carry it, and the message would never be sent.
                 self._fault(
                     name, f"value: {mapped.value:g}; expected {layout['low']:g} to {layout['high']:g} {ours.unit or ''}"
                 )
@@ -227,7 +227,7 @@ class Mapping:
         return ", ".join(signal.name for signal in self._ours[message][0].signals if signal.name not in HEADER)
 
     def _like(self, bus: str | None, signal: str) -> str:
-        """What the rig's DBC has that is called most like it, in words; empty if nothing is."""
+        """The most similar names in the rig's DBC, in words; empty if there are none."""
         known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
         like = get_close_matches(signal, known, 3)
         return f"; did you mean {' or '.join(like)}?" if like else ""
@@ -256,14 +256,15 @@ class Mapping:
         return self.databases[bus].get_message_by_name(signal.rpartition(".")[0])
 
     def _check_complete(self) -> None:
-        """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
+        """Find missing signals: a message is sent whole, and a signal without source or substitute would be sent as a valid
+        zero."""
         corners = [corner for corner in CORNERS if f"EMB_{corner}_Resolver" in self.messages]
         if not corners and not self._faults:
             self._faults.append(
                 f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner; of a "
                 "bench without a motor, or whose motor stands, say so by `EMB_FL_Resolver.MotorAngle: {value: 0}`"
             )
-        # Of a message with a fault nobody knows yet what will be missing.
+        # What a message with a fault lacks is not known yet.
         whole = [name for name in self.messages if not any(f"signals.{name}." in fault for fault in self._faults)]
         for name in whole:
             signals = self.messages[name]
@@ -360,7 +361,7 @@ class Mapping:
             raise InputError(
                 f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
             )
-        # No log has times before zero, as a recorder has them before its trigger.
+        # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
 
@@ -387,7 +388,7 @@ class Mapping:
         return ", ".join(names) or "a signal"
 
     def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
-        """Times and values of the rig's signals by bus and name; one in a frame too short for it is left out."""
+        """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
         found = {}
         by_message: dict[tuple[str | None, str], list[str]] = {}
         for bus, signal in sorted(wanted, key=str):
@@ -402,7 +403,7 @@ class Mapping:
             if in_group or message.protocol == "j1939":
                 parameters = {signal: message.get_signal_by_name(signal.rpartition(".")[2]) for signal in columns}
                 columns = {signal: j1939.known(parameters[signal], values) for signal, values in columns.items()}
-            # Parts of a multiplexed message are messages of their own.
+            # Each multiplexed part counts as a message of its own.
             for part in [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]:
                 heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
                 values = [columns[signal][heard] for signal in part]
@@ -414,7 +415,8 @@ class Mapping:
         """Of a message's frames.
 
         Raises:
-            InputError: the log has nothing of the channel, or two channels or senders carry the message and nothing names one.
+            InputError: the log has nothing of the channel, or the message comes from two channels or senders and the mapping
+                names none.
         """
         frames = recorded.frames
         flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
@@ -441,8 +443,8 @@ class Mapping:
 
 
 def alone(message: "Message", name: str) -> Callable[[bytes], float]:
-    """What reads one signal of a message (cantools) out of a payload, whatever overlaps with it in other people's DBC files;
-    NaN of a payload that is too short for it, and of one that a multiplexer's number gives to others.
+    """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
+    the payload is too short or belongs to other multiplexed signals.
 
     Raises:
         cantools.database.Error: the message has no room for it.
@@ -466,7 +468,7 @@ def alone(message: "Message", name: str) -> Callable[[bytes], float]:
 
 
 def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bool:
-    """Whether what one channel carries of a message is what another does: a gateway's copy, or two loggers of one bus."""
+    """Whether two channels carry the same frames of a message: a gateway's copy, or two loggers of one bus."""
     rows = np.flatnonzero(mine)
     payloads = np.array([payload.hex() for payload in recorded.payloads(rows)])
     by_channel = [set(payloads[channels[rows] == channel].tolist()) for channel in np.unique(channels[rows])]

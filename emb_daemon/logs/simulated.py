@@ -1,4 +1,4 @@
-"""The simulated car on another rig's bus: our frames leave as the rig's, by the mapping that reads them back."""
+"""The simulated car on another rig's bus: our frames are sent as the rig's messages, by the mapping that reads them."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ class _Theirs:
 
 
 def _bounds(signal) -> tuple[float, float]:
-    """What a cantools signal can carry."""
+    """Range of a cantools signal."""
     if signal.is_float:
         return -np.inf, np.inf
     least, most = (
@@ -47,12 +47,12 @@ def _bounds(signal) -> tuple[float, float]:
 
 
 class SimulatedRig(PythonCanBus):
-    """A bus with the calls of `runtime.bus.PythonCanBus` on which what is sent leaves as the rig's messages.
+    """A bus that sends our frames as the rig's messages.
 
     Args:
         bus: python-can's, opened for CAN FD where the rig's messages need it.
         mapping: by the rig's DBC.
-        ids: of the frames to receive, as they are.
+        ids: of the frames to receive, unchanged.
 
     Raises:
         InputError: a mapping of tables has no frames, and one signal cannot select what else its message holds.

@@ -34,8 +34,7 @@ from emb_daemon.report.page import Page, Section
 USUAL_RELAXATION_S = 0.03
 #: A curve with a maximum below the brake's largest force is used up to this share of that maximum.
 _RISING = 0.999
-#: Relative amount above the least held-out error of all combinations up to which a combination with fewer effects is
-#: preferred.
+#: Factor on the least held-out error of all combinations up to which a combination with fewer effects is preferred.
 _WORTH = 1.02
 #: Least amplitude of an effect, in its standard deviations.
 _CLEAR = 3.0
