@@ -98,13 +98,9 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        parameters: np.ndarray,
-        corners: Sequence[str] = wire.CORNERS,
-        layout: np.ndarray | None = None,
-        capacity: int = 4096,
-        adaptation: Adaptation | None = None,
-    ):
+        self, parameters: np.ndarray, corners: Sequence[str] = wire.CORNERS, layout: np.ndarray | None = None,
+        capacity: int = 4096, adaptation: Adaptation | None = None,
+    ):  # fmt: skip
         self.parameters = parameters
         self.states: np.ndarray = new_state(4)
         self.corners: np.ndarray = np.zeros(4, CORNER)

@@ -235,17 +235,9 @@ def _conclude(a, s, parameters, learned, scratch, rows):
 
 @njit
 def observe(
-    a: Record,
-    s: Record,
-    parameters: Records,
-    learned: Record,
-    limits: Record,
-    others_hold: bool,
-    scratch: Records,
-    rows: Records,
-    m: Record,
-    estimate: Record,
-) -> None:
+    a: Record, s: Record, parameters: Records, learned: Record, limits: Record, others_hold: bool, scratch: Records,
+    rows: Records, m: Record, estimate: Record,
+) -> None:  # fmt: skip
     """Advance one corner's adaptation by one estimate, and write its state into the estimate.
 
     Args:
@@ -349,18 +341,9 @@ def _advance(a, s, parameters, learned, limits, scratch, rows, m):
     Array(r.LIMITS), Array(STATE), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
 def answer_adapting(
-    samples: Records,
-    first: int,
-    count: int,
-    states: Records,
-    parameters: Records,
-    learned: Records,
-    estimates: Records,
-    adapters: Records,
-    limits: Records,
-    scratch: Records,
-    rows: Records,
-) -> int:
+    samples: Records, first: int, count: int, states: Records, parameters: Records, learned: Records, estimates: Records,
+    adapters: Records, limits: Records, scratch: Records, rows: Records,
+) -> int:  # fmt: skip
     """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation."""

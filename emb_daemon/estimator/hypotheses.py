@@ -359,18 +359,9 @@ def to_force(h: Floats, spread: float, slope: float, force: float, warmth: float
 
 @njit
 def to_torque(
-    h: Floats,
-    leverage: float,
-    slope: float,
-    friction_mean: float,
-    force: float,
-    speed: float,
-    slow: float,
-    accelerating: float,
-    motor_torque: float,
-    winding: float,
-    housing: float,
-) -> None:
+    h: Floats, leverage: float, slope: float, friction_mean: float, force: float, speed: float, slow: float,
+    accelerating: float, motor_torque: float, winding: float, housing: float,
+) -> None:  # fmt: skip
     """Make a sensitivity of the clamp force one of the torque that it leaves unexplained. ``slope`` of the gear; ``slow``,
     ``accelerating`` and ``motor_torque`` N m: friction as far as it is slow, what inertia and what everything took."""
     for i in (FAST, CONTACT, SCALE, GROWTH):

@@ -74,17 +74,9 @@ def engaged(state: Record, x: float, contact_sigma: float) -> bool:
 
 @njit
 def watch_closing(
-    state: Record,
-    torque: float,
-    predicted: float,
-    friction_mean: float,
-    sigma: float,
-    limit: float,
-    x: float,
-    contact_sigma: float,
-    offset: float,
-    offset_sigma: float,
-) -> int:
+    state: Record, torque: float, predicted: float, friction_mean: float, sigma: float, limit: float, x: float,
+    contact_sigma: float, offset: float, offset_sigma: float,
+) -> int:  # fmt: skip
     """Compare torque with belief for one sample.
 
     Args:

@@ -169,14 +169,9 @@ def stands(c: Record, angle: float) -> bool:
 
 @njit
 def hold(
-    c: Record,
-    force: float,
-    sigma: float,
-    gear_gain: float,
-    load_friction: float,
-    offset_friction: float,
+    c: Record, force: float, sigma: float, gear_gain: float, load_friction: float, offset_friction: float,
     presliding_angle: float,
-) -> int:
+) -> int:  # fmt: skip
     """How often the motor must have turned although the angle stands: number of times that the smoothed torque rose or fell by
     more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as friction turns over
     within that angle. A single swing may be an offset of the current, a swing back cannot.

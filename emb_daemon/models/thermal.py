@@ -150,19 +150,9 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
 
 @njit
 def heat_step(
-    p: Record,
-    pads: Floats,
-    disc: float,
-    inner_backplate: float,
-    outer_backplate: float,
-    ambient: float,
-    power: float,
-    braking: bool,
-    wheel_speed: float,
-    dt: float,
-    work: Floats,
-    longest: float,
-) -> float:
+    p: Record, pads: Floats, disc: float, inner_backplate: float, outer_backplate: float, ambient: float, power: float,
+    braking: bool, wheel_speed: float, dt: float, work: Floats, longest: float,
+) -> float:  # fmt: skip
     """Advance pads and disc by ``dt`` seconds.
 
     Args:

@@ -39,12 +39,9 @@ class LiveCar:
         spare.hear(spare.tick(self._commands[0], self._drives[0]))
 
     def run(
-        self,
-        stopped: Callable[[], bool],
-        seconds: float | None = None,
-        sent: Callable[[int, np.ndarray], None] | None = None,
+        self, stopped: Callable[[], bool], seconds: float | None = None, sent: Callable[[int, np.ndarray], None] | None = None,
         heard: Callable[[np.ndarray], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;

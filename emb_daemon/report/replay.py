@@ -194,12 +194,9 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
 
 
 def replay_page(
-    results: Sequence[Result],
-    corner: str,
-    described: str,
-    learned: "Store | None" = None,
+    results: Sequence[Result], corner: str, described: str, learned: "Store | None" = None,
     calibration: Calibration | None = None,
-) -> Page:
+) -> Page:  # fmt: skip
     """The page of one or more `replay.Result`, in sequence as one drive.
 
     Args:
