@@ -12,16 +12,16 @@ import importlib.util
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emb_daemon.ahead import library
-from emb_daemon.ahead.signature import Array, Decorator, Entry, Kind, name_in_c
+from emb_daemon.ahead.signature import Array, Entry, Function, Kind, name_in_c
 
 __all__ = [
-    "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Integers", "Record", "Records", "compile_beside",
+    "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Record", "Records", "compile_beside",
     "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit",
 ]  # fmt: skip
 
@@ -30,14 +30,8 @@ __all__ = [
 Record: TypeAlias = np.void
 Records: TypeAlias = NDArray[np.void]
 Floats: TypeAlias = NDArray[np.float64]
-Integers: TypeAlias = NDArray[np.int64]
 Booleans: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]
-
-_Function = TypeVar("_Function", bound=Callable[..., object])
-
-#: Compiles a function; Python and type checkers see the function that it decorates.
-njit: Decorator
 
 #: Entry points by name in C, for `emb_daemon.ahead.build`.
 ENTRIES: dict[str, Entry] = {}
@@ -63,16 +57,16 @@ def _with_attributes(value):
     return value
 
 
-def _plain(function: _Function) -> _Function:
-    @functools.wraps(function)
-    def call(*arguments, **options):
-        return function(*map(_with_attributes, arguments), **options)
-
-    return call
-
-
 if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or importlib.util.find_spec("numba") is None:
-    njit = _plain
+
+    def njit(function: Function) -> Function:
+        """The function itself, over records whose fields are attributes."""
+
+        @functools.wraps(function)
+        def call(*arguments, **options):
+            return function(*map(_with_attributes, arguments), **options)
+
+        return call
 
     def compiled_for_the_next_start() -> bool:
         return False
@@ -88,7 +82,7 @@ else:
     from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit
 
 
-def entry(*takes: Kind, returns: int = 0) -> Decorator:
+def entry(*takes: Kind, returns: int = 0) -> Callable[[Function], Function]:
     """A function that Python calls in a tick. ``takes`` describes its arguments (see `emb_daemon.ahead.signature`),
     ``returns`` is the number of integers that it returns. Unlike functions of `njit` it is callable in a library compiled
     ahead."""

@@ -11,14 +11,12 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numba
 from numba.core import config, event, types
 
 from emb_daemon.ahead.library import installed_digest, who_else_writes
-
-_Function = TypeVar("_Function", bound=Callable[..., object])
+from emb_daemon.ahead.signature import Function
 
 
 def _cache_root() -> Path:
@@ -96,7 +94,7 @@ config.CACHE_DIR = str(_cache_folder())
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def njit(function: _Function) -> _Function:
+def njit(function: Function) -> Function:
     """Compile with numba, cached on disk; called from compiled code once for all values of an argument."""
     dispatcher = _compiled(function)
     template = dispatcher.get_call_template

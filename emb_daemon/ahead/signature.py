@@ -6,17 +6,12 @@ address and dimensions, for a record its address, for a number itself.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-_Function = TypeVar("_Function", bound=Callable[..., object])
-
-
-class Decorator(Protocol):
-    """Leaves the signature of what it decorates as it is."""
-
-    def __call__(self, function: _Function, /) -> _Function: ...
+#: What a decorator takes and returns, its signature unchanged.
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
 class Array(NamedTuple):

@@ -9,16 +9,8 @@ from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
 from emb_daemon.jit import Record, njit
-from emb_daemon.models.thermal import (
-    LONGEST_S,
-    NODES,
-    at_depth,
-    disc_loss,
-    friction_power,
-    heat_step,
-    mean_temperature,
-    stiffness_factor,
-)
+from emb_daemon.models import thermal
+from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -131,7 +123,7 @@ def _flow(s, t, e, m):
     _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
     power = s.heat_energy / dt
-    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, LONGEST_S)
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, thermal.LONGEST_S)
     s.disc += effects.disc_cooling(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
