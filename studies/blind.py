@@ -63,7 +63,7 @@ _FAMILY = {
     "gear_gain": ("clamp_force", "brake_torque", "disc_temperature"),
 }
 _EXPONENTS, _LAGS_S = (0.4, 2.6), (1.0, 20.0)
-#: Stops of a campaign with an effect outside the catalogue: as many as in a rig's six minutes; other campaigns have ten.
+#: Stops of a campaign for what no catalogue holds: as many as a rig's six minutes have; others have ten.
 _STOPS = {"foreign": 25, "drawn": 25}
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
@@ -136,7 +136,7 @@ class Trial:
         return {name for name in self.found if _without_number(name) not in true and not self._is_drawn(name)}
 
     def _is_drawn(self, found: str) -> bool:
-        """Whether a term has the port and the signal, or both signals, of a drawn effect."""
+        """Whether a term says what a drawn effect is: its port over one of its signals, or both."""
         if self.kind != "drawn" or not found.startswith("term:"):
             return False
         [(name, values)] = self.hidden.items()
@@ -196,7 +196,7 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
 
 
 def draw_foreign(rng: np.random.Generator) -> dict[str, dict[str, float]]:
-    """A random effect outside the catalogue, of size one."""
+    """An effect that nobody thought of, of size one."""
     port = list(_FAMILY)[rng.integers(len(_FAMILY))]
     signal = rng.choice(_FAMILY[port])
     other = rng.choice(_FAMILY[port]) if rng.uniform() < 1.0 / 3.0 else None

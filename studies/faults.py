@@ -341,8 +341,7 @@ def torque_constant(rng, moments, size):
 
 @_family
 def torque_constant_fade(rng, moments, size):
-    """Magnets lose 0.12 %/K as the motor's current heats winding and housing; minutes are compressed to the length of the
-    drive."""
+    """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
     heating = _draw_size(rng, 0.5, 3.0) / size.current**2
 
     def brake(plant):
@@ -424,7 +423,7 @@ def viscous(rng, moments, size):
 
 @_family
 def gear_wear(rng, moments, size):
-    """A gear that has run in or worn: other friction, presliding and backlash."""
+    """A gear that has run in or worn: friction, its presliding and play of another size."""
     friction, play = float(rng.uniform(0.7, 1.4)), _draw_size(rng, 0.01, 0.15)
 
     def brake(plant):

@@ -33,7 +33,7 @@ def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray
     columns: dict[str, np.ndarray] = {}
     for name, variable in variables.items():
         if name.startswith("__"):
-            # The file's own metadata.
+            # What the file says of itself.
             continue
         _add(columns, name, np.asarray(variable))
     return columns

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 _TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
-#: Endings of files that contain only frames; all others may be tables. First bytes of workbooks and HDF5, which are not read.
+#: Endings of logs of frames alone; all others may be a table's. How workbooks and HDF5 begin, which are not read.
 _FRAMES, _BINARY = (".blf", ".asc", ".trc"), (b"PK\x03\x04", b"\x89HDF", b"\xd0\xcf\x11\xe0")
-#: Separators of cells; the last one is any run of blanks.
+#: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3

@@ -52,7 +52,7 @@ class ThermalStep(Step):
 
     Attributes:
         fitted, unseen: recordings that fitted, and logs that validate, by name.
-        hot: fitted logs in which the brake works as in service: force while the pads heat up.
+        hot: logs that fitted in which the brake works as in service: force over heat.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
         figures: RMSE on logs that were not fitted, by name with unit, once `validate`d.
         achieved_K: the worst of these temperatures; None without one.
@@ -171,7 +171,7 @@ def _errors(parameters: np.ndarray, r: Recording, torque_known: bool = True) -> 
 
 
 def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibration):
-    """(temperatures to draw, figures on logs that were not fitted, residuals of those that were)."""
+    """(temperatures to draw, figures on logs that fitted nothing, residuals of those that did)."""
     temperatures, figures, residuals, parameters = {}, {}, {}, thermal_parameters(calibration)
     if "tune" in recordings:
         temperatures["tune"] = _compare("tune", recordings["tune"], parameters, residuals)
