@@ -25,12 +25,12 @@ from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Kelvin per second by which a disc may have heated while nobody looked, and at most: hard braking from motorway speed.
+#: Largest heating of a disc while the daemon was off, K/s and K: hard braking from motorway speed.
 _UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
-#: Longest step of the heat that flowed meanwhile, s, and longest time that is followed, s.
+#: Longest step when the heat flow meanwhile is simulated, s, and longest time that is simulated, s.
 _STEP_S, _FOLLOWED_S = 5.0, 6 * 3600.0
 
-#: What no brake's snapshot holds: a contact further from the calibration's than ten times what brakes reach, m; more than a
+#: Bounds of a plausible snapshot: a contact further from the calibration's than ten times what brakes reach, m; more than a
 #: pad or disc survives, degC; growth beyond ten times that of an iron disc, m/K; heat of motor and housing over what the
 #: largest force's current leaves for ever; errors beyond so many of their standard deviations.
 _CONTACT_M, _COLDEST_C, _HOTTEST_C, _GROWTH_M_PER_K, _HEAT, _SIGMAS = 1e-3, -60.0, 1200.0, 2.6e-6, 4.0, 10.0
@@ -59,7 +59,7 @@ SNAPSHOT = np.dtype(
 
 @njit
 def _copy_pads(to, pads):
-    # Not ``to[:, :] = pads``: that allocates.
+    # ``to[:, :] = pads`` would allocate.
     for side in range(2):
         for node in range(NODES):
             to[side, node] = pads[side, node]
@@ -92,7 +92,7 @@ def _widen(s, p):
 
 
 def why_implausible(snapshot: Record, p: Record) -> str:
-    """What in a SNAPSHOT no brake with PARAMETERS ``p`` can have had, by the record's names; empty if nothing."""
+    """Fields of a SNAPSHOT that are impossible for a brake with PARAMETERS ``p``, by name; empty if there are none."""
     widest = np.zeros(1, STATE)[0]
     _widen(widest, p)
     prior, covariance = widest["covariance"], snapshot["covariance"]
@@ -122,7 +122,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
 def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
 
-    Its first sample then starts it as ever, but from these values."""
+    Its first sample then starts it as usual, but from these values."""
     s.resumed = True
     s.clearance, s.clearance_sigma = snapshot.clearance, snapshot.clearance_sigma
     s.scale, s.growth, s.growth_start = snapshot.scale, snapshot.growth, snapshot.growth_start
@@ -146,14 +146,14 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
 
 @njit
 def follow_heat(s: Record, t: Record, m: Record) -> None:
-    """Let the heat of a snapshot flow for the time that has passed since, between the plates as they are now."""
+    """Simulate the heat flow of the time since the snapshot, with the plates' present temperatures."""
     ambient = m.ambient if m.has_status else m.caliper
     if s.rested_s > 0.0:
         before = s.disc
         s.disc = heat_step(
             t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S
         )
-        # How much air passed is as unknown as what braked; both die out as the disc cools.
+        # Cooling air and braking meanwhile are unknown; both effects vanish as the disc cools.
         s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
         s.temperature_sigma += 0.3 * abs(before - s.disc)
         forgotten = exp(-s.rested_s / t.history_time)
