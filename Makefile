@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean deb image fuzz soak mutation silent sbom audit fleet measurement
+.PHONY: demo test docs wheel wheel-demo lint format lock clean deb image fuzz soak mutation silent sbom audit fleet measurement types
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
@@ -100,6 +100,16 @@ measurement: $(READY)
 lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+
+# Fails unless every public name has a known type. The checker brings its own node; it finds the package through the first
+# python of the path.
+TYPES = build/types/bin
+$(TYPES)/pyright:
+	$(PYTHON) -m venv build/types
+	$(TYPES)/pip install --quiet --disable-pip-version-check 'pyright[nodejs]==1.1.414'
+
+types: $(READY) $(TYPES)/pyright
+	PATH="$(abspath $(VENV))/bin:$$PATH" $(abspath $(TYPES))/pyright --verifytypes emb_daemon --ignoreexternal
 
 format: $(READY)
 	$(VENV)/bin/ruff check --fix .

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     # The daemon and --help need none of this, and it takes half a second to import.
     if name in __all__:
         from emb_daemon import api

@@ -11,13 +11,27 @@ import functools
 import importlib.util
 import os
 from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_daemon.ahead import library
-from emb_daemon.ahead.signature import Array, Entry, name_in_c
+from emb_daemon.ahead.signature import Array, Entry, Function, Kind, name_in_c
 
-__all__ = ["ENTRIES", "Array", "compile_beside", "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit"]
+__all__ = [
+    "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Record", "Records", "compile_beside",
+    "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit",
+]  # fmt: skip
+
+# What annotations of kernels name. The fields of a `Record` are those of the numpy dtype that the argument's name or the
+# docstring says; kernels read and write them as attributes.
+Record: TypeAlias = np.void
+Records: TypeAlias = NDArray[np.void]
+Floats: TypeAlias = NDArray[np.float64]
+Booleans: TypeAlias = NDArray[np.bool_]
+Bytes: TypeAlias = NDArray[np.uint8]
 
 #: Entry points by name in C, for `emb_daemon.ahead.build`.
 ENTRIES: dict[str, Entry] = {}
@@ -43,24 +57,24 @@ def _with_attributes(value):
     return value
 
 
-def _plain(function):
-    @functools.wraps(function)
-    def call(*arguments, **options):
-        return function(*map(_with_attributes, arguments), **options)
-
-    return call
-
-
 if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or importlib.util.find_spec("numba") is None:
-    njit = _plain
+
+    def njit(function: Function) -> Function:
+        """The function itself, over records whose fields are attributes."""
+
+        @functools.wraps(function)
+        def call(*arguments, **options):
+            return function(*map(_with_attributes, arguments), **options)
+
+        return call
 
     def compiled_for_the_next_start() -> bool:
         return False
 
-    def compile_beside(_function, _work: Callable[[], object]) -> Callable[[], object]:
+    def compile_beside(function: Callable[..., object], work: Callable[[], object]) -> Callable[[], object]:
         return lambda: None
 
-    def depend_on(source) -> None:
+    def depend_on(source: Path) -> None:
         if library.in_use():
             raise RuntimeError(f"{source}: is not in the kernels compiled ahead; set {library.VARIABLE}= (empty) to use numba")
 
@@ -68,7 +82,7 @@ else:
     from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit
 
 
-def entry(*takes, returns: int = 0):
+def entry(*takes: Kind, returns: int = 0) -> Callable[[Function], Function]:
     """A function that Python calls in a tick. ``takes`` describes its arguments (see `emb_daemon.ahead.signature`),
     ``returns`` is the number of integers that it returns. Unlike functions of `njit` it is callable in a library compiled
     ahead."""

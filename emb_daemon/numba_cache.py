@@ -13,9 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numba
-from numba.core import config, event
+from numba.core import config, event, types
 
 from emb_daemon.ahead.library import installed_digest, who_else_writes
+from emb_daemon.ahead.signature import Function
 
 
 def _cache_root() -> Path:
@@ -64,7 +65,7 @@ def compiled_for_the_next_start() -> bool:
     return _compilations.count > 0 and _private is None
 
 
-def compile_beside(function, work: Callable[[], object]) -> Callable[[], object]:
+def compile_beside(function: Callable[..., object], work: Callable[[], object]) -> Callable[[], object]:
     """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
 
     Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Returns a
@@ -89,8 +90,21 @@ event.register("numba:compile", _compilations)
 _private: tempfile.TemporaryDirectory | None = None
 
 config.CACHE_DIR = str(_cache_folder())
-#: Compile with numba, cached on disk. fastmath stays off: without fused multiply-add a replay is equal on every machine.
-njit = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+# fastmath stays off: without fused multiply-add a replay is equal on every machine.
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+
+
+def njit(function: Function) -> Function:
+    """Compile with numba, cached on disk; called from compiled code once for all values of an argument."""
+    dispatcher = _compiled(function)
+    template = dispatcher.get_call_template
+
+    def of_types(arguments, named):
+        # numba would compile a function anew for each constant that it is called with.
+        return template([types.unliteral(kind) for kind in arguments], {k: types.unliteral(v) for k, v in named.items()})
+
+    dispatcher.get_call_template = of_types
+    return dispatcher
 
 
 def depend_on(source: Path) -> None:

@@ -5,10 +5,12 @@ a log. The same frames in the same order give the same payloads, because the sam
 message, by its Counter, so that jitter of arrival does not reach the estimator.
 """
 
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.records import LIMITS
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
@@ -95,20 +97,23 @@ class Pipeline:
         deadlines.
     """
 
-    def __init__(self, parameters, corners=wire.CORNERS, layout=None, capacity=4096, adaptation=None):
+    def __init__(
+        self, parameters: np.ndarray, corners: Sequence[str] = wire.CORNERS, layout: np.ndarray | None = None,
+        capacity: int = 4096, adaptation: Adaptation | None = None,
+    ):  # fmt: skip
         self.parameters = parameters
-        self.states = new_state(4)
-        self.corners = np.zeros(4, CORNER)
+        self.states: np.ndarray = new_state(4)
+        self.corners: np.ndarray = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
         self.corners["second_sender_ns"] = -2 * _SHOWN_NS
-        self.samples = np.zeros(capacity, SAMPLE)
-        self.estimates = np.zeros(capacity, ESTIMATE)
-        self.frames = np.zeros(4 * capacity, FRAME)
-        self.disturbed = np.zeros(4, np.int64)
-        self.layout = wire.default_layout() if layout is None else layout
-        self.receptions = new_reception()
-        self.transmission = np.zeros(1, TRANSMISSION)
+        self.samples: np.ndarray = np.zeros(capacity, SAMPLE)
+        self.estimates: np.ndarray = np.zeros(capacity, ESTIMATE)
+        self.frames: np.ndarray = np.zeros(4 * capacity, FRAME)
+        self.disturbed: np.ndarray = np.zeros(4, np.int64)
+        self.layout: np.ndarray = wire.default_layout() if layout is None else layout
+        self.receptions: np.ndarray = new_reception()
+        self.transmission: np.ndarray = np.zeros(1, TRANSMISSION)
         self.adaptation = adaptation
         self._limits = adaptation.limits if adaptation else np.zeros(4, LIMITS)
         if adaptation:
@@ -146,7 +151,7 @@ class Pipeline:
             return "braking is requested"
         return ""
 
-    def distrust(self, corners) -> None:
+    def distrust(self, corners: Iterable[str]) -> None:
         """Mark the estimates of these corners as Fault, because they or their inputs cannot be authenticated."""
         for name in corners:
             self.corners["unproven"][wire.CORNERS.index(name)] = True

@@ -1,7 +1,9 @@
 """Logs through the daemon's pipeline, one after the other as one drive."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +60,7 @@ class Result:
         names = ("time_ns", "estimates", "samples", "force_N")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, Any]:
         """Error figures against the log's reference instruments, if it has any."""
         return {
             "log": str(self.path),
@@ -97,7 +99,7 @@ class Replay:
         corner: str = "FL",
         measured_torque: bool = False,
         state: Path | None = None,
-        read=read_frames,
+        read: Callable[[Path], np.ndarray] = read_frames,
         start_s: float = 0.0,
         end_s: float = float("inf"),
     ):
@@ -141,7 +143,7 @@ class Replay:
         self._end_ns = int(frames["time_ns"][-1])
         return shift
 
-    def frames(self, path: Path):
+    def frames(self, path: Path) -> Iterator[np.ndarray]:
         """The frames that the daemon would have sent, as FRAME arrays on the drive's clock."""
         frames = self._read(path)
         self._on_the_drive(frames, path)

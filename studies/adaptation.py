@@ -1,4 +1,4 @@
-"""What can be said of contact and adaptation only by many repetitions: false alarms and wear over a life.
+"""Properties of contact and adaptation that need many repetitions: false alarms, and wear over a life.
 
     python -m studies.adaptation alarms
     python -m studies.adaptation wear --output DIR
@@ -51,7 +51,7 @@ def _false_alarms(state, releases, p, contact_sigma, rng):
                 speed = p.speed_sigma * rng.standard_normal()
                 coloured = rho * coloured + sqrt(1.0 - rho * rho) * rng.standard_normal()
                 torque = p.torque_constant * p.current_sigma * coloured - p.inertia * (speed - before) / CYCLE_S + offset
-                watch_closing(state, torque, 0.0, direction, sigma, limit, x + believed, contact_sigma)
+                watch_closing(state, torque, 0.0, direction, sigma, limit, x + believed, contact_sigma, 0.0, 0.0)
                 alarmed |= engaged(state, x + believed, contact_sigma)
                 x += direction * pace * CYCLE_S
                 samples += 1
@@ -70,10 +70,10 @@ def false_alarms(calibration: Calibration, releases: int = 100_000, contact_sigm
 def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear_mm: float = 9.0, seed: int = 1) -> dict:
     """Force error of a brake whose pads wear by ``wear_mm`` over ``cycles`` park cycles, with adaptation and without.
 
-    Training motion is driven in every ``cycles / trainings``-th cycle, and the force is judged on random motor angles
-    (thesis 3.3.2) afterwards, in the state of wear then reached; the cycles between only wear the pads. The daemon is
-    started anew each time, so what it learned comes from its memory. Contact is where the released position puts it: the
-    actuator follows wear. Simulated car, whose brake shares no force model with the estimator.
+    Training motion is driven in every ``cycles / trainings``-th cycle, and the force is judged on random motor angles (thesis
+    3.3.2) afterwards, in the state of wear then reached; the cycles between only wear the pads. The daemon is restarted each
+    time, so that learned values come from its memory. The clearance stays the same, because the actuator follows wear.
+    Simulated car, whose brake shares no force model with the estimator.
     """
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
@@ -129,7 +129,7 @@ def plot_wear(result: dict, path: Path) -> None:
 
 
 def specimen(number: int) -> Store:
-    """A store whose every value tells ``number``, so that a mixture of two would show."""
+    """A store in which every value contains ``number``, so that a mixture of two would be noticed."""
     value = float(number)
     entry = Entry(
         date=str(number), outcome="accepted", note="", ambient_C=value, pad_rise_K=value,

@@ -1,4 +1,4 @@
-"""What somebody on the bus can do who knows ids, layouts and E2E protection, and no key.
+"""What an attacker on the bus can do who knows ids, layouts and E2E protection, but no key.
 
     python -m studies.attacks [--seed N] [--seconds S] [--frames N]
 
@@ -36,12 +36,12 @@ from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
 from emb_daemon.wire.secoc import FRESHNESS_SET, Signer, Verifier, load_links
 
 _RESOLVER, _CURRENT = 0x100, 0x110
-#: From when to when the attackers are there: every sender's schedule is known by then, and what stays behind shows, s.
+#: Begin and end of the attack, s: before it every sender's schedule is known, and after it lasting effects show.
 _FROM_S, _TO_S = 10.0, 40.0
-#: How long before the genuine frame a forged one comes, ms; what it adds to the motor angle, rad, swinging in so many s: no
-#: step gives it away.
+#: Time between a forged frame and the genuine one after it, ms; amplitude of what it adds to the motor angle, rad, and period,
+#: s, so that there is no step.
 _AHEAD_MS, _ADDED_RAD, _SWINGS_S = (0.05, 0.5, 1.0, 2.1), 6.0, 2.0
-#: How old what is played back is: a whole number of turns of the counter, s.
+#: Age of replayed frames, s: a whole number of turns of the counter.
 _OLD_S = (0.06, 0.6, 3.0)
 _FLOOD_PER_S = 6700
 _START_NS = 1_000_000_000
@@ -52,7 +52,7 @@ _AUTH, _FRESHNESS = _RECEIVED[0].authentication_id, _RECEIVED[0].freshness_id
 
 @njit
 def _moved(frames, signal, added):
-    """Motor angles by ``added`` rad greater, protected anew."""
+    """Frames with ``added`` rad added to the motor angle, protected again."""
     mask = ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)) << np.uint64(signal.start)
     for index in range(len(frames)):
         frame = frames[index]
@@ -117,7 +117,7 @@ def flood(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def keys_of(seed: int):
-    """CMACs of all links by name, and one of nobody's key."""
+    """CMACs of all links by name, and one of an unknown key."""
     rng = np.random.default_rng((seed, 7))
     macs = {link.name: cmac(rng.bytes(16)) for link in (*_RECEIVED, *_SENT)}
     return macs, cmac(rng.bytes(16))
@@ -150,7 +150,7 @@ def _with_code(frames: np.ndarray, code: np.ndarray) -> np.ndarray:
 
 
 def _forged_sets(genuine, rng, _macs):
-    """Values of one's own, and a guess of their authenticator under the freshness that is expected."""
+    """Forged values, and a guessed authenticator under the expected freshness value."""
     forged = _early(genuine, rng)
     named = np.isin(forged["can_id"], [link.authentication_id for link in _RECEIVED])
     forged["data"] ^= np.where(named, 0, rng.integers(1, 2**16, len(forged)) << 16).astype(np.uint64)
@@ -165,7 +165,7 @@ def _guesses(genuine, rng, _macs):
 
 
 def _played_back(genuine, rng, _macs):
-    """Everything as it was some turns of the counter ago, authentication included."""
+    """All frames of some turns of the counter ago, authentication included."""
     again = _early(genuine, rng)
     again["time_ns"] += rng.integers(1, 100) * COUNTER_MODULO * CYCLE_NS
     return again
@@ -182,7 +182,8 @@ def _played_back_as_expected(genuine, rng, macs):
 
 
 def _freshness_of_the_future(genuine, rng, _macs):
-    """A trip and reset far ahead, which would make all later genuine frames old ones, in pairs with a guess."""
+    """Trip and reset counters far ahead, after which all genuine frames would count as old, each with a guessed
+    authenticator."""
     forged = _early(genuine[genuine["can_id"] == _AUTH], rng)
     forged = forged[: len(forged) // 2 * 2]
     counters = forged["data"][::2] & np.uint64(0xF00)
@@ -211,7 +212,7 @@ FORGERIES = {
 
 
 def _of_drive(frames: np.ndarray) -> np.ndarray:
-    """Which frames are none of authentication."""
+    """Mask of the frames that are not for authentication."""
     return ~np.isin(frames["can_id"], [can_id for link in _RECEIVED for can_id in (link.authentication_id, link.freshness_id)])
 
 
@@ -255,8 +256,8 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
 
 
 def _cost(seed: int) -> None:
-    """Median time of a tick of four corners, µs: of what the daemon hears and of what it sends; on the CPU, whatever else
-    runs."""
+    """Median time of a tick of four corners, µs: of what the daemon hears and of what it sends; on the CPU, independent of
+    other processes."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     plants = np.array([plant_from_calibration(calibration, seed + k) for k in range(4)])
     schedule = city_drive().first(20.0)

@@ -2,12 +2,12 @@
 
     python -m studies.blind --null 200 --single 5 --pairs 40 --foreign 10 --output blind.jsonl
 
-Trials are appended to the file one by one; started again with the same file, the command goes on where it was stopped, and
-prints the table of all.
+Trials are appended to the file one by one. Started again with the same file, the command continues, and prints the table of
+all trials.
 
 Each trial draws a unit that scatters about the calibration as units do, gives it no effect, one, two, three, one that the
-calibration has with another size, or one that the catalogue does not know, drives a campaign with it, and hands log and
-calibration to `diagnose`, which is not told. Sizes are drawn as the RMS error (N) that the effect makes on its own path, so
+calibration has with another size, or one that the catalogue does not know, drives a campaign with it, and gives log and
+calibration to `diagnose` without telling it. Sizes are drawn as the RMS error (N) that the effect makes on its own path, so
 that power can be stated per size. The plant shares no code with the estimator (see emb_daemon/plant).
 """
 
@@ -38,9 +38,9 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
 
-#: Effects that say from which ranges they are to be drawn.
+#: Effects with ranges from which they can be drawn.
 DRAWN = {effect.name: effect for effect in REGISTRY if all(parameter.drawn for parameter in effect.parameters)}
-#: Effects outside the catalogue, with a size at which they matter, and the terms that say the same: port and signal.
+#: Effects outside the catalogue, with a relevant size, and the equivalent terms: port and signal.
 _FOREIGN = {
     "clamp_creep": {"share": 0.06, "time_constant_s": 30.0},
     "brake_torque_coupling": {"per_Nm": 6e-5},
@@ -67,7 +67,7 @@ _EXPONENTS, _LAGS_S = (0.4, 2.6), (1.0, 20.0)
 _STOPS = {"foreign": 25, "drawn": 25}
 #: Sizes (N RMS on the effect's own path) of the power curve.
 SIZES_N = (75.0, 150.0, 300.0, 600.0)
-#: Effects of the brake over those of a calibration that has them with another size.
+#: Size of the brake's effects over that in the calibration, in trials with changed effects.
 _CHANGES = (1.0 / 3.0, 3.0)
 
 
@@ -84,7 +84,7 @@ class Rest:
         after: with the calibration that `diagnose` wrote.
         plain, fitted: of the same unit and schedule with nothing hidden, by the calibration as it was, and fitted to that very
             log: what it achieves on such units, and what it could.
-        said: whether the report calls something unexplained there.
+        said: whether the report says that something is unexplained there.
     """
 
     after: float
@@ -94,7 +94,7 @@ class Rest:
 
     @property
     def anything(self) -> bool | None:
-        """Whether something is left; None where nobody could say."""
+        """Whether something is left; None where that is undecidable."""
         if self.after <= _NOTHING * self.fitted:
             return False
         return True if self.after >= _LEFT * max(self.plain, self.fitted) else None
@@ -105,7 +105,7 @@ class Trial:
     """What was hidden and what was found.
 
     Attributes:
-        hidden: effects of the plant with their parameters, beside those of the calibration.
+        hidden: effects of the plant with their parameters, in addition to those of the calibration.
         size: RMS that each makes on its own path, N.
         found: effects accepted, with their parameters.
         changed: effects of the calibration that are not as calibrated.
@@ -157,7 +157,7 @@ class Trial:
 
 
 def _without_number(term: str) -> str:
-    """A term's name, of several that say the same the first's."""
+    """A term's name without the number that distinguishes several of the same kind."""
     name, _, number = term.rpartition(":")
     return name if number.isdigit() else term
 
@@ -174,7 +174,7 @@ def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:
 
 
 def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of an effect at the size that physics leads one to expect."""
+    """Parameters of an effect at its physically expected size."""
     effect, values = DRAWN[name], {}
     for parameter in effect.parameters:
         low, high = parameter.drawn
@@ -258,7 +258,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         bench = Bench([log_of(frames)], start)
         for name in names:
             values = draw(name, rng)
-            # Twice, because large sizes are not quite linear.
+            # Twice, because the effect is not quite linear in its size.
             for _ in range(2):
                 values = scaled(name, values, size / max(rmse(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
@@ -306,7 +306,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
 
 
 def what_is_left(result: Diagnosis, alone: Log) -> dict[str, Rest]:
-    """By path, beside the log of the same unit with nothing hidden."""
+    """Remaining error by path, compared with the log of the same unit with nothing hidden."""
     plain = Model.of(Bench([alone], result.original))
     fitted = plain.refined(FORCE_CHANNELS)
     judges = result.judges.under(result.calibration)
@@ -418,7 +418,8 @@ def _share(group: list[Trial]) -> str:
 
 
 def _said(group: list[Trial], anything: bool) -> str:
-    """Paths on which the report says rightly that something is left (``anything``), or that nothing is, of all where it is."""
+    """Number of paths on which the report is right that something is left (``anything``) or that nothing is, of all such
+    paths."""
     said = [rest.said is anything for trial in group for rest in trial.left.values() if rest.anything is anything]
     return f"{sum(said)}/{len(said)}" if said else "–"
 
@@ -429,7 +430,7 @@ def _percent(errors: list[float]) -> str:
 
 
 def recorded(path: Path | None) -> list[Trial]:
-    """Trials that an earlier run has left in a file; the last line may be cut."""
+    """Trials of an earlier run from a file; the last line may be incomplete."""
     trials = []
     for line in path.read_bytes().splitlines() if path and path.exists() else []:
         try:

@@ -33,7 +33,7 @@ class Fault:
         car: called as (car, time_s) before every stretch of the drive.
         bus: called as (frames, time_s), returns the frames that reach the daemon.
         effects: effects that both brake and calibration have, so that they are no change.
-        ambient_C: of the surroundings, and of everything at the start but for ``warm_C``.
+        ambient_C: of the surroundings, and at the start of everything except for ``warm_C``.
         warm_C: of the disc, of plates and caliper, and the share of the pads' rise that their softening remembers.
         power_on_s: when the daemon first hears anything.
         restarts: (time, silence before it, in s) of further starts of the daemon.
@@ -55,7 +55,7 @@ class Fault:
 
 
 class Size(NamedTuple):
-    """A brake over another one, where sizes of faults are in newtons, amperes or N m s/rad."""
+    """Ratios of a brake to the shipped one, by which faults in newtons, amperes or N m s/rad are scaled."""
 
     force: float = 1.0
     current: float = 1.0
@@ -73,12 +73,12 @@ def size_of(brake: Calibration, other: Calibration) -> Size:
 
 
 FAMILIES: dict[str, Callable] = {}
-#: Families of which a few stops and a training must leave nothing but a small error and a small sigma.
+#: Families after which a few stops and a training must lead to a small error and a small sigma.
 LEARNED = {
     "pads_thickness", "pads_compound", "contact_jump", "contact_slow", "knock_back", "current_offset", "current_offset_later",
     "gear_wear", "disc_growth",
 }  # fmt: skip
-#: Families in which nothing is wrong.
+#: Families without a fault.
 NOMINAL = {"nominal"}
 
 
@@ -251,7 +251,7 @@ def nominal(rng, moments, size):
 
 @_family
 def tolerance(rng, moments, size):
-    """A unit that nobody calibrated: torque constant within 3 %, what else the datasheet states within 15 %."""
+    """A unit with the calibration of another: torque constant within 3 %, other datasheet values within 15 %."""
     drawn = {"torque_constant": 0.03} | dict.fromkeys(
         ("inertia", "load_friction", "offset_friction", "presliding_angle", "curve", "conductivity", "specific_heat"), 0.15
     )
@@ -457,7 +457,7 @@ def resolver_frozen_speed_zero(rng, moments, size):
 
 @_family
 def resolver_frozen_speed_noise(rng, moments, size):
-    """The resolver's rotor has come off its shaft; its angle may flicker."""
+    """The resolver's rotor is loose on its shaft; its angle may flicker."""
     flicker = 1e-3 if rng.random() < 0.5 else 0.0
 
     def speed(values, _):
@@ -631,7 +631,7 @@ def thermocouple_lost(rng, moments, size):
 def power_on_hot(rng, moments, size):
     """Power comes on a brake that has just stopped from a long descent: hot disc, pads between it and their plates."""
     disc, plate = float(rng.uniform(200.0, 500.0)), float(rng.uniform(60.0, 140.0))
-    # Minutes of descent against the half hour and more of the softening's memory.
+    # The descent takes minutes, the softening's memory half an hour and more.
     return Fault(f"disc {disc:.0f}, plates {plate:.0f} degC", warm_C=(disc, plate, float(rng.uniform(0.2, 0.6))))
 
 

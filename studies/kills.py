@@ -74,7 +74,7 @@ def live(memory: Memory, calibration: Calibration, pads_mm: float, night: int = 
     car = Car(np.atleast_1d(plant), (_CORNER,), 1)
     adaptation = Adaptation({_CORNER: calibration}, memory, lambda _: time.time_ns() + night * _NIGHT_NS)
     pipeline = Pipeline(np.zeros(4, PARAMETERS), (_CORNER,), capacity=64, adaptation=adaptation)
-    adaptation.warm_up(pipeline)
+    adaptation.warm_up(pipeline.states[0], pipeline.parameters[0])
     pipeline.begin(0)
     schedule = rest(1.0) + park(1.0, _PARKED_S)
     # Released, so that the training stroke begins in the clearance.

@@ -59,7 +59,7 @@ def _latched(calibration: Calibration, rng: np.random.Generator) -> sc.Schedule:
 
 
 def draw_mechanism(seed: int) -> Stranger:
-    """The brake of a seed: its kind is the seed's rest by four."""
+    """The brake of a seed; the seed modulo four selects its kind."""
     rng = np.random.default_rng(seed)
     calibration, kind = draw_brake(rng), seed % 4
     if kind < 3:

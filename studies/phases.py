@@ -1,6 +1,6 @@
 """Judges estimates of one drive, phase by phase, against the reference force: is the estimator ever silently wrong?
 
-A phase is a named span of the drive. Samples are *silent* where mode is running or adapting: there a reader trusts them.
+A phase is a named span of the drive. Samples are *silent* while the mode is running or adapting, so that a reader trusts them.
 They are *usable* where the source is not invalid and the mode not init.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import ADAPTING, FUSED, INIT, INVALID, RUNNING
 
-#: Noise of the reference force sensor, N, that a stated sigma need not cover.
+#: Noise of the reference force sensor, N, which sigma need not cover.
 REFERENCE_SIGMA_N = 25.0
 #: What is promised of every phase. Shares are of the phase's silent or usable samples; forces in N, times in s.
 SILENT_BEYOND, USABLE_BEYOND = 0.01, 0.02
@@ -59,7 +59,7 @@ def _share(mask: np.ndarray, of: np.ndarray) -> float:
 
 
 def _longest(mask: np.ndarray, time_s: np.ndarray) -> float:
-    """Longest time that ``mask`` lasts, in s; a single sample lasts nothing."""
+    """Longest time that ``mask`` lasts, in s; 0 for a single sample."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
     if not len(edges):
         return 0.0
@@ -84,7 +84,7 @@ def judge(
     usable = (estimates["source"] != INVALID) & (estimates["mode"] != INIT)
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(estimates["force"] - reference_N)
-        # Not a number is beyond everything.
+        # NaN counts as beyond any bound.
         beyond = ~(error <= 3.0 * np.hypot(estimates["sigma"], REFERENCE_SIGMA_N))
         large = ~(error <= LARGE_N) & silent
         errors = [(estimates[path] - reference_N)[usable] for path in ("force", "stiffness_force", "torque_force")]
@@ -112,7 +112,7 @@ def judge(
 
 
 def flags(estimates: np.ndarray) -> np.ndarray:
-    """Where a reader is told not to trust the row: a reason, a mode other than running or adapting, a source that fell."""
+    """Mask of the rows that are flagged: a reason, a mode other than running or adapting, or a lower source."""
     return (estimates["reasons"] != 0) | ~np.isin(estimates["mode"], _RUNNING_MODES) | (estimates["source"] != FUSED)
 
 

@@ -42,7 +42,7 @@ from studies.phases import (
 
 #: When the service logs' training begins and ends, s.
 _TRAINING_S = (242.0, 284.0)
-#: When the change of a service log begins, s, where not at the start.
+#: Begin of the change of a service log, s, if not at the start.
 _ONSET_S = {"contact_plus_40um": 80.0, "current_offset_later": 60.0, "resolver_frozen": 61.27, "wheel_frames_lost": 20.0}
 #: Changes that driving and training must have healed afterwards.
 _HEALED = ("pads_6p5mm", "compound_stiffer", "contact_plus_40um", "current_offset_later", "disc_growth")
@@ -50,7 +50,7 @@ _HEALED = ("pads_6p5mm", "compound_stiffer", "contact_plus_40um", "current_offse
 _NOMINAL_RMSE_N = {"before": 31.5, "training": 35.5, "after": 34.7}
 #: Between these lines of docs/safety.md stands the table that `grid --table` writes.
 _BEGIN, _END = "<!-- detection times: begin -->", "<!-- detection times: end -->"
-#: Flags of the first moments, s, are of power-on: slow inputs have not been heard yet.
+#: Flags within this time, s, are due to power-on: slow inputs have not been received yet.
 _POWER_ON_S = 0.5
 
 
@@ -87,7 +87,7 @@ def judge_log(name: str, time_s: np.ndarray, estimates: np.ndarray, force_N: np.
 
 
 def _print_json(figures: dict) -> None:
-    """What is not finite is null."""
+    """Print JSON with null for values that are not finite."""
     print(msgspec.json.format(msgspec.json.encode(figures), indent=1).decode())
 
 

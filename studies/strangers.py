@@ -1,12 +1,12 @@
-"""Brakes of other physics, identified from campaign and datasheet alone, and judged on a drive that fitted nothing.
+"""Brakes with other physics, identified from campaign and datasheet alone, and judged on a drive that was not fitted.
 
     python -m studies.strangers --seeds 0 1 2 3 [--without random ...] [--kept DIR]
 
-Each seed draws a simulated brake: force from 10 to 45 kN, another screw, motor and friction, three effects of the catalogue
-at their usual sizes and one that no catalogue lists. A campaign is recorded as a rig does it (curves and random angles at
-three pad thicknesses, a training, heat, drives with stops) and given to `emb-daemon identify`. What comes out estimates
-another drive, or the campaign's own judge where the brake jams in that; printed are its errors, what the calibration says of
-itself, and what it named. With parts of the campaign, or single logs, left out it shows what a thin campaign is worth.
+Each seed draws a simulated brake: force from 10 to 45 kN, another screw, motor and friction, three effects of the catalogue at
+their usual sizes and one that no catalogue lists. A campaign is recorded as a rig does it (curves and random angles at three
+pad thicknesses, a training, heat, drives with stops) and given to `emb-daemon identify`. The resulting calibration estimates
+another drive, or the campaign's own judge if the brake jams in that. Printed are its errors, what the calibration states of
+itself, and what was named. With parts of the campaign, or single logs, left out it shows the effect of a smaller campaign.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from studies.blind import DRAWN, draw, draw_foreign, sized
 _THICKNESSES_MM = (3.5, 6.5, 9.5)
 #: RMS of the effect that no catalogue lists, as a share of the brake's force: 300 N at 30 kN.
 _FOREIGN_SHARE = 0.01
-#: What a reference force sensor leaves unknown, N (the measure of `studies.silent`).
+#: Uncertainty of a reference force sensor, N (as in `studies.silent`).
 _REFERENCE_N = 25.0
 
 
@@ -214,7 +214,7 @@ def _thin(campaign: dict, without: Sequence[str]) -> dict:
 
 
 def judge(calibration: Calibration, path: Path) -> dict[str, float]:
-    """Errors on a drive that fitted nothing: of the force in N and shares of it, of the pads in K."""
+    """Errors on a drive that was not fitted: of the force in N and relative to it, of the pads in K."""
     log = load_log(path)
     estimates = estimate(log.samples, to_parameters(calibration))
     known = slice(first_known(estimates), None)
@@ -233,7 +233,7 @@ def judge(calibration: Calibration, path: Path) -> dict[str, float]:
 
 
 def _opens(path: Path) -> bool:
-    """Whether the brake is released at the end of a drive: a drawn loss of the gear may grow until it holds itself."""
+    """Whether the brake is released at the end of a drive: a drawn loss of the gear may grow until it is self-locking."""
     force = load_log(path).force_N
     return float(np.nanmedian(force[-50:])) < 0.1 * float(np.nanmax(force))
 

@@ -1,4 +1,5 @@
-"""The thesis's models beside ours, identified and judged on the same logs, and what the thesis reports of its own rig.
+"""The thesis's models and ours, identified and judged on the same logs, and the figures that the thesis reports of its own
+rig.
 
     python -m studies.thesis ../shared/rig/campaign.yaml
 
@@ -39,11 +40,11 @@ from emb_daemon.wire.contract import CYCLE_S
 from studies.frequency import response
 from studies.thesis_pad import thesis_profiles
 
-#: Presliding angle that stands for the sign function, rad.
+#: Presliding angle that approximates the sign function, rad.
 SIGN = 1e-6
-#: Largest rise of conductivity that the thesis's pad may take, 1/K: without a bound it takes absurd ones.
+#: Bound of the rise of conductivity of the thesis's pad, 1/K; without it the fit is unphysical.
 _MOST_RISE = 2e-3
-#: A fusion may be worse than the better of its inputs by this much.
+#: Relative amount by which a fusion may be worse than the better of its inputs.
 _WORSE = 1.05
 #: Share of errors inside two stated standard deviations.
 _HONEST = (0.90, 0.99)
@@ -64,7 +65,7 @@ class Form:
     def values(self, calibration: Calibration) -> dict[str, float]:
         """The curve by the calibration's keys."""
         coefficients = self.coefficients.copy()
-        # The estimator wants a force that rises from contact; a line of best fit may start flat.
+        # The estimator needs a force that rises from contact; a line of best fit may start flat.
         coefficients[0] = max(coefficients[0], 1e-3 * float(np.max(np.abs(coefficients))))
         return dict(zip(curve_keys(calibration, self.thickness_mm), coefficients, strict=True))
 
@@ -131,7 +132,7 @@ def _regressors(log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def unexplained(log: Log, found: TorqueFit, gear_gain: float) -> Unexplained:
-    """Current that the thesis's form leaves on a log."""
+    """Current that the thesis's form leaves unexplained on a log."""
     rows, columns, current = _regressors(log)
     coefficients = np.array([gear_gain, *(found.values[key] for key in (INERTIA, OFFSET_FRICTION, LOAD_FRICTION))])
     residual = current - columns @ coefficients / found.values[TORQUE_CONSTANT]
@@ -159,7 +160,7 @@ def regress_torque(logs: list[Log], sheet: Datasheet) -> TorqueFit:
 
 
 class Thesis:
-    """The thesis's forms of everything that an identification found."""
+    """The thesis's forms of all models of an identification."""
 
     def __init__(self, result: Identification):
         self.result = result
@@ -217,12 +218,12 @@ class Thesis:
         return moved(self.plain, values | {RELAXATION: self.damping_s, CLEARANCE: clearance})
 
     def of_fold(self, fold: Fold) -> Calibration:
-        """What the thesis's forms know of one thickness without its random logs."""
+        """The thesis's forms of one thickness, identified without its random logs."""
         others = [other for other in self.folds if other is not fold] or [fold]
         return moved(self.plain, self._noise(others, self.result.campaign.pad_thickness_mm).values | fold.values)
 
     def validate(self) -> dict[str, Validation]:
-        """By name, the same logs as ours."""
+        """Errors by name, on the same logs as ours."""
         whole, gears = self.calibration(), dict(self.torque_step.gears)
         ours = {one.name: one for one in self.result.validations}
         found = {}
@@ -289,7 +290,7 @@ def moving_window(rise: np.ndarray, step_s: float, width_s: float) -> np.ndarray
 
 
 def softening_rmse_N(log: Log, heat: Recording, calibration: Calibration) -> float:
-    """RMSE over bursts that fitted nothing, of a static line with the moving window; arguments as in `fit_softening`."""
+    """RMSE over bursts that were not fitted, of a static line with the moving window; arguments as in `fit_softening`."""
     bursts = cold_bursts(log, heat, calibration)
     force = [bursts.force_N(index) for index in range(len(bursts.rows))]
     x = [log.samples["angle"][rows] - bursts.contact for rows in bursts.rows]
@@ -346,7 +347,7 @@ def _span(values: list[float]) -> str:
 
 
 def force_lines(ours: list[Validation], thesis: dict[str, Validation]) -> list[Line]:
-    """Forces, kN RMSE over every sample of logs that fitted nothing."""
+    """Forces, kN RMSE over every sample of logs that were not fitted."""
     lines = []
 
     def add(name, kinds, path, reported, target=None, fusion=False):
@@ -402,7 +403,7 @@ def thermal_lines(result: Identification) -> list[Line]:
 
 
 def frequency_lines(result: Identification) -> list[str]:
-    """First-order frequency response, and what the identified dynamics make of logs that they never saw."""
+    """First-order frequency response, and the identified dynamics on logs that were not fitted."""
     campaign, fit, trials = result.campaign, result.stiffness.fit, []
     clearance = result.calibration.contact.clearance_rad
     for entry in campaign.file.frequency_response:

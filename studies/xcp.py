@@ -47,7 +47,7 @@ class Master:
         self.gaps = self.overloads = 0
 
     def ask(self, layout: str, *values: int) -> bytes:
-        """The response to a command; data that come meanwhile count."""
+        """The response to a command; data packets that come meanwhile are counted."""
         packet = struct.pack("<" + layout, *values)
         self._socket.send(struct.pack("<HH", len(packet), self._sent & 0xFFFF) + packet)
         self._sent += 1
@@ -97,7 +97,7 @@ class Master:
 
 
 def cost_us(rounds: int = 100_000) -> tuple[float, float]:
-    """Median and 99 % quantile of what telling four rows costs, with a thousand of them after each other."""
+    """Median and 99 % quantile of the time to write four rows, over a thousand repetitions."""
     pipeline = SimpleNamespace(
         samples=np.zeros(4096, SAMPLE), estimates=np.zeros(4096, ESTIMATE), parameters=np.zeros(4, PARAMETERS)
     )
@@ -159,7 +159,7 @@ def _judge(port: int, share: Path, seconds: float) -> int:
     print(f"lost: {master.gaps} by the packet counter, {master.overloads} overloads")
     print(f"steps of the time stamps, ms: median {np.median(steps) / 1e3:.3f}, longest {steps.max() / 1e3:.1f}")
     print("telling four rows costs the loop {:.2f} µs (median), {:.2f} µs (99 %)".format(*cost_us()))
-    # What was on its way at either end.
+    # Packets that were on their way at begin and end.
     complete = abs(came - rows) <= 64
     return int(bool(master.gaps or master.overloads or not complete))
 

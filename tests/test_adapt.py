@@ -133,7 +133,7 @@ def test_the_helper_thread_changes_no_byte(rig, once, tmp_path):
     learner = Adaptation({"FL": calibration}, Memory(tmp_path / "thread"), int, threaded=True)
     pipeline = Pipeline(parameters, ("FL",), capacity=64, adaptation=learner)
     pipeline.begin(int(frames["time_ns"][0]))
-    learner.warm_up(Pipeline(parameters.copy(), ("FL",), capacity=64))
+    learner.warm_up(new_state()[0], parameters[0].copy())
     sent, start = [], 0
     while start < len(frames):
         start, count = pipeline.consume(frames, start)

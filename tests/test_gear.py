@@ -166,7 +166,7 @@ def test_the_monitors_bounds_hold_the_force_wherever_the_gear_may_be(shipped):
         m["current_q"] = p["gear_gain"] * slope * (10e3 + spring) / (gain * p["torque_constant"])
         m["speed"] = speed
         for _ in range(300):
-            bound(w[0], p, m[0])
+            bound(w[0], p, m[0], 1.0)
         assert w["low"][0] < 10e3 < w["high"][0], (slope, spring, gain, speed)
 
 

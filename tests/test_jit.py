@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba import types
 
 import emb_daemon
 from emb_daemon.ahead.library import installed_digest, source_digest
+from emb_daemon.jit import njit
 
 _PACKAGE = Path(emb_daemon.__file__).parent
 _CALL = """
@@ -41,6 +43,18 @@ def test_digest_follows_kernels_and_records_and_nothing_else(tmp_path):
         changed = source_digest(package)
         assert changed != before, name
         before = changed
+
+
+@njit
+def _twice_if(asked, value):
+    return value + value if asked else value
+
+
+def test_constants_share_one_compiled_version():
+    """A second of compiling for each of them would be wasted."""
+    for constant in (True, False):
+        _twice_if.get_call_template([types.literal(constant), types.float64], {})
+    assert _twice_if.signatures == [(types.boolean, types.float64)]
 
 
 def _call(**variables) -> subprocess.CompletedProcess:

@@ -90,7 +90,7 @@ def test_strokes_at_any_speed_never_contradict_the_true_force(p, gain, friction,
     rows["current_q"] = rows["current_q"] / gain + offset * p["gear_gain"] * p["maximum_force"] / p["torque_constant"]
     watched = Watched(p)
     for row, now in zip(rows, force, strict=True):
-        bound(watched.w[0], p, row)
+        bound(watched.w[0], p, row, 1.0)
         assert not contradicts(watched.w[0], now, 50.0, row["dt"])
 
 
@@ -215,7 +215,7 @@ def test_what_accelerates_the_motor_is_no_force(p):
     watched.m["current_q"] = p["inertia"] * 2000.0 / p["torque_constant"]
     for sample in range(60):
         watched.m["speed"] = 2000.0 * sample * _DT
-        bound(watched.w[0], p, watched.m[0])
+        bound(watched.w[0], p, watched.m[0], 1.0)
     assert watched.w["torque"][0] == pytest.approx(0.0, abs=0.12 * p["inertia"] * 2000.0)
 
 

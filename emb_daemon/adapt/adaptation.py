@@ -31,7 +31,7 @@ from emb_daemon.wire.layout import CORNERS
 #: Time for which `close` waits for the helper thread, s.
 _CLOSING_S = 2.0
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 class Adaptation:
@@ -53,11 +53,11 @@ class Adaptation:
     def __init__(
         self, calibrations: dict[str, Calibration], memory: Memory, clock: Callable[[int], int], threaded: bool = False
     ):
-        self.adapters = np.zeros(4, r.ADAPTER)
-        self.limits = np.zeros(4, r.LIMITS)
-        self.rows = np.zeros((4, r.CAPACITY), r.TRAINING)
-        self.learned = np.zeros(4, PARAMETERS)
-        self.reached = np.zeros(4, STATE)
+        self.adapters: np.ndarray = np.zeros(4, r.ADAPTER)
+        self.limits: np.ndarray = np.zeros(4, r.LIMITS)
+        self.rows: np.ndarray = np.zeros((4, r.CAPACITY), r.TRAINING)
+        self.learned: np.ndarray = np.zeros(4, PARAMETERS)
+        self.reached: np.ndarray = np.zeros(4, STATE)
         self._remembered = np.zeros(4, r.REMEMBERED)
         self._memory, self._clock, self._threaded = memory, clock, threaded
         self._calibrations: dict[int, Calibration] = {}
@@ -126,20 +126,22 @@ class Adaptation:
         for corner in self._stores:
             parameters[corner] = to_parameters(self.in_use(CORNERS[corner]))
 
-    def warm_up(self, pipeline) -> None:
-        """Compile, or load from the cache, what evaluations call, for a pipeline like this; touch the memory that training
-        will need; start the helper thread."""
+    def warm_up(self, state: np.void, parameters: np.void) -> None:
+        """Compile, or load from the cache, what evaluations call, with a corner's STATE and PARAMETERS records; touch the
+        memory that training will need; start the helper thread."""
         for corner in self._stores:
             self.rows[corner] = np.zeros((), r.TRAINING)
-        compile_fit(next(iter(self._calibrations.values())), pipeline.states[0])
-        state, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
-        restart.take_snapshot(state, pipeline.parameters[0], snapshot)
-        restart.resume(state, pipeline.parameters[0], snapshot, 0.0)
+        compile_fit(next(iter(self._calibrations.values())), state)
+        scratch, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+        restart.take_snapshot(scratch, parameters, snapshot)
+        restart.resume(scratch, parameters, snapshot, 0.0)
         if self._threaded and self._thread is None:
             self._thread = threading.Thread(target=self._work, name="adaptation", daemon=True)
             self._thread.start()
 
-    def answer(self, samples, count, states, parameters, estimates) -> None:
+    def answer(
+        self, samples: np.ndarray, count: int, states: np.ndarray, parameters: np.ndarray, estimates: np.ndarray
+    ) -> None:
         """`pipeline.answer` that learns on the way."""
         if self._resumable:
             self._resume(samples[:count], states, parameters)

@@ -3,6 +3,7 @@
 import hashlib
 import os
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -30,7 +31,11 @@ class Owned(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     calibration: str
 
 
-def owner(version: int, corner: str, calibration: Calibration) -> dict:
+_Kept = TypeVar("_Kept", bound=msgspec.Struct)
+_Mine = TypeVar("_Mine", bound=Owned)
+
+
+def owner(version: int, corner: str, calibration: Calibration) -> dict[str, str | int]:
     """Fields of `Owned`."""
     mine = {"format": version, "corner": corner, "actuator": calibration.actuator}
     return mine | {"calibration": calibration_hash(calibration)}
@@ -47,7 +52,7 @@ def read(path: Path) -> bytes:
     return read_bounded(path, _MOST_BYTES)
 
 
-def decode(data: bytes, kind: type, version: int):
+def decode(data: bytes, kind: type[_Kept], version: int) -> _Kept:
     """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``.
 
     Raises:
@@ -65,7 +70,7 @@ def decode(data: bytes, kind: type, version: int):
     return content
 
 
-def read_own(path: Path, kind: type[Owned], ours: dict):
+def read_own(path: Path, kind: type[_Mine], ours: dict[str, str | int]) -> tuple[_Mine | None, str | None]:
     """A file's content of type ``kind``, or None, and a warning for the log, or None.
 
     A damaged file is set aside; one that does not belong to ``ours`` (`owner`) is not used.

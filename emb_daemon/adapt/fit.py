@@ -41,11 +41,11 @@ from emb_daemon.calibration.parameters import (
     moved,
     value_of,
 )
-from emb_daemon.calibration.types import to_parameters
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.paths import begin_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import INERTIA_SIGMA, SLOW_RAD_PER_S
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, Record, entry, njit
 from emb_daemon.models.contact import torque_sigma
 from emb_daemon.models.fusion import SLOW, VISCOUS
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -78,7 +78,7 @@ _LEAST_SAMPLES, _RANGES = 1000, 5
 
 
 @njit
-def unexplained_step(s, p, row):
+def unexplained_step(s: Record, p: Record, row: Record) -> float:
     """Advance both paths by one TRAINING row; motor torque (N m) that the clamp force leaves unexplained, or NaN."""
     before, speed = s.force, s.speed
     stiffness_path(s, p, row, row.factor)
@@ -106,7 +106,7 @@ def _run(states, parameters, rows, residual, force):
         force[i] = s.force
 
 
-def reach(rows, state, contact_angle, learned):
+def reach(rows: np.ndarray, state: np.void, contact_angle: float, learned: np.void) -> np.void:
     """STATE of the path models at the last of ``rows`` with the ``learned`` PARAMETERS and contact angle (rad).
 
     ``state``: as in `fit_training`."""
@@ -180,7 +180,7 @@ def _block_noise(calibration):
     return sqrt(current**2 * correlated / _BLOCK + 2.0 * (speed / _BLOCK) ** 2)
 
 
-def compile_fit(calibration, state):
+def compile_fit(calibration: Calibration, state: np.void) -> None:
     """Compile, or load from the cache, all that a fit calls; as `fit_training` gets them."""
     rows, p = np.zeros(2, r.TRAINING), to_parameters(calibration)
     x = np.zeros(_CURVE + curve_terms(calibration))
@@ -378,7 +378,9 @@ def _is_excited(angle, contact_angle, force, residual, low, high, limits):
     return np.min(counts, axis=0)[:asked].min() >= limits.samples_per_range
 
 
-def fit_training(rows, calibration, base, state, factor_sigma=0.0):
+def fit_training(
+    rows: np.ndarray, calibration: Calibration, base: Calibration, state: np.void, factor_sigma: float = 0.0
+) -> Evaluation:
     """Evaluate one training.
 
     Args:

@@ -4,6 +4,7 @@ Learned values are a partial calibration, applied by `calibration.parameters.mov
 training is accepted and when a file is read.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -58,7 +59,7 @@ def curve_terms(calibration: Calibration) -> int:
     return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted_curves(calibration))
 
 
-def curve_values(calibration: Calibration, coefficients) -> dict[str, float]:
+def curve_values(calibration: Calibration, coefficients: Sequence[float] | np.ndarray) -> dict[str, float]:
     """Values that make ``coefficients`` the curve of the mounted pads: both curves next to their thickness are set to it."""
     values = {}
     for index in _mounted_curves(calibration):

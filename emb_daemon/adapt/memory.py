@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -70,7 +71,7 @@ def entry_of(outcome: int, evaluation: Evaluation, date: str, ambient_C: float, 
     )
 
 
-def state_directory(configured: str | None, relative_to: Path, environment=os.environ) -> Path | None:
+def state_directory(configured: str | None, relative_to: Path, environment: Mapping[str, str] = os.environ) -> Path | None:
     """Folder for learned values: systemd's STATE_DIRECTORY, or else the configured one; None if there is neither."""
     if given := environment.get("STATE_DIRECTORY"):
         return Path(given.split(":")[0])
@@ -98,7 +99,7 @@ class Memory:
 
     def __init__(self, folder: Path):
         """Raises InputError if the folder cannot be made."""
-        self.folder = Path(folder)
+        self.folder: Path = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -58,14 +58,14 @@ def _sliding(rows, p, states, direction, torque, force):
         torque[i] = torque[i] / (slope * s.gear_gain) - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
 
 
-def turned_angles(rows, p, gear_zero):
+def turned_angles(rows: np.ndarray, p: np.void, gear_zero: float) -> np.ndarray:
     """Equivalent angles (`models.gear`) of TRAINING rows, rad; PARAMETERS record ``p``, STATE's ``gear_zero``."""
     turned = np.empty(len(rows))
     _turn(rows, p, gear_zero, turned)
     return turned
 
 
-def pairs_of_passes(rows, p, state=None):
+def pairs_of_passes(rows: np.ndarray, p: np.void, state: np.void | None = None) -> np.ndarray:
     """Pairs of one training: TRAINING rows, PARAMETERS record ``p``, STATE record at its end (None: of a brake that is not
     known); returns (pairs, 5): equivalent angle in rad, N, N m, samples, N."""
     states = new_state(1)
@@ -110,7 +110,7 @@ def _fit_curve(pairs, weight, contact, terms):
     return weight @ (pairs[:, FORCE] - shapes @ solution) ** 2, solution / travel**powers
 
 
-def curve_from_pairs(pairs, terms):
+def curve_from_pairs(pairs: np.ndarray, terms: int) -> tuple[float, np.ndarray]:
     """Contact angle (rad) and ``terms`` coefficients of the best curve through the pairs; NaN if there is none.
 
     Robust: pairs that lie far from a first fit lose weight in the second (Cauchy weights on the median residual).
@@ -137,7 +137,7 @@ def curve_from_pairs(pairs, terms):
     return best, curve
 
 
-def friction_from_pairs(pairs):
+def friction_from_pairs(pairs: np.ndarray) -> tuple[float, float]:
     """(offset N m, load m/rad) of the straight line of friction torque over clamp force; thesis 4.1."""
     weight, force, friction = pairs[:, WEIGHT], np.maximum(pairs[:, FORCE], 0.0), pairs[:, FRICTION]
     total = weight.sum()

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import fields
 
@@ -82,7 +83,7 @@ EVALUATION_SAMPLES = 750
 CAPACITY = TRAINING_SAMPLES + EVALUATION_SAMPLES
 
 
-def to_limits(calibration) -> np.void:
+def to_limits(calibration: Calibration) -> np.void:
     """LIMITS record of a `Calibration`."""
     a, limits = calibration.adaptation, np.zeros(1, LIMITS)[0]
     limits["estimated"], limits["enabled"] = True, a.enabled

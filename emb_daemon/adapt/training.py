@@ -16,7 +16,7 @@ from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, Record, Records, entry, njit
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, GROWTH, HOUSING, INERTIA, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
@@ -75,7 +75,7 @@ def _has_rolled(a, m):
 
 
 @njit
-def others_hold(adapters, limits, k, time_ns):
+def others_hold(adapters: Records, limits: Records, k: int, time_ns: int) -> bool:
     """Whether every other corner that this process estimates holds its parking force, so that the car does not move while
     corner ``k`` is opened. A corner that is being trained, or that sends nothing, does not count as holding."""
     for other in range(len(adapters)):
@@ -87,7 +87,7 @@ def others_hold(adapters, limits, k, time_ns):
 
 
 @njit
-def end_training(a, outcome, result):
+def end_training(a: Record, outcome: int, result: int) -> None:
     """Return to idle and discard everything collected."""
     a.phase = r.IDLE
     a.rows = 0
@@ -170,7 +170,7 @@ def _restart_fitted(x, P):
 
 
 @njit
-def apply_learned(s, p, reached, rows, learned, a):
+def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned: Record, a: Record) -> None:
     """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER).
 
     The path models go on from ``reached``, the STATE that they have with the learned values at the end of the training
@@ -234,7 +234,10 @@ def _conclude(a, s, parameters, learned, reached, rows):
 
 
 @njit
-def observe(a, s, parameters, learned, reached, remembered, limits, others_hold, rows, m, estimate):
+def observe(
+    a: Record, s: Record, parameters: Records, learned: Record, reached: Record, remembered: Records, limits: Record,
+    others_hold: bool, rows: Records, m: Record, estimate: Record,
+) -> None:  # fmt: skip
     """Advance one corner's adaptation by one estimate, and write its state into the estimate.
 
     Args:
@@ -339,8 +342,9 @@ def _advance(a, s, parameters, learned, reached, remembered, limits, rows, m):
     Array(ESTIMATE), Array(r.ADAPTER), Array(r.LIMITS), Array(r.TRAINING, 2), returns=1,
 )  # fmt: skip
 def answer_adapting(
-    samples, first, count, states, parameters, learned, reached, remembered, estimates, adapters, limits, rows
-):
+    samples: Records, first: int, count: int, states: Records, parameters: Records, learned: Records, reached: Records,
+    remembered: Records, estimates: Records, adapters: Records, limits: Records, rows: Records,
+) -> int:  # fmt: skip
     """Estimate samples from row ``first``, with adaptation.
 
     Returns the row at which to go on: ``count``, or earlier if a training then waits for its evaluation or has ended."""

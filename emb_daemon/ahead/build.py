@@ -1,8 +1,8 @@
-"""Lowers entry points through numba into one shared library that needs libc and libm alone.
+"""Compiles entry points through numba into one shared library that needs only libc and libm.
 
-numba compiles each entry point behind a wrapper whose arguments are plain C. What it makes of them is linked into one module
-in which only those wrappers can be seen: what needs Python or numba lives in what nobody calls then, and is dropped. LLVM
-optimises and emits the rest for the target; a linker that is installed makes the library.
+numba compiles each entry point behind a wrapper whose arguments are plain C. The results are linked into one module that
+exports only those wrappers; functions that need Python or numba are then unused, and are removed. LLVM optimises the module
+and emits code for the target, and an installed linker makes the library.
 """
 
 import platform
@@ -24,9 +24,9 @@ from emb_daemon.ahead.signature import Array, Entry, is_group
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import Unavailable
 
-#: What counts the owners of numba's arrays. Kernels make none, and nobody owns what they are given.
+#: Reference counting of numba's arrays does nothing: kernels make no arrays, and do not own those that they are given.
 _NO_OWNERS = "define void @NRT_incref(ptr %0) { ret void }\ndefine void @NRT_decref(ptr %0) { ret void }\n"
-#: What Python and numba have within a process, and a library has not.
+#: Names of functions that exist only in a process with Python and numba.
 _HERE_ALONE = re.compile("_?Py|NRT_|_?numba")
 
 
@@ -40,7 +40,7 @@ def _wrapper(entry: Entry):
     names, lines, kinds = ["results"], [], [types.CPointer(types.int64)]
 
     def unpack(kind) -> str:
-        """The expression that makes an argument of plain ones."""
+        """The expression that makes an argument from plain C arguments."""
         name = f"a{len(names)}"
         if is_group(kind):
             return f"{type(kind).__name__}({', '.join([unpack(part) for part in kind])})"
@@ -67,7 +67,8 @@ def _wrapper(entry: Entry):
 
 
 def _lower(entry: Entry) -> str:
-    """LLVM's text of an entry point with all that it calls, and of what calls it with words in memory, under its name in C."""
+    """LLVM assembly of an entry point with all that it calls, and of the wrapper that calls it with words in memory, under its
+    name in C."""
     wrapper, kinds = _wrapper(entry)
     compiled = numba.njit(types.void(*kinds), nogil=True, error_model="numpy", no_cfunc_wrapper=True)(wrapper)
     [overload] = compiled.overloads.values()
@@ -77,7 +78,7 @@ def _lower(entry: Entry) -> str:
         word = kind_in_c.get(kind, "ptr")
         loads += [f"  %p{index} = getelementptr i64, ptr %words, i64 {index}", f"  %a{index} = load {word}, ptr %p{index}"]
         arguments.append(f"{word} %a{index}")
-    # numba's own functions return a status and take where to leave a result and an exception, of which there are none.
+    # numba's functions return a status, and take pointers to a result and to an exception, which are not used here.
     return "\n".join(
         [
             str(overload.library._final_module),
@@ -92,11 +93,11 @@ def _lower(entry: Entry) -> str:
 
 
 def _merge(entries: list[Entry], sources: str, triple: str):
-    """One module of all entry points, in which nothing else but its `mark` can be seen from outside."""
+    """One module of all entry points, which exports nothing else but its `mark`."""
     marked = f"@{mark(sources)} = constant i8 0"
     whole = llvm.parse_assembly(f'target triple = "{triple}"\n{_NO_OWNERS}{marked}\n')
     for entry in entries:
-        # numba compiles for this machine; what it writes before it optimises is the same for all.
+        # numba compiles for this machine, but its code before optimisation is the same for all.
         text = re.sub(r'(?m)^target (datalayout|triple) = ".*"$', "", _lower(entry))
         whole.link_in(llvm.parse_assembly(f'target triple = "{triple}"\n{text}'))
     visible = {mark(sources), *(entry.name for entry in entries)}
@@ -110,7 +111,7 @@ def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
     """The entry points, and the `mark` of ``sources``, as a relocatable ELF object.
 
     Raises:
-        RuntimeError: an entry point needs what is only in this process.
+        RuntimeError: an entry point needs an address of this process.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
@@ -132,12 +133,12 @@ def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
 
 
 def linker_for(machine: str) -> list[str]:
-    """A command that links for ``machine``, the best that is installed.
+    """A command that links for ``machine``, the best one that is installed.
 
-    A compiler knows where libm is; what a bare linker leaves open is found when the library is loaded.
+    A compiler finds libm; symbols that a bare linker leaves undefined are resolved when the library is loaded.
 
     Raises:
-        Unavailable: none is; says what has one.
+        Unavailable: none is; the message says which packages have one.
     """
     own = machine == platform.machine()
     prefix = "" if own else f"{machine}-linux-gnu-"
@@ -170,7 +171,7 @@ def build(entries: list[Entry], sources: str, target: Target, path: Path) -> Non
     With the ending ``.o`` it is a plain object, to be linked into a program.
 
     Raises:
-        Unavailable: nothing that is installed links for the target.
+        Unavailable: no linker for the target is installed.
         OSError: the file cannot be written.
     """
     linker = None if path.suffix == ".o" else linker_for(target.machine)

@@ -1,7 +1,7 @@
 """Kernels compiled ahead, as the daemon finds, checks and calls them: without numba, and without a compiler.
 
-A library is an ELF shared object followed by one line of JSON, the `Manifest`. It is used if it is whole, made from the very
-sources that are installed (those that mention `emb_daemon.jit` or make records), for this processor, and nobody else could
+A library is an ELF shared object followed by one line of JSON, the `Manifest`. It is used if it is complete, was made for this
+processor from the sources that are installed (those that mention `emb_daemon.jit` or define records), and if nobody else could
 have written it.
 """
 
@@ -22,16 +22,16 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from emb_daemon.ahead.signature import Array, is_group
+from emb_daemon.ahead.signature import Array, Kind, is_group
 from emb_daemon.bounded import read_bounded
 from emb_daemon.errors import InputError
 
 #: A source that mentions one of these takes part in compiled code.
 _MARKS = (b"emb_daemon.jit", b"emb_daemon.ahead.signature", b"np.dtype(")
 _FORMAT = 1
-#: A hundred times what a library of ours has.
+#: A hundred times the size of such a library.
 _MOST_BYTES = 20_000_000
-#: The library to use; empty: none.
+#: Environment variable: the library to use; empty: none.
 VARIABLE = "EMB_DAEMON_KERNELS"
 
 
@@ -56,7 +56,7 @@ TARGETS = {
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a library says of itself."""
+    """Description of a library, stored in it."""
 
     format: int = _FORMAT
     #: Of the ELF object before this line.
@@ -96,8 +96,8 @@ def installed_digest() -> str:
 
 
 def who_else_writes(path: Path) -> str:
-    """Who else could have put something into a file or folder, or into its parent, whose content is executed; in words, empty
-    if nobody. What is root's is as good as one's own, and root may use what it likes."""
+    """Who else could have written a file or folder whose content is executed, or its parent; in words, empty if nobody. Files
+    of root are accepted like one's own, and root accepts files of anybody."""
     for place in (path, path.parent):
         status = place.stat()
         if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
@@ -113,7 +113,8 @@ def default_path() -> Path:
 
 
 def found() -> Path | None:
-    """The library to look at: what `VARIABLE` names, else that at `default_path`; None if there is none, or none is wanted."""
+    """The library to look at: what `VARIABLE` names, else that at `default_path`; None if there is none, or none is to be
+    used."""
     named = os.environ.get(VARIABLE)
     if named == "" or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
         return None
@@ -121,13 +122,13 @@ def found() -> Path | None:
     return path if named or path.exists() else None
 
 
-def seal(elf: bytes, **manifest) -> bytes:
+def seal(elf: bytes, **manifest: str | tuple[str, ...]) -> bytes:
     """A library's bytes."""
     return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Raises Refused for what is no library of ours or not whole; OSError."""
+    """Raises Refused for a file that is no such library or incomplete; OSError."""
     elf, _, line = read_bounded(path, _MOST_BYTES).rpartition(b"\n")
     try:
         manifest = msgspec.json.decode(line, type=Manifest)
@@ -180,7 +181,7 @@ def load() -> str:
             if "emb_daemon.jit" in sys.modules:
                 raise Refused("this process has already loaded other kernels")
             manifest = check(path)
-            # What was left open by a linker that knew no libm is looked for among what is loaded.
+            # Symbols of libm that a linker left undefined are resolved from the libraries already loaded.
             ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
             _loaded = ctypes.CDLL(str(path), mode=os.RTLD_NOW)
             _says = f"kernels of {path}, compiled ahead for {manifest.cpu} by {manifest.made_by}"
@@ -203,7 +204,7 @@ def in_use() -> bool:
 
 
 class _Words(threading.local):
-    """What a function was called with last, and the same as C has it; each thread's own, since a function runs without the
+    """Arguments of the last call, and the same as words for C; separate for each thread, because a function runs without the
     interpreter's lock."""
 
     def __init__(self, arguments: int, words: int):
@@ -212,10 +213,10 @@ class _Words(threading.local):
         self.address = ctypes.c_void_p(ctypes.addressof(self.words))
 
 
-def bind(name: str, takes: tuple, returns: int) -> Callable:
+def bind(name: str, takes: tuple[Kind, ...], returns: int) -> Callable[..., int | tuple[int, ...]]:
     """The library's function ``name``, called like the Python function that it was made from.
 
-    An argument that is the same object as in the call before costs nothing: it is still where it was."""
+    An argument that is the same object as in the last call is not converted again, because its address has not changed."""
     function = getattr(_loaded, name)
     places, end = [], returns
     for kind in takes:
@@ -245,7 +246,7 @@ def _size(kind) -> int:
 
 
 def _converter(kind) -> Callable:
-    """What makes words of an argument. Raises TypeError for another kind of argument."""
+    """The function that converts an argument to words. Raises TypeError for another kind of argument."""
     if is_group(kind):
         parts = [_converter(part) for part in kind]
         return lambda group: [word for convert, part in zip(parts, group, strict=True) for word in convert(part)]
@@ -259,13 +260,13 @@ def _converter(kind) -> Callable:
         def convert_array(array):
             if array.dtype != dtype or array.ndim != dimensions or not array.flags.c_contiguous:
                 raise TypeError(f"expected a contiguous array of {dimensions} dimensions of {dtype.names or dtype}")
-            # Not __array_interface__, which describes every field in words.
+            # Not __array_interface__, which is slow because it describes every field.
             return (array.ctypes.data, *array.shape)
 
         return convert_array
 
     def convert_record(record):
-        # A record that is no view of an array has no address that stays.
+        # A record that is not a view of an array has no lasting address.
         if not isinstance(record, np.void) or record.dtype != kind or record.flags.owndata:
             raise TypeError(f"expected a record within an array, of {kind.names}")
         return (np.asarray(record).ctypes.data,)

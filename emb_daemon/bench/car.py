@@ -21,9 +21,10 @@ from emb_daemon.plant.scenarios import city_drive
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import RawCanSocket
 from emb_daemon.runtime.realtime import settle_memory, use_fifo
-from emb_daemon.wire.layout import CORNERS
+from emb_daemon.wire.contract import PREDICTED
+from emb_daemon.wire.e2e import COUNTER_MODULO
+from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, default_layout, load_database, signal_columns, unpack
 
-_CLAMP_FORCE = 0x200
 #: Time from the beginning of a cycle's computation until its frames leave, as by a timer; independent of how long it takes.
 _COMPUTING_NS = 500_000
 
@@ -60,7 +61,12 @@ class _Answers:
     """Time from a sample's last frame to its answer, matched by the InputCounter."""
 
     def __init__(self):
-        self._sent = np.zeros((4, 15), np.int64)
+        self._sent = np.zeros((len(CORNERS), COUNTER_MODULO), np.int64)
+        self._ids = default_layout()[0]["sent_id"][CLAMP_FORCE].tolist()
+        database, names = load_database(resource("dbc/emb.dbc")), ("InputCounter", "ForceSource")
+        self._counter, self._source = signal_columns(database, f"EMB_{CORNERS[0]}_ClampForce", names)
+        # Compile now, not while answers are timed.
+        unpack(np.uint64(0), self._source)
         self.latency_us: list[float] = []
         self.samples = 0
 
@@ -71,11 +77,10 @@ class _Answers:
             self.samples += len(truth)
 
     def heard(self, frames: np.ndarray) -> None:
-        mine = frames[(frames["can_id"] >= _CLAMP_FORCE) & (frames["can_id"] < _CLAMP_FORCE + 4)]
-        source = (mine["data"] >> np.uint64(52)) & np.uint64(15)
-        for frame in mine[source < 3]:
-            counter = int(frame["data"] >> np.uint64(48)) & 15
-            self.latency_us.append((int(frame["time_ns"]) - self._sent[frame["can_id"] - _CLAMP_FORCE, counter]) / 1e3)
+        for frame in frames[np.isin(frames["can_id"], self._ids)]:
+            if unpack(frame["data"], self._source) < PREDICTED:
+                corner, counter = self._ids.index(frame["can_id"]), int(unpack(frame["data"], self._counter))
+                self.latency_us.append((int(frame["time_ns"]) - self._sent[corner, counter]) / 1e3)
 
 
 def main() -> None:

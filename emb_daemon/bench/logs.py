@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
     return largest
 
 
-def measure_logs() -> dict:
+def measure_logs() -> dict[str, Any]:
     """Figures by CPU time over a simulated single-corner log, in the page cache and with kernels compiled."""
     calibration = load_calibration(resource("config/calibration.yaml"))
     frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), _SECONDS)
@@ -99,7 +100,7 @@ def _decoders(frames: np.ndarray) -> tuple[float, float]:
     return tuple(len(some) / taken for taken in medians_s(bulk, one_by_one))
 
 
-def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict:
+def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict[str, Any]:
     """Time of the compiled step over SAMPLE rows, with PARAMETERS of shape (1,), and of the same in plain Python.
 
     Returns:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def _configured(corners: int) -> Iterator[list]:
         yield [shipped_configuration(Path(folder), CORNERS[:corners], "log_level: error"), Path(folder) / "state"]
 
 
-def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict:
+def measure_loop(corners: int, seconds: float, kernels: str | None = None, share: Path | None = None) -> dict[str, Any]:
     """Run the real daemon and a simulated car, each in a process of its own, together with an empty loop and, if it is
     installed, cyclictest.
 
@@ -131,7 +132,7 @@ def held_up(late_ns: int, worked_ns: int) -> bool:
     return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
 
 
-def measure_start(cold: bool = False) -> dict:
+def measure_start(cold: bool = False) -> dict[str, float]:
     """``wall_s`` and ``cpu_s`` from start to ready with numba, with cached kernels or, if ``cold``, without."""
     ours, theirs = connected_sockets()
     with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
@@ -144,7 +145,7 @@ def measure_start(cold: bool = False) -> dict:
     return served.ready
 
 
-def cyclictest(seconds: float) -> dict | None:
+def cyclictest(seconds: float) -> dict[str, float] | None:
     """Wake-up latency by rt-tests' cyclictest at 250 Hz; None if it is not installed or not permitted."""
     command = ["cyclictest", "-q", "-t1", f"-p{_PRIORITY}", "-i4000", f"-D{max(1, round(seconds))}", "-h5000"]
     try:

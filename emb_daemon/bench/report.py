@@ -1,9 +1,10 @@
 """Evaluates the figures of a bench: every budget with its margin, and all figures as text."""
 
 import math
+from typing import Any
 
 
-def verdict(result: dict) -> list[dict]:
+def verdict(result: dict[str, Any]) -> list[dict[str, Any]]:
     """Each budget: ``measured``, ``limit``, ``unit``, and ``met``, whether the machine holds it.
 
     Budgets of the loop apply to the run with four corners, or to the last run if there was none. ``sense`` says which side of
@@ -50,7 +51,7 @@ def verdict(result: dict) -> list[dict]:
     ]
 
 
-def text(result: dict) -> str:
+def text(result: dict[str, Any]) -> str:
     """The figures as tables of text and the verdict."""
     lines = [result["machine"]]
     for loop in result["loops"]:

@@ -7,10 +7,12 @@ the cost of more corners; the daemon of this package has at most four in one pro
 """
 
 # Before modules with kernels are imported.
+from typing import Any
+
 from emb_daemon.ahead import library
 
-if refusal := library.load():
-    raise SystemExit(refusal)
+if _refusal := library.load():
+    raise SystemExit(_refusal)
 
 import gc
 import json
@@ -45,8 +47,8 @@ _ROOM = 1_000_000
 class Pacer(loop.Pacer):
     """Records the deadline for which the loop sleeps (0 while a sample is overdue), and the process's CPU time before."""
 
-    deadline_ns = 0
-    worked_ns = 0
+    deadline_ns: int = 0
+    worked_ns: int = 0
 
     def next_wake(self, now_ns: int) -> int:
         wake = super().next_wake(now_ns)
@@ -120,7 +122,7 @@ class Ledger:
         daemon = self._daemons[0]
         return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, self._held_up
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, Any]:
         """From the time when memory has settled to the last sample: share of a core, ticks, missed ticks, those held up by the
         machine, memory at both ends. Since the start: costs, us."""
         (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._stand()

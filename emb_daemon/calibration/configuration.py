@@ -15,7 +15,7 @@ from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.wire.keys import key_file, load_keys
 from emb_daemon.wire.layout import CORNERS, load_layout
-from emb_daemon.wire.secoc import load_links
+from emb_daemon.wire.secoc import Link, load_links
 
 
 class Bus(Struct, kw_only=True):
@@ -28,7 +28,7 @@ class Bus(Struct, kw_only=True):
     #: Bit rate in bit/s, for interfaces that set it.
     bitrate: Annotated[int, Meta(gt=0)] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # python-can is imported only if needed, because it imports many other modules.
         if self.interface in (None, "socketcan"):
             return
@@ -107,24 +107,24 @@ class Setup:
 
     def __init__(self, path: Path):
         """Raises InputErrors with every fault of configuration, calibrations and DBC."""
-        self.path = Path(path)
+        self.path: Path = Path(path)
         faults: list[str] = []
         folder = self.path.parent
         try:
-            self.configuration = load_yaml(self.path, Configuration)
+            self.configuration: Configuration = load_yaml(self.path, Configuration)
             dbc, files = self.configuration.dbc, {name: c.calibration for name, c in self.configuration.corners.items()}
         except InputError as error:
             faults += error.faults
             dbc, files = _read_named(self.path)
         try:
-            self.layout = load_layout(folder / dbc if dbc else None, tuple(files))
+            self.layout: np.ndarray = load_layout(folder / dbc if dbc else None, tuple(files))
         except InputError as error:
             faults += error.faults
         self.keys, self.links = None, ([], [])
         if not faults and (secoc := self.configuration.secoc):
             try:
-                self.links = load_links(folder / dbc if dbc else None, tuple(files))
-                self.keys = load_keys(key_file(secoc.keys, folder))
+                self.links: tuple[list[Link], list[Link]] = load_links(folder / dbc if dbc else None, tuple(files))
+                self.keys: dict[str, bytes] = load_keys(key_file(secoc.keys, folder))
             except InputError as error:
                 faults += error.faults
         loaded: dict[str, Calibration] = {}
@@ -135,8 +135,8 @@ class Setup:
                 faults += error.faults
         if faults:
             raise InputErrors(faults)
-        self.calibrations = {name: loaded[file] for name, file in files.items()}
-        self.parameters = np.zeros(4, PARAMETERS)
+        self.calibrations: dict[str, Calibration] = {name: loaded[file] for name, file in files.items()}
+        self.parameters: np.ndarray = np.zeros(4, PARAMETERS)
         for name, calibration in self.calibrations.items():
             self.parameters[CORNERS.index(name)] = to_parameters(calibration)
 

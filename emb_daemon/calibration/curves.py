@@ -23,7 +23,7 @@ class Curve(Struct, kw_only=True):
     #: N/rad, N/rad^2, N/rad^3 and so on (thesis A0, A1, A2).
     coefficients: Annotated[tuple[Annotated[float, usual(1e-3)], ...], Meta(min_length=1, max_length=CURVE_TERMS)]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.coefficients[0] <= 0.0:
             raise InvalidValue("the first coefficient (N/rad) must be positive: force rises from contact")
 

@@ -1,6 +1,6 @@
 """Terms of a calibration that no catalogue holds: data, checked here, evaluated by `effects.terms`."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta
@@ -23,6 +23,17 @@ _GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
 _COLD_C = 20.0
 
 
+if TYPE_CHECKING:
+    _Port: TypeAlias = str
+    _Signal: TypeAlias = str
+    _Memory: TypeAlias = str
+    _Shape: TypeAlias = str
+    _Gate: TypeAlias = str
+else:
+    # Words that a file may use, from the tables of `effects.terms`; type checkers accept no computed Literal.
+    _Port, _Signal, _Memory, _Shape, _Gate = (Literal[tuple(w)] for w in (PORTS, SIGNALS, MEMORIES, SHAPES, GATES))
+
+
 class Term(Struct, kw_only=True):
     """A term that `emb-daemon diagnose` made for a residual that no effect of the catalogue explains.
 
@@ -32,20 +43,20 @@ class Term(Struct, kw_only=True):
     #: Name; begins with ``term:``.
     name: Annotated[str, Meta(pattern="^term:.+")]
     #: Quantity to which the term adds. The coefficient has the unit of this port (`effects.base.HOOKS`).
-    port: Literal[PORTS]
+    port: _Port
     #: Signal of which the term is a function.
-    signal: Literal[tuple(SIGNALS)]
+    signal: _Signal
     #: none: z is the signal; lag: z is the signal through a first-order lag of time constant memory_scale, s; deficit: z is
     #: that lag's output minus the signal; slip: z is the state, -1 to 1, of a Maxwell slip element of stretch memory_scale, in
     #: the signal's unit; response: z is the signal, and the lag acts on the output of the shape, as heat follows the power
     #: that makes it.
-    memory: Literal[MEMORIES] = "none"
+    memory: _Memory = "none"
     #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
     #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).
-    shape: Literal[SHAPES]
+    shape: _Shape
     #: When the term acts: always, while closing, opening, turning or standing; load: always, multiplied by the clamp force
     #: over the largest force.
-    gate: Literal[GATES] = "always"
+    gate: _Gate = "always"
     #: Size of the term, in the port's unit.
     coefficient: float
     #: Coefficient of sin u of a harmonic.
@@ -67,14 +78,14 @@ class Term(Struct, kw_only=True):
     high: float
     #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The
     #: hidden state of a response follows the product.
-    other: Literal[tuple(SIGNALS)] | None = None
+    other: _Signal | None = None
     #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. Beyond it the
     #: term stays the same, and sigma grows.
     other_high: float = 0.0
     #: Date and logs from which the term was found.
     provenance: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.low < self.high:
             raise InvalidValue("high: expected more than low")
         if self.sine and self.shape != "harmonic":

@@ -3,6 +3,7 @@
 The estimator never sees these objects: `to_parameters` turns them into its record once.
 """
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Annotated
 
@@ -38,7 +39,7 @@ class Travel(Struct, kw_only=True):
     #: curve.
     travel_mm: tuple[Annotated[NonNegative, usual(0.1)], ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.angle_rad) != len(self.travel_mm):
             raise InvalidValue(
                 f"{len(self.angle_rad)} angle_rad and {len(self.travel_mm)} travel_mm: expected the same number"
@@ -88,7 +89,7 @@ class Motor(Struct, kw_only=True):
     #: is relaxed.
     release_spring_N_per_m: Annotated[NonNegative, usual(1e5)] = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.travel.check_mean(self.gear_gain_m_per_rad)
 
     def gear(self) -> np.void:
@@ -120,7 +121,7 @@ class Stiffness(Struct, kw_only=True):
     #: Largest force that the curves were identified for.
     maximum_force_N: Positive
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         thicknesses = [curve.pad_thickness_mm for curve in self.curves]
         if thicknesses != sorted(set(thicknesses)):
             raise InvalidValue("curves: expected ascending, distinct pad thicknesses")
@@ -224,7 +225,7 @@ class Pad(Struct, kw_only=True):
     #: Heat conductance between a pad and the thermocouple on its backing plate.
     backplate_conductance_W_per_m2K: Positive
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.inner_heat_share + self.outer_heat_share > 1.0:
             raise InvalidValue("inner_heat_share and outer_heat_share: their sum exceeds 1")
 
@@ -260,7 +261,7 @@ class FrictionTable(Struct, kw_only=True):
     #: coefficient[force][speed][temperature]
     coefficient: tuple[tuple[tuple[Annotated[Share, usual(0.4)], ...], ...], ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("force_N", "disc_speed_rad_per_s", "surface_temperature_C"):
             grid = getattr(self, name)
             if any(after <= before for before, after in pairwise(grid)):
@@ -348,7 +349,7 @@ class Adaptation(Struct, kw_only=True):
     #: and of the pads' dynamics where these look like inertia.
     torque_constant_relative: Annotated[NonNegative, usual(0.01)] = 0.01
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.minimum_ambient_C >= self.maximum_ambient_C:
             raise InvalidValue("maximum_ambient_C: expected more than minimum_ambient_C")
 
@@ -407,7 +408,7 @@ class Calibration(Struct, kw_only=True):
     adaptation: Adaptation = Adaptation()
     provenance: Provenance | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         known, faults = {effect.name: effect for effect in REGISTRY}, []
         for name, values in self.effects.items():
             if name not in known:
@@ -450,7 +451,7 @@ class Calibration(Struct, kw_only=True):
                 )
         return faults
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Callable[[bytes], "Calibration"], tuple[bytes]]:
         # Defaults are recognised by identity. A copy made field by field in another process would state them, and therefore
         # have another hash.
         return _decode, (msgspec.json.encode(self),)

@@ -3,8 +3,12 @@
 import argparse
 import json
 from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
 
 from emb_daemon.errors import InputError
+
+if TYPE_CHECKING:
+    from emb_daemon.calibration.configuration import Bus
 
 
 def add_bus_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +56,7 @@ def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
             )
 
 
-def bus_options(arguments: argparse.Namespace, defaults=None) -> dict:
+def bus_options(arguments: argparse.Namespace, defaults: "Bus | None" = None) -> dict[str, Any]:
     """Keyword arguments for `runtime.bus.open_bus`: the command line, else CAN_* variables, else ``defaults``, a
     configuration's Bus."""
     from can.util import load_environment_config

@@ -4,6 +4,10 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from emb_daemon.logs.mapping import Mapping
 
 #: Help text of LOG.
 LOG_HELP = (
@@ -22,7 +26,7 @@ def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False
     )
 
 
-def open_mapping(path: Path):
+def open_mapping(path: Path) -> "Mapping":
     """A `logs.mapping.Mapping`; prints to stderr which signals its rig does not measure."""
     from emb_daemon.logs.mapping import Mapping
 

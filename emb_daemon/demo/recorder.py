@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -53,13 +54,13 @@ class Recorder:
     def __init__(self, corners: tuple[str, ...], seconds: float):
         cycles = round(seconds * 1e9 / CYCLE_NS) + 1
         self.corners = corners
-        self.truth = np.zeros((cycles, len(corners)), TRUTH)
-        self.sent_ns = np.zeros(cycles, np.int64)
-        self.cycles = 0
-        self.frames = np.zeros(cycles * len(corners) * _FRAMES_PER_CYCLE, FRAME)
+        self.truth: np.ndarray = np.zeros((cycles, len(corners)), TRUTH)
+        self.sent_ns: np.ndarray = np.zeros(cycles, np.int64)
+        self.cycles: int = 0
+        self.frames: np.ndarray = np.zeros(cycles * len(corners) * _FRAMES_PER_CYCLE, FRAME)
         #: Number of cycles that the car had sent when a frame arrived.
-        self.frame_cycle = np.zeros(len(self.frames), np.int64)
-        self.count = 0
+        self.frame_cycle: np.ndarray = np.zeros(len(self.frames), np.int64)
+        self.count: int = 0
         self._ids = default_layout()[0]["sent_id"]
         #: Listener of the live view, and number of frames that it has received.
         self._listener, self._listened = Listener(), 0
@@ -77,7 +78,7 @@ class Recorder:
         self.frame_cycle[self.count : self.count + room] = self.cycles
         self.count += room
 
-    def states(self) -> list[dict]:
+    def states(self) -> list[dict[str, Any]]:
         """Present state by the broadcasts, by corner (`monitor.listener.Corner.state`)."""
         count = self.count
         self._listener.hear(self.frames[self._listened : count])
@@ -96,7 +97,7 @@ class Recorder:
         frames, cycle = self.frames[start:stop], self.frame_cycle[start:stop]
         mine = (frames["can_id"] == self._ids[CLAMP_FORCE, corner]) & (cycle > 0)
         frames, newest = frames[mine], cycle[mine] - 1
-        answered = (frames["data"] >> np.uint64(48) & np.uint64(0xF)).astype(np.int64)
+        answered = Decoder().columns(frames, f"EMB_{self.corners[row]}_ClampForce")["InputCounter"].astype(np.int64)
         age = (self.truth["counter"][newest, row] - answered) % COUNTER_MODULO
         known = (answered < COUNTER_MODULO) & (age <= np.minimum(newest, _LATEST_CYCLES))
         known &= self.sent_ns[np.where(known, newest - age, 0)] > 0

@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +63,9 @@ class Session:
         plants = np.array([plant_from_calibration(setup.calibrations[name], _SEED + row) for row, name in enumerate(names)])
         ours, theirs = socket_pair()
         self._buses = (ours, theirs)
-        self.daemon = Daemon(setup, theirs)
-        self.live = LiveCar(Car(plants, names, _SEED), ours, city_drive())
-        self.recorder = Recorder(names, seconds)
+        self.daemon: Daemon = Daemon(setup, theirs)
+        self.live: LiveCar = LiveCar(Car(plants, names, _SEED), ours, city_drive())
+        self.recorder: Recorder = Recorder(names, seconds)
         self._stop = threading.Event()
         self._failures: list[BaseException] = []
 
@@ -78,7 +79,7 @@ class Session:
             receiver.drain()
         settle_memory()
 
-    def run(self, show, period_s: float) -> None:
+    def run(self, show: Callable[[], None], period_s: float) -> None:
         """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
         drive = (self._stop.is_set, self.seconds, self.recorder.sent, self.recorder.heard)
         daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")

@@ -1,5 +1,6 @@
 """Live view of the demonstration."""
 
+from collections.abc import Iterable
 from itertools import compress
 
 import numpy as np
@@ -10,6 +11,8 @@ from rich.text import Text
 
 from emb_daemon.demo.recorder import Recorder
 from emb_daemon.monitor.view import STATUS_COLOURS, number
+from emb_daemon.plant.live import LiveCar
+from emb_daemon.runtime.daemon import Daemon
 from emb_daemon.wire.contract import PARK_RELEASED
 
 _BAR_FULL_KN, _BAR_WIDTH = 20.0, 20
@@ -33,7 +36,7 @@ def phase(truth: np.void) -> str:
     return "driving" if truth["vehicle_speed"] > 0.1 else "standing"
 
 
-def health(recorder: Recorder, daemon, live) -> str:
+def health(recorder: Recorder, daemon: Daemon, live: LiveCar) -> str:
     """Loop health in one line: time from sample to estimate on the bus, missed periods, late cycles of the car."""
     responses = recorder.recent_responses(0)
     if not len(responses):
@@ -45,7 +48,7 @@ def health(recorder: Recorder, daemon, live) -> str:
     )
 
 
-def line(recorder: Recorder, daemon, live) -> str:
+def line(recorder: Recorder, daemon: Daemon, live: LiveCar) -> str:
     """The view as one line, for output that is no terminal."""
     truth = recorder.truth[recorder.cycles - 1]
     corners = "  ".join(
@@ -74,7 +77,7 @@ def _remark(state: dict) -> str:
     return ", ".join(state["reasons"])
 
 
-def render(recorder: Recorder, daemon, live, seconds: float, messages, width: int) -> Panel:
+def render(recorder: Recorder, daemon: Daemon, live: LiveCar, seconds: float, messages: Iterable[str], width: int) -> Panel:
     """The view for a terminal of ``width`` characters."""
     if not recorder.cycles:
         return Panel("starting", title="emb-daemon demo")

@@ -1,4 +1,6 @@
-"""Error before and after, on logs (or episodes) that chose neither effect nor value, with intervals over episodes."""
+"""Error before and after, on logs (or episodes) that were not used for search and fit, with intervals over episodes."""
+
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +35,7 @@ def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
 
 
 def whole(bench: Bench) -> str:
-    """The path that judges: what all others serve, or the only one there is."""
+    """The path by which a diagnosis is judged: the fused force, or the only path there is."""
     if not bench.has_reference:
         return "innovation"
     if not bench.clamps:
@@ -41,10 +43,10 @@ def whole(bench: Bench) -> str:
     return "fused" if bench.has_current else "stiffness"
 
 
-def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict:
+def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict[str, dict[str, dict[str, Any]]]:
     """RMSE before and after by path and condition, each with a 95 % interval, and one of the ratio, over episodes.
 
-    A path that says nothing on these logs is left out."""
+    A path without finite errors on these logs is left out."""
     random = np.random.default_rng(0)
     count = before.sums.shape[2]
     weights = random.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES)

@@ -1,10 +1,10 @@
-"""The last hurdle: the running estimator itself must get better on data that took no part in the fit.
+"""Confirmation: the running estimator itself must improve on data that were not fitted.
 
-Whatever was accepted has to lower what is left of its own path on episodes left out of the fit, the contact angle held: it
-learns from the other path, whose error would speak against a term that is true. What an engineer gets is the estimator with
-everything at work, so the error of the fused force must not rise, nor clearly that of any log: where one log is off by far,
-a fit that gains a little there may ruin all others, and their mean would not show it. Where validation logs are given, they
-have a veto. What fails is taken out, one by one, and the rest refitted.
+Every accepted suspect must lower the residual of its own path on episodes left out of the fit, with the contact angle held,
+because otherwise that would take over an error of the other path and contradict a true term. The error of the fused force must
+not rise either, nor clearly that of a single log: a fit that gains a little on a log with large errors may ruin all others,
+which the mean would not show. Validation logs, if given, have a veto. What fails is taken out one by one, and the rest is
+refitted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,17 +22,17 @@ from emb_daemon.offline.score import EpisodeErrors, rmse
 
 #: Parts into which the episodes are dealt.
 _FOLDS = 4
-#: Rise of the fused error that is harm. Below it is what the contact angle's learning and the reference's noise do by chance,
-#: where an effect is real but the other path carries the fused force.
+#: Factor on the fused error from which it has become worse. Learning of the contact angle and the reference's noise cause
+#: smaller changes, if an effect is real but the fused force rests on the other path.
 _HARM = 1.05
-#: ... and of one log alone, whose few episodes scatter more: what a rest must rise by to count as unexplained.
+#: The same for a single log, whose few episodes scatter more: the factor from which a residual counts as unexplained.
 _LOG_HARM = CLEARLY
 #: Share of the samples with a force before that must have one after: a delay takes some at the edges.
 _KEPT = 0.99
 
 
 def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
-    """What is left of a search when everything that makes the running estimator worse is taken out again.
+    """The selection without everything that makes the running estimator worse.
 
     Returns it with the errors on left-out episodes. ``judges``: the validation logs.
     """
@@ -159,7 +159,7 @@ def left_out_errors(selection: Selection, without: str = "") -> EpisodeErrors:
     """Errors of each quarter of the episodes with parameters that the other quarters gave; ``without`` one suspect."""
     bench, result = selection.model.bench, None
     for own, values in _fits_without(selection, without):
-        # A log with pads of its own has its own contact, too.
+        # A log with other pads has its own contact angle, too.
         there = [bench.calibrated(values, trial.index if trial.mounted else None) for trial in bench.trials]
         part = EpisodeErrors.joined([errors_of(bench, *pair) for pair in zip(bench.trials, there, strict=True)])
         result = result or part
@@ -223,7 +223,7 @@ def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
         return worst, f"withdrawn: on the validation logs it adds {-gains[worst]:.3g} {UNITS[channel]} RMS to what it explains"
     bench, main = selection.model.bench, whole(judges)
     before = errors(judges, bench.calibration)
-    # Where nothing is clamped the path is all there is: no other hides what a recalibration does to it.
+    # If nothing is clamped there is only this path, and no other hides the effect of a recalibration.
     tolerated = _HARM if judges.clamps else 1.0
     worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, tolerated)
     if not worse or not gains:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -110,7 +111,7 @@ class Diagnosis:
         travel = travel_at(0.5 * self.original.stiffness.maximum_force_N, before)
         return float(characteristic_curve(travel, after)[0] / characteristic_curve(travel, before)[0])
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, dict[str, dict[str, Any]]]:
         """RMSE before and after with intervals, by path and condition."""
         return comparison(self.before, self.after)
 

@@ -1,9 +1,8 @@
 """Episodes: the sample of every statistic in this package.
 
-Residuals at 250 Hz are autocorrelated over seconds, so neighbouring samples say nothing new; what happens in one stop says
-little about the next. A log is therefore cut into brake applications, each with the pause before it, and what goes on for
-long (a drag, a burst, a park brake stroke) into pieces of a few seconds, but only while the motor turns: however long a
-hold, what is aliased in it is the same throughout.
+Residuals at 250 Hz are autocorrelated over seconds, so that neighbouring samples contain no new information, while different
+stops are nearly independent. A log is therefore cut into brake applications, each with the pause before it, and long motion (a
+drag, a burst, a park brake stroke) into pieces of a few seconds; a hold is one episode however long it is.
 """
 
 from itertools import pairwise
@@ -39,7 +38,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
         wanted = np.searchsorted(time_s, time_s[start] + duration * np.arange(1, pieces) / pieces)
         inside = moving[(moving > start) & (moving < stop)]
         if len(inside):
-            # A hold is never cut: its halves would vouch for each other.
+            # A hold is never cut, because its halves are not independent.
             cuts += np.unique(inside[np.minimum(np.searchsorted(inside, wanted), len(inside) - 1)]).tolist()
         cuts.append(stop)
     apart = [0]
@@ -65,7 +64,7 @@ def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:
 
 
 def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Where the motor stands, shape (N,). A gap in which it was turned ends with a motion that nobody recorded."""
+    """Mask of the samples in which the motor stands, shape (N,). A gap over which the angle has changed ends a hold."""
     before = np.searchsorted(time_s, time_s - _HOLDING_S)
     after = np.minimum(np.searchsorted(time_s, time_s + _HOLDING_S), len(time_s) - 1)
     back, on = np.abs(angle_rad - angle_rad[before]), np.abs(angle_rad[after] - angle_rad)

@@ -27,8 +27,8 @@ class Averaging:
         within = index - begins[np.searchsorted(begins, index, side="right") - 1]
         self._starts = np.flatnonzero(within % samples == 0)
         counts = np.diff(np.append(self._starts, len(episode)))
-        self.per_mean = 1.0 / np.sqrt(counts)
-        self.episode = episode[self._starts]
+        self.per_mean: np.ndarray = 1.0 / np.sqrt(counts)
+        self.episode: np.ndarray = episode[self._starts]
 
     def of(self, columns: np.ndarray) -> np.ndarray:
         """Weighted means of columns (N, k)."""

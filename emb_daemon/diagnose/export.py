@@ -5,7 +5,7 @@ import numpy as np
 from emb_daemon.calibration.terms import Term
 from emb_daemon.effects.terms import SIGNALS
 
-#: What a shape makes of u, by its name.
+#: Expressions of the shapes over u, by name.
 _SHAPED = {
     "constant": "1.0",
     "odd_power": "abs(u) ** p.exponent * (1.0 if u >= 0.0 else -1.0)",
@@ -40,7 +40,7 @@ _MEMORIES = {
 """,
 }
 _MEMORIES["deficit"] = _MEMORIES["lag"]
-#: What comes after the shape instead of before it.
+#: Memory that acts after the shape instead of before it.
 _RESPONSE = """    y = {shaped}
     if not s.begun:
         s.begun, s.memory = True, y
@@ -151,7 +151,7 @@ def _kernel(term: Term) -> list[str]:
 
 
 def _declaration(term: Term, equation: str) -> list[str]:
-    """The `Effect` that the kernel is of."""
+    """The kernel's `Effect`."""
     return [
         "EFFECT = Effect(",
         f'    name="{effect_name(term)}",',
@@ -169,7 +169,7 @@ def _declaration(term: Term, equation: str) -> list[str]:
 
 
 def _sizes(term: Term) -> list[str]:
-    """Sizes that shape a term."""
+    """Parameters that shape a term."""
     shape = [] if term.shape == "constant" else ["scale", "centre"]
     power = ["exponent"] if term.shape in ("odd_power", "even_power") else []
     return [*shape, *power, *(["memory_scale"] if term.memory != "none" else [])]

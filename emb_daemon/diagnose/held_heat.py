@@ -1,8 +1,8 @@
-"""Both force paths with the heat of an earlier run: a twentieth of the whole step's cost.
+"""Both force paths with the temperatures of an earlier run, at a twentieth of the whole step's cost.
 
-A fit asks hundreds of times what a force parameter does to the force. Pads and disc hardly notice, but conduction and the
-fusion's filter are nearly all that a step costs. So the whole step is run once where the fit stands, what the paths take from
-it is written down, and the parameters are moved with that held.
+A fit computes hundreds of times how a force parameter changes the force. It hardly changes the temperatures, but conduction
+and the filter are nearly the whole cost of a step. So the whole step is run once at the present parameters, its results that
+the paths use are stored, and parameters are changed with these held.
 """
 
 import numpy as np
@@ -43,8 +43,8 @@ def _run(samples, parameters, states, heat, out, signals):
 
 
 def run_with_heat(samples: np.ndarray, parameters: np.void) -> tuple[np.ndarray, np.ndarray | None]:
-    """TRACE rows of the whole step with `held` parameters, and its HEAT rows; None instead of them where the zero of the angle
-    was lost on the way, which a held run cannot follow."""
+    """TRACE rows of the whole step with `held` parameters, and its HEAT rows; None instead of them if the resolver lost its
+    zero, which a held run cannot follow."""
     heat = np.zeros(len(samples), HEAT)
     trace = run_step(samples, parameters, heat)
     return trace, heat if np.ptp(heat["contact_angle"]) == 0.0 else None
@@ -58,7 +58,7 @@ def run_held(samples: np.ndarray, parameters: np.void, heat: np.ndarray) -> np.n
 
 
 def follow_signals(samples: np.ndarray, parameters: np.void, heat: np.ndarray) -> np.ndarray:
-    """What terms see (`effects.terms.SIGNALS`) at each sample of a held run; NaN where it is not known."""
+    """Signals of terms (`effects.terms.SIGNALS`) at each sample of a held run; NaN where unknown."""
     watching = parameters.copy()
     watching["effects"]["terms"]["count"] = max(watching["effects"]["terms"]["count"], 1)
     signals = np.zeros((len(samples), len(SIGNALS)))

@@ -13,7 +13,8 @@ def strongest_orders(
     model: Model, effect: Effect, channel: str, signals: dict[str, np.ndarray], most: int = 1
 ) -> tuple[list[float], int]:
     """Orders of ``effect``'s harmonic over which the channel's residual varies most, strongest first; and how many independent
-    orders were looked at. Logs at places far apart have side lobes nearly as strong as what makes them: ``most`` of them."""
+    orders were looked at. ``most`` of them are returned, because logs at distant angles have side lobes nearly as strong as
+    the peak."""
     samples = np.concatenate([trial.log.samples for trial in model.bench.trials])
     angle, travel = samples["angle"], np.abs(samples["speed"]) * samples["dt"]
     harmonic, limits = effect.harmonic, effect.parameter(effect.harmonic.order).starts
@@ -27,7 +28,8 @@ def strongest_orders(
     peaks: list[tuple[float, float]] = []
     low = orders[0]
     while low < orders[-1]:
-        # One octave at a time: samples that pass more than a sixth of a period smear it, bins are an eighth of one wide.
+        # One octave at a time: samples over more than a sixth of a period are left out, and bins are an eighth of a period
+        # wide.
         high = 2.0 * low
         slow = (travel * high < 1.0) & (residual != 0.0)
         if not slow.any():
@@ -51,7 +53,7 @@ def _peaks(power: np.ndarray, orders: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _beside_the_model(model: Model, channel: str) -> np.ndarray:
-    """What of a residual no coordinate of the model can take."""
+    """The part of a residual that no coordinate of the model explains."""
     own, residual = model.own(channel), model.residual[channel]
     if not own:
         return residual
@@ -64,7 +66,7 @@ def _spectrum(angle: np.ndarray, residual: np.ndarray, weight: np.ndarray, width
     """Power of the weighted residual by order, over angles binned ``width`` rad wide."""
     bins = (angle / width).astype(np.int64)
     sums, squares = np.bincount(bins, weight * residual), np.bincount(bins, weight**2)
-    # One stop's long hold at one angle must not outvote the strokes.
+    # A long hold at one angle must not outweigh the strokes.
     typical = np.median(squares[squares > 0.0]) if squares.any() else 1.0
     cap = np.minimum(1.0, typical / np.maximum(squares, typical))
     padded = 1 << int(np.ceil(np.log2(4 * len(sums))))

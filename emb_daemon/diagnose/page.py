@@ -1,4 +1,4 @@
-"""report.html: verdict, error bars before and after, evidence for each effect, and why the others lost."""
+"""report.html: verdict, error bars before and after, evidence for each effect, and why others were rejected."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, 
 from emb_daemon.report.page import Page
 
 _BINS = 40
-#: Fewest residuals that are worth a picture, and dependences listed.
+#: Least number of residuals for a plot, and number of dependences listed.
 _FEWEST, _LISTED = 100, 6
 
 

@@ -58,17 +58,19 @@ class Screen:
     """One channel's residual, averaged, with its nuisances, against which forms are held."""
 
     def __init__(self, model: Model, channel: str, samples: int):
-        self.model, self.channel, bench = model, channel, model.bench
-        self.means = Averaging(bench.episode[channel], samples)
+        self.model = model
+        self.channel = channel
+        bench = model.bench
+        self.means: Averaging = Averaging(bench.episode[channel], samples)
         self._bounds = np.searchsorted(self.means.episode, np.arange(bench.episodes + 1))
         own = model.own(channel)
         penalty = model.penalty(own, channel) + 1e-12
         table = np.column_stack([*(model.columns[c] for c in own), model.residual[channel]])
         averaged = self.means.of(table)
-        self.nuisances = averaged[:, :-1]
+        self.nuisances: np.ndarray = averaged[:, :-1]
         self._inverse = np.linalg.pinv(self.nuisances.T @ self.nuisances + np.diag(penalty), rcond=1e-12, hermitian=True)
-        self.residual = self.beside_nuisances(averaged[:, -1:])
-        self.keep = model.residual[channel] != 0.0
+        self.residual: np.ndarray = self.beside_nuisances(averaged[:, -1:])
+        self.keep: np.ndarray = model.residual[channel] != 0.0
 
     def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
         """What of averaged columns the nuisances cannot take."""
@@ -112,14 +114,16 @@ class Search:
     """All forms at the ports of one channel."""
 
     def __init__(self, model: Model, channel: str, signals: list[np.ndarray]):
-        self.model, self.channel, self.signals = model, channel, signals
-        self.random = np.random.default_rng(0)
-        self.covered = _covered(np.concatenate(signals))
-        self.ports = tuple(
+        self.model = model
+        self.channel = channel
+        self.signals = signals
+        self.random: np.random.Generator = np.random.default_rng(0)
+        self.covered: dict[str, tuple[float, float]] = _covered(np.concatenate(signals))
+        self.ports: tuple[str, ...] = tuple(
             port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
         )  # fmt: skip
-        self.sensitivities = {port: _sensitivity(model, channel, port) for port in self.ports}
-        self.screen = Screen(model, channel, LASTING[channel])
+        self.sensitivities: dict[str, np.ndarray] = {port: _sensitivity(model, channel, port) for port in self.ports}
+        self.screen: Screen = Screen(model, channel, LASTING[channel])
 
     @cached_property
     def forms(self) -> list[Form]:

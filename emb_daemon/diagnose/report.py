@@ -1,5 +1,7 @@
 """Contents of report.json."""
 
+from typing import Any
+
 import numpy as np
 
 from emb_daemon.diagnose.diagnosis import Diagnosis, Recalibrated
@@ -12,7 +14,7 @@ from emb_daemon.diagnose.unexplained import Left
 _LISTED = 6
 
 
-def report(diagnosis: Diagnosis) -> dict:
+def report(diagnosis: Diagnosis) -> dict[str, Any]:
     """Everything, for scripts."""
     return {
         "paths": {
@@ -118,7 +120,7 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
     return entry
 
 
-def amplitudes(finding: Candidate) -> dict:
+def amplitudes(finding: Candidate) -> dict[str, dict[str, float | str]]:
     """Amplitude of each order out of its cosine and sine."""
     result = {}
     for name, cosine in finding.values.items():

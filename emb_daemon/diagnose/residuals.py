@@ -6,9 +6,10 @@ would spread an error of one path over both, and hide slow effects in an angle t
 """
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -149,30 +150,31 @@ class Bench:
     ):
         """``mounted``: for each log what the calibration says otherwise of it alone (`Trial.mounted`). ``own_data``:
         the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
-        self.calibration, self.own_data = calibration, own_data
+        self.calibration = calibration
+        self.own_data = own_data
         # A thread that waits for one other costs more than what most of these tasks do.
-        self.map = ThreadPoolExecutor(workers).map if workers > 1 else map
+        self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
 
         def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
             return make_trial(log, index, held(to_parameters(moved(calibration, here)))[0], here)
 
-        self.trials = list(self.map(trial, range(len(logs)), logs, mounted))
-        self.has_reference = all(trial.has_force for trial in self.trials)
-        self.clamps = calibration.contact.is_in_reach
-        self.has_current = any(trial.log.samples["has_current"].any() for trial in self.trials)
-        self.channels = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
-        self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
+        self.trials: list[Trial] = list(self.map(trial, range(len(logs)), logs, mounted))
+        self.has_reference: bool = all(trial.has_force for trial in self.trials)
+        self.clamps: bool = calibration.contact.is_in_reach
+        self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
+        self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
+        self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
-        self.load_follows = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
+        self.load_follows: bool = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
         #: Converts unexplained current to force: what it would be on the spindle.
-        self.newton_per_ampere = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
+        self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
         offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
-        self.episodes = int(offsets[-1])
+        self.episodes: int = int(offsets[-1])
         by_sample = [trial.episode + offset for trial, offset in zip(self.trials, offsets, strict=False)]
         by_temperature = [np.repeat(e[trial.temperature_rows], 9) for trial, e in zip(self.trials, by_sample, strict=True)]
-        self.sample_episode = np.concatenate(by_sample)
-        self.episode = {
+        self.sample_episode: np.ndarray = np.concatenate(by_sample)
+        self.episode: dict[str, np.ndarray] = {
             channel: np.concatenate(by_temperature) if channel == "temperature" else self.sample_episode
             for channel in self.channels
         }

@@ -14,6 +14,7 @@ A candidate is refused unless it passes all of
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import TypeAlias
 
 import numpy as np
 
@@ -39,9 +40,11 @@ _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 #: Draws of a placebo that runs through the estimator, and of one that does not.
 _DRAWS, _SHUFFLES = 2, 5
+#: By channel, the largest gain of a smooth function of one signal, and that signal.
+Rivals: TypeAlias = dict[str, tuple[float, str]]
 #: Signals that are no rivals in a channel: what a base parameter answers for (smoothed, the acceleration shows inertia better
 #: than the estimator's own difference of noisy speeds can), and the current of which the residual itself is made.
-NO_RIVALS = {"torque": ("motor_acceleration", "current"), "innovation": ("current",)}
+NO_RIVALS: dict[str, tuple[str, ...]] = {"torque": ("motor_acceleration", "current"), "innovation": ("current",)}
 
 
 @dataclass(frozen=True)
@@ -98,18 +101,19 @@ class Screening:
     """What is the same in all rounds: signals, coordinates of the effects that are off, and the residual at the beginning."""
 
     def __init__(self, bench: Bench, model: Model):
-        self.bench, self.initial = bench, model.residual
-        self.signals = signals(bench)
+        self.bench = bench
+        self.initial: dict[str, np.ndarray] = model.residual
+        self.signals: dict[str, np.ndarray] = signals(bench)
         channels = {effect.name: bench.channel_of(effect.channel) for effect in REGISTRY}
         #: Coordinates by parameter, of each effect that is off.
-        self.coordinates = {
+        self.coordinates: dict[str, dict[str, Coordinate]] = {
             effect.name: effect_coordinates(bench.calibration, effect, channels[effect.name])
             for effect in REGISTRY
             if channels[effect.name] and not model.of_effect(effect.name)
         }
         braking = self.signals["brake_torque"][self.signals["brake_torque"] > 0.0]
         #: RMS of the clamp force, or of the load where nothing is clamped, N.
-        self.force_N = rmse(self.signals["clamp_force"]) if bench.clamps else rmse(bench.load_N)
+        self.force_N: float = rmse(self.signals["clamp_force"]) if bench.clamps else rmse(bench.load_N)
         self._size = dict.fromkeys(bench.channels, self.force_N)
         self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
 
@@ -191,7 +195,7 @@ class Screening:
 
     # -- objections ---------------------------------------------------------------------------------------------------
 
-    def judge(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate]) -> Candidate:
+    def judge(self, model: Model, candidate: Candidate, rivals: Rivals, tested: Sequence[Candidate]) -> Candidate:
         """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked. ``tested``: all
         that were tested with it."""
         effect, evidence = candidate.effect, candidate.evidence
@@ -204,7 +208,7 @@ class Screening:
             return replace(candidate, reason=f"not significant over {clusters}")
         return self.plausible(model, candidate, rivals, tested)
 
-    def plausible(self, model: Model, candidate: Candidate, rivals: dict, tested: Sequence[Candidate] = ()) -> Candidate:
+    def plausible(self, model: Model, candidate: Candidate, rivals: Rivals, tested: Sequence[Candidate] = ()) -> Candidate:
         """The same but for chance."""
         channel, evidence, unit = candidate.channel, candidate.evidence, UNITS[candidate.channel]
         floor = self.floor(model, channel)
@@ -229,7 +233,7 @@ class Screening:
                 return replace(candidate, reason=f"its placebo ({text}) explains {100 * share:.0f} % of the same")
         return replace(candidate, reason="")
 
-    def rival(self, model: Model, channel: str, rivals: dict, samples: int = 1) -> tuple[float, str]:
+    def rival(self, model: Model, channel: str, rivals: Rivals, samples: int = 1) -> tuple[float, str]:
         """Largest gain on left-out episodes of a smooth function of one signal, and that signal; kept in ``rivals``."""
         if channel not in rivals:
             gains = {

@@ -3,13 +3,13 @@
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 STATE = np.dtype([("known", "?"), ("follower", "f8")], align=True)
 
 
 @njit
-def term(p, s, m):
+def term(p: Record, s: Record, m: Record) -> float:
     """Angle in rad by which the spindle lags the motor."""
     if p.play_rad == 0.0:
         return 0.0

@@ -110,7 +110,7 @@ class Placebo:
     signal: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray] | None = None
     order: Callable[[float], tuple[float, ...]] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if sum(way is not None for way in (self.samples, self.signal, self.order)) != 1:
             raise ValueError(f"placebo {self.text}: expected one of samples, signal and order")
 
@@ -166,7 +166,7 @@ class Effect:
     beside: str = ""
     bare: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.hook not in HOOKS:
             raise ValueError(f"effect {self.name}: there is no hook {self.hook}; there are {', '.join(HOOKS)}")
         offered = {"p", "value", *HOOKS[self.hook].arguments} | ({"s"} if self.state is not None else set())

@@ -2,11 +2,11 @@
 
 from emb_daemon.effects.base import Effect, Harmonic, Parameter, Placebo
 from emb_daemon.effects.gear_mesh_ripple import cycle_mean
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p, m, travel):
+def term(p: Record, m: Record, travel: float) -> float:
     """Torque in N m that it adds, mean over the cycle."""
     if p.cosine_Nm == 0.0 and p.sine_Nm == 0.0:
         return 0.0

@@ -1,11 +1,11 @@
 """Offset of the current measurement."""
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p):
+def term(p: Record) -> float:
     """Current in A that flows but is not measured."""
     return p.offset_A
 

@@ -1,12 +1,12 @@
 """Radiation of the disc beyond that in the calibration: it dominates while a hot disc stands still."""
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.thermal import KELVIN, STEFAN_BOLTZMANN
 
 
 @njit
-def term(p, heat_capacity, disc, ambient, dt):
+def term(p: Record, heat_capacity: float, disc: float, ambient: float, dt: float) -> float:
     """Change of the disc temperature in K over ``dt`` seconds."""
     if p.area_m2 == 0.0:
         return 0.0

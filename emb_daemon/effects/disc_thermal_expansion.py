@@ -3,13 +3,13 @@
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 STATE = np.dtype([("known", "?"), ("start_C", "f8")], align=True)
 
 
 @njit
-def term(p, s, disc, disc_known):
+def term(p: Record, s: Record, disc: float, disc_known: bool) -> float:
     """Growth of the disc in m since power-on, where the contact angle was set."""
     if p.growth_um_per_K == 0.0 or not disc_known:
         return 0.0

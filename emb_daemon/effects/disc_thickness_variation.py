@@ -9,7 +9,7 @@ from math import cos, pi, sin, sqrt
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.wheel import WHEEL, track
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
@@ -35,7 +35,7 @@ def _amplitudes(p):
 
 
 @njit
-def term(p, s, m):
+def term(p: Record, s: Record, m: Record) -> float:
     """Disc thickness in m above its mean, where the pads stand."""
     cosines, sines = _amplitudes(p)
     # Twice the mean square of the slope over the angle, µm²/rad².

@@ -1,11 +1,11 @@
 """Gear friction that differs between clamping and releasing."""
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p, friction_mean):
+def term(p: Record, friction_mean: float) -> float:
     """Friction over that without direction, minus one; ``friction_mean`` in [-1, 1], positive while clamping."""
     return p.asymmetry * friction_mean
 

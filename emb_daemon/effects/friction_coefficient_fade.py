@@ -1,14 +1,14 @@
 """Pad fade: hot pads have less friction, so braking produces less heat than the friction table says."""
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Most of the coefficient of friction that can be lost.
 _MOST = 0.8
 
 
 @njit
-def term(p, surface):
+def term(p: Record, surface: float) -> float:
     """Coefficient of friction at the pads' ``surface`` temperature (degC) over that without fade, minus one."""
     if p.fade_per_K == 0.0:
         return 0.0

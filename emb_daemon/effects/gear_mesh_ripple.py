@@ -3,11 +3,11 @@
 from math import cos, sin
 
 from emb_daemon.effects.base import Effect, Harmonic, Parameter, Placebo
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def cycle_mean(cosine, sine, order, angle, travel):
+def cycle_mean(cosine: float, sine: float, order: float, angle: float, travel: float) -> float:
     """Mean of cosine cos(n x) + sine sin(n x) over a cycle in which x went ``travel`` rad and ended at ``angle``."""
     phase = order * (angle - 0.5 * travel)
     half = 0.5 * order * travel
@@ -16,7 +16,7 @@ def cycle_mean(cosine, sine, order, angle, travel):
 
 
 @njit
-def term(p, m, travel):
+def term(p: Record, m: Record, travel: float) -> float:
     """Gear gain over its mean, minus one, mean over the cycle."""
     if p.cosine == 0.0 and p.sine == 0.0:
         return 0.0

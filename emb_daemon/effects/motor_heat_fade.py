@@ -9,13 +9,13 @@ from math import exp
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 STATE = np.dtype([("heat", "f8")], align=True)
 
 
 @njit
-def term(p, s, m, dt):
+def term(p: Record, s: Record, m: Record, dt: float) -> float:
     """Relative change of the torque constant; ``s.heat`` is the lagged square of the current, A^2."""
     if p.fade_per_A2 == 0.0:
         return 0.0

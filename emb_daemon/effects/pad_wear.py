@@ -3,13 +3,13 @@
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 STATE = np.dtype([("energy_MJ", "f8")], align=True)
 
 
 @njit
-def term(p, s, power, dt):
+def term(p: Record, s: Record, power: float, dt: float) -> float:
     """Thickness in m by which both pads have grown (wear is negative) since power-on by friction of ``power`` W."""
     if p.wear_um_per_MJ == 0.0:
         return 0.0

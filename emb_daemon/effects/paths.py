@@ -5,10 +5,16 @@ order of the registry, which compiled code then calls directly. numba keeps it o
 (`emb_daemon.jit`), so the same registry finds the same compiled code again.
 """
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 from emb_daemon import effects
 from emb_daemon.effects import terms
 from emb_daemon.effects.base import HOOKS, Hook
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
+
+#: Called with the quantity where the hook has no start, parameters and states of all effects, and the hook's arguments.
+_Hook: TypeAlias = Callable[..., float]
 
 
 def _source(name: str, hook: Hook) -> str:
@@ -26,11 +32,12 @@ def _source(name: str, hook: Hook) -> str:
     return "\n".join([*lines, "    return value"])
 
 
-def _compose(name: str):
+def _compose(name: str) -> _Hook:
     scope = {effect.name: effect.term for effect in effects.REGISTRY} | {"__name__": __name__}
     # numba's cache on disk needs an existing file; the content of this one and of the registry decide.
     exec(compile(_source(name, HOOKS[name]), __file__, "exec"), scope)
-    return njit(scope[name])
+    function: _Hook = scope[name]
+    return njit(function)
 
 
 #: Whether an effect uses the signals of terms, which must then be computed even without a term.
@@ -38,53 +45,55 @@ _WATCHED = any("signals" in effect.arguments for effect in effects.REGISTRY)
 
 
 @njit
-def look(e, s, p, m):
+def look(e: Record, s: Record, p: Record, m: Record) -> None:
     """Signals and amounts of terms at this sample."""
     if _WATCHED or e.count > 0:
         terms.look(e, s, p, m)
 
 
-thickness = _compose("thickness")
-motor_angle = _compose("motor_angle")
-stiffness = _compose("stiffness")
-force = _compose("force")
-relaxation_time = _compose("relaxation_time")
-torque_constant = _compose("torque_constant")
-current = _compose("current")
-torque = _compose("torque")
-gear_gain = _compose("gear_gain")
-gear_friction = _compose("gear_friction")
-backplate = _compose("backplate")
-pad_friction = _compose("pad_friction")
-disc_cooling = _compose("disc")
+thickness: _Hook = _compose("thickness")
+motor_angle: _Hook = _compose("motor_angle")
+stiffness: _Hook = _compose("stiffness")
+force: _Hook = _compose("force")
+relaxation_time: _Hook = _compose("relaxation_time")
+torque_constant: _Hook = _compose("torque_constant")
+current: _Hook = _compose("current")
+torque: _Hook = _compose("torque")
+gear_gain: _Hook = _compose("gear_gain")
+gear_friction: _Hook = _compose("gear_friction")
+backplate: _Hook = _compose("backplate")
+pad_friction: _Hook = _compose("pad_friction")
+disc_cooling: _Hook = _compose("disc")
 
 
 @njit
-def static_force(e, s, static, travel, dt):
+def static_force(e: Record, s: Record, static: float, travel: float, dt: float) -> float:
     """Static clamp force (N) with what effects add to it after ``travel`` rad in contact."""
     return force(static * stiffness(e, s, travel, dt), e, s, travel, dt)
 
 
 @njit
-def motor_torque(e, s, m, nominal, travel, mean_speed, disc, disc_known):
+def motor_torque(
+    e: Record, s: Record, m: Record, nominal: float, travel: float, mean_speed: float, disc: float, disc_known: bool
+) -> float:
     """Motor torque (N m) that reaches the gear; ``nominal`` is the torque constant at 25 degC."""
     constant = nominal * torque_constant(e, s, m, disc, disc_known, m.dt)
     return torque(constant * current(m.current_q, e, s, m, m.dt), e, s, m, travel, mean_speed, m.dt)
 
 
 @njit
-def backplates(e, s, inner, outer, dt):
+def backplates(e: Record, s: Record, inner: float, outer: float, dt: float) -> tuple[float, float]:
     """Temperatures (degC) of the backing plates from what their thermocouples show."""
     return backplate(inner, e, s, 0, dt), backplate(outer, e, s, 1, dt)
 
 
 @njit
-def thickness_sigma(s):
+def thickness_sigma(s: Record) -> float:
     """Standard deviation (m) of the disc's thickness where its phase is not known."""
     return s.disc_thickness_variation.sigma
 
 
 @njit
-def known_delay(e):
+def known_delay(e: Record) -> float:
     """Age of the motor angle (s) that the calibration knows."""
     return e.signal_delay.delay_s

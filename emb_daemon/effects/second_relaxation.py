@@ -3,14 +3,14 @@
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.stiffness import first_order_lag
 
 STATE = np.dtype([("force", "f8"), ("before", "f8")], align=True)
 
 
 @njit
-def term(p, s, value, dt):
+def term(p: Record, s: Record, value: float, dt: float) -> float:
     """Force in N that is still to come: share of the static force ``value`` that lags with the time constant."""
     if p.share == 0.0:
         return 0.0

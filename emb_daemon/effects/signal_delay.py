@@ -1,11 +1,11 @@
 """Time by which the resolver's angle is older than the force it is compared with."""
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p, m):
+def term(p: Record, m: Record) -> float:
     """Angle in rad by which the motor has gone on."""
     return p.delay_s * m.speed
 

@@ -3,13 +3,13 @@
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 STATE = np.dtype([("slip", "f8")], align=True)
 
 
 @njit
-def term(p, s, travel):
+def term(p: Record, s: Record, travel: float) -> float:
     """Relative force of the element after the pads moved by ``travel`` rad; ``s.slip`` is its stretch, -1 to 1."""
     if p.share == 0.0:
         return 0.0

@@ -3,11 +3,11 @@
 from math import exp
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p, mean_speed):
+def term(p: Record, mean_speed: float) -> float:
     """Friction over Coulomb friction, minus one."""
     if p.rise == 0.0:
         return 0.0

@@ -9,7 +9,7 @@ from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Largest number of terms in a calibration.
@@ -222,7 +222,7 @@ def _of_torque(port, s, p, m):
 
 
 @njit
-def look(e, s, p, m):
+def look(e: Record, s: Record, p: Record, m: Record) -> None:
     """All terms at this sample. ``e`` PARAMETERS, ``s`` the estimator's state, ``p`` its parameters, ``m`` the sample."""
     t = s.effects.terms
     _follow(t.signal, s, m)
@@ -253,5 +253,5 @@ def _follow_all(e, t, signals, dt, maximum_force, values):
 def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
     """Amount that a term (TERM) adds at its port for signals of shape (n, signals), ``dt`` s apart, in the port's unit."""
     values = np.zeros(len(signals))
-    _follow_all(term, np.zeros(1, STATE)[0], signals, dt, maximum_force_N, values)
+    _follow_all(term, np.zeros(1, STATE)[0], signals, np.ascontiguousarray(dt), maximum_force_N, values)
     return values

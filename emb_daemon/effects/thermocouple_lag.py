@@ -5,7 +5,7 @@ from math import exp
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, at_another_time
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Smoothing of the derivative that undoes the lag, s: readings come in steps of 0.1 K.
 _SMOOTHING_S = 2.0
@@ -14,7 +14,7 @@ STATE = np.dtype([("known", "i8", 2), ("smoothed", "f8", 2)], align=True)
 
 
 @njit
-def term(p, s, side, value, dt):
+def term(p: Record, s: Record, side: int, value: float, dt: float) -> float:
     """Correction of the reading ``value``, K."""
     if p.lag_s == 0.0:
         return 0.0

@@ -5,14 +5,14 @@ heats the motor from the other side; a share says where.
 """
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Temperature at which torque constants are stated.
 RATED_C = 25.0
 
 
 @njit
-def term(p, m, disc, disc_known):
+def term(p: Record, m: Record, disc: float, disc_known: bool) -> float:
     """Relative change of the torque constant."""
     if p.fade_per_K == 0.0 or not m.has_thermocouple:
         return 0.0

@@ -7,14 +7,14 @@ term of it, which is tested against the whole grammar.
 """
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Loss beyond which the quadratic is no longer valid; motors stay far below it.
 _MOST = 0.5
 
 
 @njit
-def term(p, m):
+def term(p: Record, m: Record) -> float:
     """Relative change of the torque constant."""
     if p.loss_per_A2 == 0.0 or not m.has_current:
         return 0.0

@@ -1,11 +1,11 @@
 """Friction proportional to motor speed: lubricant, bearings, eddy currents."""
 
 from emb_daemon.effects.base import Effect, Parameter
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p, mean_speed):
+def term(p: Record, mean_speed: float) -> float:
     """Torque in N m that it adds."""
     return -p.viscous_Nms_per_rad * mean_speed
 

@@ -2,12 +2,12 @@
 
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.step import predict, step
-from emb_daemon.jit import Array, entry, njit
+from emb_daemon.jit import Array, Record, Records, entry, njit
 from emb_daemon.wire.contract import CONTESTED, CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
 
 
 @entry(Array(SAMPLE), int, Array(STATE), Array(PARAMETERS), Array(ESTIMATE))
-def answer(samples, count, states, parameters, estimates):
+def answer(samples: Records, count: int, states: Records, parameters: Records, estimates: Records) -> None:
     """Estimate ``samples[:count]``.
 
     ``states`` and ``parameters`` have one record for each corner, or one in all.
@@ -18,7 +18,7 @@ def answer(samples, count, states, parameters, estimates):
 
 
 @njit
-def answer_row(row, state, p, estimate):
+def answer_row(row: Record, state: Record, p: Record, estimate: Record) -> None:
     """Estimate one SAMPLE into one ESTIMATE."""
     estimate.time_ns = row.time_ns
     estimate.cycle = row.cycle

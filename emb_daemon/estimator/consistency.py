@@ -2,30 +2,30 @@
 
 A bias of 1 kN under noise of 0.6 kN a sample is nothing in one sample and certain after a second. The innovation is smoothed
 over several horizons; the mean square of what is left, over many such horizons, is compared with what white noise of the
-filter's own variance would leave (the test ratios of PX4's EKF2, with memory). What is beyond it is model error: of either
-path, so the force may be wrong by as much.
+filter's own variance would leave (the test ratios of PX4's EKF2, with memory). An excess is model error, of either path, so
+that the force may be wrong by as much.
 """
 
 from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 
 #: Horizons over which the innovation is smoothed, s, and time over which its square is averaged, s.
 HORIZONS_S = (0.05, 0.2, 1.0)
 HORIZONS = len(HORIZONS_S)
 _AVERAGED_S = (30.0, 60.0, 60.0)
-#: Mean square over the expected one that is no noise: the mean of n squares spreads by sqrt(2 / n), overlapping horizons by
-#: half as much again, and six of those are taken.
+#: Mean square over the expected one above which it is no noise: the mean of n squares has standard deviation sqrt(2 / n), with
+#: overlapping horizons half as much again, and the bound is six of those.
 _RATIO = tuple(
     1.0 + 6.0 * 1.5 * (2.0 * horizon / averaged) ** 0.5 for horizon, averaged in zip(HORIZONS_S, _AVERAGED_S, strict=True)
 )
-#: Mean square over the expected one that counts at most: a jump is the hypotheses' to find and must not be remembered for
-#: minutes after they have.
+#: Largest mean square over the expected one that counts: the hypotheses find a jump, and it must not be remembered for minutes
+#: afterwards.
 _COUNTED = 16.0
 
-#: What a test says.
+#: Results of a test.
 UNKNOWN, CONSISTENT, INCONSISTENT = range(3)
 
 CONSISTENCY = np.dtype(
@@ -41,7 +41,7 @@ CONSISTENCY = np.dtype(
 
 
 @njit
-def remember(c, innovation, sigma, dt):
+def remember(c: Record, innovation: float, sigma: float, dt: float) -> None:
     """Take one innovation and its standard deviation."""
     c.seen_s += dt
     for i in range(HORIZONS):
@@ -54,15 +54,15 @@ def remember(c, innovation, sigma, dt):
 
 
 @njit
-def forget(c):
-    """Begin anew: what was left unexplained has been explained."""
+def forget(c: Record) -> None:
+    """Begin anew, because a change has explained what was left."""
     c.seen_s = 0.0
     for i in range(HORIZONS):
         c.mean[i] = c.variance[i] = c.square[i] = c.expected[i] = 0.0
 
 
 @njit
-def judge(c, horizon):
+def judge(c: Record, horizon: int) -> int:
     """UNKNOWN before enough evidence, CONSISTENT or INCONSISTENT."""
     if c.seen_s < 0.5 * _AVERAGED_S[horizon]:
         return UNKNOWN
@@ -70,8 +70,8 @@ def judge(c, horizon):
 
 
 @njit
-def model_error(c):
-    """Standard deviation (the innovation's unit) of what is left beyond noise; 0 where all that can be judged is noise."""
+def model_error(c: Record) -> float:
+    """Standard deviation (the innovation's unit) of what noise does not explain; 0 if noise explains all."""
     worst = 0.0
     for i in range(HORIZONS):
         if judge(c, i) == INCONSISTENT:

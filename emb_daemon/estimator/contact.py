@@ -7,7 +7,7 @@ import numpy as np
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, turned
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.contact import (
     NOTHING,
     TOO_EARLY,
@@ -58,7 +58,7 @@ _CLAMPED = 0.1
 
 
 @njit
-def follow_zero(s, p, m):
+def follow_zero(s: Record, p: Record, m: Record) -> bool:
     """Whether the resolver has another zero now, because its angle went where the speed says that the motor did not; then the
     contact angle goes with it.
 
@@ -142,7 +142,7 @@ def _unaccounted(p, seconds):
 
 
 @njit
-def seek_release(s, p, m):
+def seek_release(s: Record, p: Record, m: Record) -> None:
     """Contact is unknown until the brake was seen released: nobody brakes, the park brake is off, the motor stands and needs
     no torque. From there the clearance counts. A brake that is latched needs no current either."""
     released = m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
@@ -193,7 +193,7 @@ def _passed_clearance(s, p, m):
 
 
 @njit
-def place_contact(s, p, released):
+def place_contact(s: Record, p: Record, released: float) -> None:
     """Believe that the motor angle ``released`` rad is the released position, from which the clearance counts, whatever was
     believed before."""
     s.gear_zero = released
@@ -215,7 +215,7 @@ def place_contact(s, p, released):
 
 
 @njit
-def watch_contact(s, p, m, force_before, torque, leverage):
+def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: float, leverage: float) -> None:
     """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
     c, x, contact_sigma = s.contact, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT])
     if p.clearance_sigma == 0.0:

@@ -1,12 +1,12 @@
 """Clamp force sensor of low range: below its limit a third source, above it what the models learned from it there.
 
-It errs by a zero that drifts, which it shows itself wherever the pads do not touch, by a gain, and by an age that nobody knows
-better than to a part of a cycle. None of these is noise: they stay the same over a stroke, so that however many samples say
-the same thing, they say it once. A hypothesis therefore takes from the sensor what makes its force known as well as those
-errors leave it, and nothing beyond; as evidence between hypotheses it counts by what each of them still had to learn.
+Its errors are a drifting zero, which it shows itself while the pads do not touch, a gain error, and an age that is only known
+to a part of a cycle. None of these is noise: they are constant over a stroke, so that many samples contain no more information
+about them than one. A hypothesis therefore learns from the sensor only until its force is known as well as these errors allow;
+as evidence between hypotheses a sample counts by how much each of them still learned from it.
 
-The sensor may itself be the part that broke. What it says for or against a change of the brake stays within `_SAYS`, and where
-no hypothesis that the torque has left standing explains it, it is disbelieved until it has followed the force again.
+The sensor itself may be faulty. Its evidence for or against a change of the brake is limited to `_SAYS`, and if no hypothesis
+that agrees with the torque explains its values, it is not used until it has followed the force again.
 """
 
 from math import hypot, inf, log, sqrt
@@ -29,7 +29,7 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.uneven import applied
 from emb_daemon.estimator.unknown import add_stiffness_jumps
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Floats, Record, fields, njit
 from emb_daemon.models.fusion import CONTACT, FAST, GROWTH, SCALE, maximum_likelihood, update_errors, variance_along
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.models.stiffness import characteristic_curve
@@ -53,35 +53,38 @@ FORCE_SENSOR = np.dtype(
 )
 
 #: Share of the clearance that the motor must have gone back through, time for which, s, and force left by the lag over the
-#: sensor's noise, for the pads not to touch.
+#: sensor's noise, for the pads to count as apart.
 _BACK, _CLEAR_S, _LEFT = 0.3, 0.5, 0.1
-#: Share of the force that the pads' deformation must account for: what is left of a force when they have let go is their
-#: relaxation's, and tells nothing of contact and stiffness.
+#: Least share of the force that is due to the pads' deformation: after they have opened the rest is relaxation, which does not
+#: depend on contact angle and stiffness.
 _HELD = 0.5
-#: States that the force rests on and that stay what they are over a stroke.
+#: States that determine the force and are constant over a stroke.
 _SLOW = (CONTACT, SCALE, GROWTH)
-#: Standard deviations of its noise below the limit from which a value may be the limit's.
+#: Distance below the limit, in standard deviations of the noise, within which a value may be saturated.
 _SURELY = 3.0
 #: Part of a cycle by which the sensor's value and the angle may be apart in time, as of the current (`fuse._LATE`).
 _LATE = 0.3
-#: Time of a stroke below the limit, s: what the sensor says of two hypotheses that have both learned counts once in it.
+#: Duration of a stroke below the limit, s, in which the sensor's evidence between two hypotheses that have both learned counts
+#: once.
 _STROKE_S = 0.1
 #: Log odds that the sensor may give or take. A sensor breaks about as rarely as a brake changes (`hypotheses.PRIOR_ODDS`), so
 #: alone it makes a change one in twenty, which has the right force as soon as the torque speaks for it. Of what
 #: `studies.force_sensor --limits 5000 --count 3` draws, 3 leaves as small errors as 4 and 7, and faults of the sensor less.
 _SAYS = 3.0
-#: Log odds over its least by which an alternative must stand for what it explains not to be held against the sensor.
+#: Log odds above its least from which an alternative that explains the sensor's values counts in favour of the sensor.
 _STANDING = 1.0
-#: Squared normalised differences as in `models.plausibility`: what model errors may make of one, what counts at most, and the
-#: sums that raise and end the alarm.
+#: Squared normalised differences as in `models.plausibility`: the part of one that is attributed to model errors, the most
+#: that one counts, and the sums that raise and end the alarm.
 _TOLERATED, _COUNTED, _RAISE, _CLEAR = 20.0, 144.0, 600.0, 150.0
-#: Share of the limit, and its noise, that the force must have moved by while it reads the same to the bit.
+#: Change of the force, as a share of the limit and in the sensor's noise, from which a value that repeats to the bit is
+#: frozen.
 _MOVED, _NOISES = 0.1, 20.0
 
 
 @njit
 def _common(s, p, m, force, force_before):
-    """Standard deviation (N) of what the sensor is off by in all samples of a stroke, at a clamp force of ``force`` N."""
+    """Standard deviation (N) of the sensor's error that is common to all samples of a stroke, at a clamp force of ``force``
+    N."""
     c, q = s.sensor, p.sensor
     warmed = q.per_kelvin * (m.caliper - c.zeroed) if m.has_thermocouple else 0.0
     late = _LATE * (s.force - force_before)
@@ -98,7 +101,7 @@ def _find_zero(c, q, m, variance):
     """The pads do not touch: what the sensor reads is its zero, known so far with ``variance`` N^2."""
     off, total = m.sensor_force - c.offset, variance + q.noise * q.noise
     if off * off > GATE * GATE * total:
-        # No zero that drifts as it should. What it is now is found once that is certain.
+        # The zero has moved more than drift explains; it is found anew once the pads are certainly apart.
         _count(c, _COUNTED)
         if not c.wrong:
             return
@@ -136,7 +139,7 @@ def _learn(x, P, gain, h, off, noise, common):
     excess = slow - common * common
     if excess <= 0.0 or off * off > GATE * GATE * total:
         return total, 0.0
-    # Left is what the common error leaves, and of the rest what the noise and the fast error do.
+    # What remains is the common error, and of the rest the noise and the fast error.
     white = noise * noise + h[FAST] * h[FAST] * P[FAST, FAST]
     told = excess * excess / (excess + white)
     update_errors(x, P, gain, off, max(along * along / told, known + noise * noise))
@@ -150,7 +153,7 @@ def _weigh(s, a, kind, first, first_variance, second, second_variance, news):
     edge = GATE * GATE
     says = 0.5 * (min(first * first / first_variance, edge) - min(second * second / second_variance, edge))
     says = min(max(says + 0.5 * log(first_variance / second_variance), -_SAYS), _SAYS)
-    # The same said again is no more than said once.
+    # Repeated values contain no new information.
     said = a.told + news * says
     said = min(said, max(a.told, says)) if says > 0.0 else max(said, min(a.told, says))
     least, most = drift_odds(s) if kind == DRIFT else (a.least, inf)
@@ -211,7 +214,7 @@ def _open_wider(s, p):
 
 
 @njit
-def hear_sensor(s, p, m, h, spread, warmth, force_before):
+def hear_sensor(s: Record, p: Record, m: Record, h: Floats, spread: float, warmth: float, force_before: float) -> None:
     """Take one sample's value into all hypotheses, or into the sensor's zero where the pads do not touch; ``h``: scratch,
     ``force_before`` N of the stiffness path at the last sample."""
     c, q = s.sensor, p.sensor
@@ -238,7 +241,7 @@ def hear_sensor(s, p, m, h, spread, warmth, force_before):
         static, _ = characteristic_curve(s.past_contact, p.curve)
         if seen and m.dt > 0.0 and s.factor * s.scale * static >= _HELD * s.force:
             left = _take(s, p, m, h, spread, warmth, q.noise, common)
-            # Which of three is wrong two of them must agree on.
+            # Of three sources, the one that the other two contradict is wrong.
             if s.plausibility.verdict == AGREE:
                 _count(c, left)
             if abs(s.force - c.value_force) > max(_MOVED * q.limit, _NOISES * q.noise):
@@ -248,13 +251,13 @@ def hear_sensor(s, p, m, h, spread, warmth, force_before):
         if c.clear_s == 0.0 and (_open_wider(s, p) or not c.asked):
             c.asked, c.contradiction, wrong = True, 0.0, False
         else:
-            # What the alternatives heard of it tells nothing of the brake.
+            # What the alternatives learned from it is not due to the brake.
             open_all(s, p)
     c.wrong = wrong
 
 
 @njit
-def with_sensor(c, force, sigma):
+def with_sensor(c: Record, force: float, sigma: float) -> tuple[float, float]:
     """A force and its standard deviation (N) that do without the angle, with what the sensor says now."""
     if c.sigma == inf:
         return force, sigma

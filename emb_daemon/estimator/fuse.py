@@ -55,7 +55,7 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
     torque_offset,
 )
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -126,7 +126,7 @@ def _clear_acceleration(s, m):
 
 
 @njit
-def needed_torque(s, p, m, mean_force, leverage):
+def needed_torque(s: Record, p: Record, m: Record, mean_force: float, leverage: float) -> tuple[float, float, float]:
     """Torques (N m): friction as far as it is slow, what inertia took, and what force, friction and inertia took together."""
     accelerating, load = p.inertia * _clear_acceleration(s, m), mean_force + s.spring_force
     friction = s.friction_mean * (p.offset_friction + p.load_friction * load * s.gear_slope)
@@ -243,7 +243,9 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
 
 
 @njit
-def fuse(s, p, m, force_before, torque, leverage, friction_variance, out):
+def fuse(
+    s: Record, p: Record, m: Record, force_before: float, torque: float, leverage: float, friction_variance: float, out: Record
+) -> tuple[float, float]:
     """All hypotheses over the errors of both paths; fills force, sigma and innovation of ``out``.
 
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state, of a motor that turns
@@ -379,7 +381,7 @@ def _facts_of_torque(s, p):
 
 
 @njit
-def take_sides(s, p, m, turning_sigma, standing_sigma, out):
+def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_sigma: float, out: Record) -> int:
     """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``turning_sigma`` and
     ``standing_sigma`` N m, as `fuse` returns them."""
     c = s.plausibility

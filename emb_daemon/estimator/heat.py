@@ -8,7 +8,8 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
+from emb_daemon.models import thermal
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
@@ -121,7 +122,8 @@ def _flow(s, t, e, m):
     outer = m.outer_backplate if m.has_thermocouple else s.pads[1, NODES - 1]
     _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
-    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, s.heat_energy / dt, s.touching, wheel_speed, dt, s.work)
+    power = s.heat_energy / dt
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, thermal.LONGEST_S)
     s.disc += effects.disc_cooling(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
@@ -135,7 +137,7 @@ def _flow(s, t, e, m):
 
 
 @njit
-def heat(s, p, m):
+def heat(s: Record, p: Record, m: Record) -> None:
     """Pads and disc up to this sample, heated by what the last estimate says.
 
     A conduction step costs more than all the rest: one serves several samples, as long as the pads' contact stays the same.
@@ -177,7 +179,7 @@ def heat(s, p, m):
 
 
 @njit
-def tell(s, out):
+def tell(s: Record, out: Record) -> None:
     known = s.temperature_known
     for side in range(2):
         out.surface[side] = s.pads[side, 0] if known else np.nan

@@ -32,7 +32,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     stay_possible,
 )
-from emb_daemon.jit import njit
+from emb_daemon.jit import Floats, Record, njit
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -92,9 +92,9 @@ _SURELY = 9.0
 GATE = 5.0
 
 #: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
-#: first hypothesis. Numbers of numpy, as the states are (`models.fusion`).
+#: first hypothesis.
 ALTERNATIVES = 5
-STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = np.arange(ALTERNATIVES)
+STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
@@ -173,7 +173,7 @@ def _forget_kept(s):
 
 
 @njit
-def exists(a):
+def exists(a: Record) -> bool:
     """Whether there is such a hypothesis: a kept jump may be none, and a brake that is known has none."""
     return a.log_odds > -np.inf
 
@@ -185,7 +185,7 @@ def _open_jumps(s, p):
 
 
 @njit
-def open_again(s, p):
+def open_again(s: Record, p: Record) -> None:
     """Look for jumps from now on; what was seen before tells nothing of them."""
     _open_jumps(s, p)
     _forget_kept(s)
@@ -210,21 +210,21 @@ def _succeed(s, p, kind, released):
 
 
 @njit
-def open_changes(s, p):
+def open_changes(s: Record, p: Record) -> None:
     """All but a brake that drifts."""
     open_again(s, p)
     _open(s, p, DISC_GROWTH)
 
 
 @njit
-def open_all(s, p):
+def open_all(s: Record, p: Record) -> None:
     """After a start, or when what was seen tells nothing."""
     open_changes(s, p)
     _open(s, p, DRIFT)
 
 
 @njit
-def open_others(s, p):
+def open_others(s: Record, p: Record) -> None:
     """When another hypothesis has become the first; beside a kept jump."""
     _open_jumps(s, p)
     _open(s, p, DISC_GROWTH)
@@ -288,7 +288,7 @@ def _share_out(s):
 
 
 @njit
-def drift_odds(s):
+def drift_odds(s: Record) -> tuple[float, float]:
     """Log odds between which those of a drift stay. Whatever is the likeliest, it may be a drift that makes it so: until that
     is proven a share of it stays. What speaks for a drift is remembered as far as it would prove another change."""
     likeliest = _likeliest_odds(s)
@@ -296,7 +296,7 @@ def drift_odds(s):
 
 
 @njit
-def likely_shift(s):
+def likely_shift(s: Record) -> float:
     """How far the change that is likelier than none moves the force, N; 0 if there is none."""
     best, shift = 0.0, 0.0
     for kind in range(DRIFT):
@@ -313,7 +313,7 @@ def _speaks(a):
 
 
 @njit
-def suspected(s):
+def suspected(s: Record) -> bool:
     """Whether an alternative is likely enough to be waited for."""
     any_speaks = False
     for kind in range(DRIFT):
@@ -322,7 +322,7 @@ def suspected(s):
 
 
 @njit
-def unproven(s):
+def unproven(s: Record) -> float:
     """How far apart a suspected change and what is without it hold the force, N: the largest of the difference times the
     probability of the less likely. A change that is as good as certain is in the force, before a release proves it."""
     most = 0.0
@@ -334,7 +334,7 @@ def unproven(s):
 
 
 @njit
-def place(s, a, p, factor, warmth):
+def place(s: Record, a: Record, p: Record, factor: float, warmth: float) -> None:
     """Where an alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
     x = s.past_contact
     moved = a.error[GROWTH] * warmth - a.error[CONTACT]
@@ -350,7 +350,7 @@ def place(s, a, p, factor, warmth):
 
 
 @njit
-def to_force(h, spread, slope, force, warmth):
+def to_force(h: Floats, spread: float, slope: float, force: float, warmth: float) -> None:
     """Sensitivity of the clamp force to the states."""
     for i in range(STATES):
         h[i] = 0.0
@@ -358,7 +358,10 @@ def to_force(h, spread, slope, force, warmth):
 
 
 @njit
-def to_torque(h, leverage, slope, friction_mean, force, speed, slow, accelerating, motor_torque, winding, housing):
+def to_torque(
+    h: Floats, leverage: float, slope: float, friction_mean: float, force: float, speed: float, slow: float,
+    accelerating: float, motor_torque: float, winding: float, housing: float,
+) -> None:  # fmt: skip
     """Make a sensitivity of the clamp force one of the torque that it leaves unexplained. ``slope`` of the gear; ``slow``,
     ``accelerating`` and ``motor_torque`` N m: friction as far as it is slow, what inertia and what everything took."""
     for i in (FAST, CONTACT, SCALE, GROWTH):
@@ -371,7 +374,7 @@ def to_torque(h, leverage, slope, friction_mean, force, speed, slow, acceleratin
 
 
 @njit
-def learned_torque(x, P, h):
+def learned_torque(x: Floats, P: Floats, h: Floats) -> tuple[float, float]:
     """Torque (N m) that what was learned of motor and friction explains, its offset apart, and its standard deviation."""
     total = variance = 0.0
     for i in _OF_THE_TORQUE:
@@ -382,7 +385,9 @@ def learned_torque(x, P, h):
 
 
 @njit
-def learn(x, P, gain, h, unexplained, variance, trusted):
+def learn(
+    x: Floats, P: Floats, gain: Floats, h: Floats, unexplained: float, variance: float, trusted: bool
+) -> tuple[float, float]:
     """One hypothesis takes one torque; its own contact angle, stiffness and growth are in ``unexplained`` already. It learns
     nothing from a torque that is not ``trusted``.
 
@@ -398,7 +403,9 @@ def learn(x, P, gain, h, unexplained, variance, trusted):
 
 
 @njit
-def weigh(a, least, most, first, first_variance, second, second_variance):
+def weigh(
+    a: Record, least: float, most: float, first: float, first_variance: float, second: float, second_variance: float
+) -> None:
     """Odds of an alternative after it and the first hypothesis have seen a torque; a sample far off counts as the gate's
     edge. They stay between ``least`` and ``most``."""
     edge = GATE * GATE
@@ -408,7 +415,7 @@ def weigh(a, least, most, first, first_variance, second, second_variance):
 
 
 @njit
-def stay_finite(s):
+def stay_finite(s: Record) -> None:
     """Log odds count from the first hypothesis; beyond certainty against it, what tells the alternatives apart stays."""
     beyond = _strongest(s, DRIFT) - CERTAIN_ODDS
     if beyond > 0.0:
@@ -431,7 +438,7 @@ def _follow_offset(s):
 
 
 @njit
-def settle(s, p, released, dt):
+def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
     While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
@@ -467,7 +474,7 @@ def settle(s, p, released, dt):
 
 
 @njit
-def fold(s, warmth, linear):
+def fold(s: Record, warmth: float, linear: bool) -> None:
     """Move what the first hypothesis learned of contact, stiffness and growth into the model itself: the curve is not
     straight. ``linear``: the force follows by its slope."""
     x = s.error
@@ -488,7 +495,7 @@ def fold(s, warmth, linear):
 
 
 @njit
-def contact_sigma(s):
+def contact_sigma(s: Record) -> float:
     """Standard deviation (rad) of the first hypothesis's contact angle, an unproven change included; shares as `mix` left
     them."""
     rest, square = 1.0, 0.0
@@ -509,7 +516,7 @@ def _unseen_growth(a):
 
 
 @njit
-def mix(s, h, spread, warmth):
+def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, float]:
     """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
     how far a drift would be from that, and its disc's growth, count in the latter. ``h``: scratch."""
     to_force(h, spread, s.slope, s.force, warmth)

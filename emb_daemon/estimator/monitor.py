@@ -7,19 +7,19 @@ which may follow the estimated force, only widens them. Over torque smoothed for
     lowest torque - offset - friction  <=  gear gain * force  <=  highest torque + offset + friction
 
 where friction counts against the motion if the motor turns and either way if it stands. Of a gear that is not constant the
-largest gain stands on the left and the least on the right, since no angle is believed here,
-and a release spring counts in full on the left and not at all on the right. A force that stays outside for
-`TOLERATED_S` is contradicted. A latched brake needs no current, so with the park brake on there is no upper bound.
+largest gain is used on the left and the least on the right, because no angle is used here; a release spring counts in full on
+the left and not at all on the right. A force that stays outside for `TOLERATED_S` is contradicted. A latched brake needs no
+current, so with the park brake on there is no upper bound.
 
-Pads only push. A standing motor that shows less torque than an open brake leaves to it has a current sensor that is further
-off than any healthy one, and by how much it shows itself: from then on that much may be missing on the right.
+Pads only push. If a standing motor shows less torque than is possible with an open brake, the offset of its current sensor is
+larger than a healthy one's, by at least that difference; from then on that much is added on the right.
 """
 
 from math import exp
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 from emb_daemon.models.gear import most_of_spring, steepest
 
 #: Time over which the torque is smoothed: longer than the motor needs to reach its speed; and time for which a force may lie
@@ -31,7 +31,7 @@ LEAST_GAIN, MOST_GAIN = 0.6, 1.1
 MOST_FRICTION = 2.0
 #: Offset of the current sensor as torque, share of what the largest force needs.
 OFFSET_SHARE = 0.05
-#: Gear gain that must be left over friction for a torque to bound the force from above: below it the gear holds by itself.
+#: Least gear gain minus friction with which a torque bounds the force from above; below it the gear is self-locking.
 _NOT_LOCKED = 0.2
 #: Time for which a standing motor must show too little torque for that, s: longer than it is pressed against its stop.
 _SHOWN_S = 1.0
@@ -44,7 +44,7 @@ MONITOR = np.dtype([("started", "?"), *fields("f8", "torque speed low high force
 
 
 @njit
-def bound(w, p, m, friction=1.0):
+def bound(w: Record, p: Record, m: Record, friction: float) -> None:
     """Update ``w.low`` and ``w.high``, N, with one SAMPLE ``m``; PARAMETERS ``p``; gear ``friction`` over theirs as the
     calibration's effects have it, of which no less than theirs is believed."""
     if not m.has_current:
@@ -62,7 +62,7 @@ def bound(w, p, m, friction=1.0):
     closing, opening = m.speed > _TURNING_RAD_PER_S, m.speed < -_TURNING_RAD_PER_S
     taken, taken_by_load = (0.0, 0.0) if opening else (dry, load)
     held, held_by_load = (0.0, 0.0) if closing else (dry, load)
-    # Friction of a motor that stands may press either way: by the most that this leaves the sensor is off from now on.
+    # Friction of a standing motor may act either way; the sensor's offset is what even the larger direction leaves.
     unhealthy = LEAST_GAIN * -w.torque > offset + dry and not closing and not opening
     w.short_s = w.short_s + m.dt if unhealthy else 0.0
     if w.short_s > _SHOWN_S:
@@ -78,7 +78,7 @@ def bound(w, p, m, friction=1.0):
 
 
 @njit
-def contradicts(w, force, sigma, dt):
+def contradicts(w: Record, force: float, sigma: float, dt: float) -> bool:
     """Whether ``force`` (N) has lain outside the bounds by more than three of its ``sigma`` for longer than tolerated.
 
     It is smoothed as the torque is, which lags behind in a long stroke."""

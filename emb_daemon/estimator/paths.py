@@ -5,7 +5,7 @@ from math import sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
@@ -27,7 +27,7 @@ UNCERTAIN_CONTACT_RAD = 0.05
 
 
 @njit
-def turned(s, p, angle):
+def turned(s: Record, p: Record, angle: float) -> tuple[float, float]:
     """Equivalent angle (rad) of a motor angle, and its slope; a constant gear's is the motor angle itself."""
     if p.gear.step == 0.0:
         return angle, 1.0
@@ -36,7 +36,7 @@ def turned(s, p, angle):
 
 
 @njit
-def position(s, p, m):
+def position(s: Record, p: Record, m: Record) -> float:
     """Equivalent angle past contact at this sample, rad; advances the effects that act on it."""
     e, state = p.effects, s.effects
     effects.look(e.terms, s, p, m)
@@ -47,7 +47,7 @@ def position(s, p, m):
 
 
 @njit
-def stiffness_path(s, p, m, factor):
+def stiffness_path(s: Record, p: Record, m: Record, factor: float) -> None:
     """Stiffness path: advances the dynamic force and its slope."""
     x = position(s, p, m)
     dt = m.dt
@@ -76,7 +76,7 @@ def _deform(s, p, x, dt, factor):
 
 
 @njit
-def rest(s, p, x, factor):
+def rest(s: Record, p: Record, x: float, factor: float) -> None:
     """Bring the stiffness path to where it settles ``x`` rad past contact."""
     s.past_contact = x
     _deform(s, p, x, _LONG_S, factor)
@@ -91,14 +91,14 @@ def _stand(s, m):
 
 
 @njit
-def settle_paths(s, p, m, factor):
+def settle_paths(s: Record, p: Record, m: Record, factor: float) -> None:
     """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
     _stand(s, m)
     rest(s, p, position(s, p, m), factor)
 
 
 @njit
-def begin_paths(s, p, m, factor):
+def begin_paths(s: Record, p: Record, m: Record, factor: float) -> None:
     """The same of pads that have not settled: effects go on from what they remember."""
     _stand(s, m)
     s.past_contact = position(s, p, m)
@@ -124,7 +124,7 @@ def _slid(s, p, angle, travel, dt):
 
 
 @njit
-def torque_path(s, p, m):
+def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     """Torque path over the cycle that ends at this sample.
 
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);

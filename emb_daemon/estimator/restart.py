@@ -20,17 +20,17 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     set_priors,
 )
-from emb_daemon.jit import entry, njit
+from emb_daemon.jit import Record, entry, njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, heat_step
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Kelvin per second by which a disc may have heated while nobody looked, and at most: hard braking from motorway speed.
+#: Largest heating of a disc while the daemon was off, K/s and K: hard braking from motorway speed.
 _UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
-#: Longest step of the heat that flowed meanwhile, s, and longest time that is followed, s.
+#: Longest step when the heat flow meanwhile is simulated, s, and longest time that is simulated, s.
 _STEP_S, _FOLLOWED_S = 5.0, 6 * 3600.0
 
-#: What no brake's snapshot holds: a contact further from the calibration's than ten times what brakes reach, m; more than a
+#: Bounds of a plausible snapshot: a contact further from the calibration's than ten times what brakes reach, m; more than a
 #: pad or disc survives, degC; growth beyond ten times that of an iron disc, m/K; heat of motor and housing over what the
 #: largest force's current leaves for ever; errors beyond so many of their standard deviations.
 _CONTACT_M, _COLDEST_C, _HOTTEST_C, _GROWTH_M_PER_K, _HEAT, _SIGMAS = 1e-3, -60.0, 1200.0, 2.6e-6, 4.0, 10.0
@@ -59,14 +59,14 @@ SNAPSHOT = np.dtype(
 
 @njit
 def _copy_pads(to, pads):
-    # Not ``to[:, :] = pads``: that allocates.
+    # ``to[:, :] = pads`` would allocate.
     for side in range(2):
         for node in range(NODES):
             to[side, node] = pads[side, node]
 
 
 @entry(STATE, PARAMETERS, SNAPSHOT, returns=1)
-def take_snapshot(s, p, snapshot):
+def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or uncertain."""
     if not s.started or s.unknown or s.contact.lost:
         return False
@@ -82,13 +82,20 @@ def take_snapshot(s, p, snapshot):
     return True
 
 
-def why_implausible(snapshot, p) -> str:
-    """What in a SNAPSHOT no brake with PARAMETERS ``p`` can have had, by the record's names; empty if nothing."""
-    prior = np.zeros((STATES, STATES))
-    set_priors(prior, p)
-    for add in (add_stiffness_jumps, add_torque_jumps, add_growth):
-        add(prior, p)
-    covariance = snapshot["covariance"]
+@njit
+def _widen(s, p):
+    """The covariance of a start, with that of all changes that a brake may have seen."""
+    set_priors(s.covariance, p)
+    add_stiffness_jumps(s.covariance, p)
+    add_torque_jumps(s.covariance, p)
+    add_growth(s.covariance, p)
+
+
+def why_implausible(snapshot: Record, p: Record) -> str:
+    """Fields of a SNAPSHOT that are impossible for a brake with PARAMETERS ``p``, by name; empty if there are none."""
+    widest = np.zeros(1, STATE)[0]
+    _widen(widest, p)
+    prior, covariance = widest["covariance"], snapshot["covariance"]
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(np.where(spread > 0.0, spread, 1.0), np.where(spread > 0.0, spread, 1.0))
@@ -112,10 +119,10 @@ def why_implausible(snapshot, p) -> str:
 
 
 @entry(STATE, PARAMETERS, SNAPSHOT, float)
-def resume(s, p, snapshot, elapsed_s):
+def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
 
-    Its first sample then starts it as ever, but from these values."""
+    Its first sample then starts it as usual, but from these values."""
     s.resumed = True
     s.clearance, s.clearance_sigma = snapshot.clearance, snapshot.clearance_sigma
     s.scale, s.growth, s.growth_start = snapshot.scale, snapshot.growth, snapshot.growth_start
@@ -138,15 +145,15 @@ def resume(s, p, snapshot, elapsed_s):
 
 
 @njit
-def follow_heat(s, t, m):
-    """Let the heat of a snapshot flow for the time that has passed since, between the plates as they are now."""
+def follow_heat(s: Record, t: Record, m: Record) -> None:
+    """Simulate the heat flow of the time since the snapshot, with the plates' present temperatures."""
     ambient = m.ambient if m.has_status else m.caliper
     if s.rested_s > 0.0:
         before = s.disc
         s.disc = heat_step(
             t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S
         )
-        # How much air passed is as unknown as what braked; both die out as the disc cools.
+        # Cooling air and braking meanwhile are unknown; both effects vanish as the disc cools.
         s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
         s.temperature_sigma += 0.3 * abs(before - s.disc)
         forgotten = exp(-s.rested_s / t.history_time)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.wire.contract import (
     CONTACT_UNCERTAIN,
     FUSED,
@@ -72,7 +72,7 @@ _SOURCES = np.array([fact.source for fact in TABLE.values()])
 
 
 @njit
-def tell_status(facts, out):
+def tell_status(facts: int, out: Record) -> None:
     """Reasons and source of an ESTIMATE from its facts: the last in the table that leaves less than both paths decides."""
     out.reasons = 0
     out.source = FUSED

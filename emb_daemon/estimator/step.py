@@ -34,7 +34,7 @@ from emb_daemon.estimator.status import (
     tell_status,
 )
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import follow, interrupt
@@ -75,7 +75,7 @@ def _start(s, p, m):
 
 
 @njit
-def step(s, p, m, out):
+def step(s: Record, p: Record, m: Record, out: Record) -> None:
     """Advance one corner by one resolver sample.
 
     Args:
@@ -189,7 +189,7 @@ def _look(s, p, m, facts, out):
 
 
 @njit
-def predict(s, p, age, out):
+def predict(s: Record, p: Record, age: float, out: Record) -> None:
     """What can be said ``age`` seconds after the last sample: the last force, and how far it may have moved since.
 
     After `SILENCE_S` nothing can: then the source is Invalid.

@@ -1,18 +1,18 @@
 """A disc whose thickness varies over its turn in a way that the calibration does not know.
 
-Its period is the wheel's: cosine and sine of the first orders of the wheel angle are a Kalman filter of their own over what
-the first hypothesis (`estimator.hypotheses`) leaves of the torque, a lock-in that knows its noise. How much better each stroke
-is foretold by what earlier ones taught than by an even disc says whether there is such a disc; the fused force follows it by
-that probability, and what that leaves open counts in its standard deviation.
+A separate Kalman filter estimates cosine and sine of the first orders of the wheel angle from the torque that the first
+hypothesis (`estimator.hypotheses`) leaves unexplained. How much better they predict each stroke from earlier ones than an even
+disc does gives the probability of such a disc; the fused force follows it by that probability, and the remaining uncertainty
+is part of its standard deviation.
 
-Only while the motor turns: a motor that stands is held by its friction, whatever the disc does to the force.
+It learns only while the motor turns: a standing motor is held by friction, whatever the disc does to the force.
 """
 
 from math import cos, exp, hypot, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.stiffness import first_order_lag
 from emb_daemon.models.wheel import TURNING_RAD_PER_S, WHEEL, track
 
@@ -22,19 +22,19 @@ STATES = 2 * ORDERS
 #: Standard deviation of cosine and sine of order 1, m: 10 to 20 um from crest to trough before drivers complain (Jacobsson,
 #: Aspects of disc brake judder, Proc. IMechE D 217, 2003); amplitudes of a smooth disc fall with the square of the order.
 _AMPLITUDE_M = 7e-6
-#: Wear makes another disc of it within hours of braking, s.
+#: Time of braking in which wear changes the disc's shape, s.
 _WORN_S = 3600.0
 #: Log odds of a disc that its calibration does not know: one in 55. Of an even disc they rise by k with a probability of at
 #: most exp(-k) (Ville's inequality for likelihood ratios), so that the same share of even discs is ever thought uneven
 #: (`test_uneven.py::test_noise_is_believed_as_rarely_as_the_odds_say`).
 _PRIOR_ODDS = -4.0
-#: Those below which they do not fall, as of a jump (`hypotheses.PRIOR_ODDS`): a disc that warps later need not make up for the
-#: past. Those from which something speaks for it: evidence of a factor e, at which a twentieth of it is believed.
+#: Those below which they do not fall, as of a jump (`hypotheses.PRIOR_ODDS`): so that a disc that warps later is found as
+#: fast. Log odds from which the force follows it: evidence of a factor e, at which its probability is a twentieth.
 _LEAST_ODDS, _SPEAKING_ODDS = -6.0, -3.0
-#: Motion of one stroke, s, at most: what one leaves unexplained is a shape, and any shape is a part of a period. In a second
-#: the wheel of a car at walking pace has turned once, and a stroke that goes on is held against what it showed so far.
+#: Longest motion that counts as one stroke, s: any unexplained shape of a single stroke is part of some period. In a second
+#: the wheel of a car at walking pace has turned once, and a longer stroke is predicted from its beginning.
 _STROKE_S = 1.0
-#: Log odds at which they stop, as good as certainty: of a disc that is even again some samples tell.
+#: Largest log odds, practically certain; a disc that is even again is then noticed within some samples.
 _CERTAIN_ODDS = 20.0
 #: Standard deviations of the innovation beyond which a sample teaches nothing, as in `hypotheses`: sensors jump.
 _GATE = 5.0
@@ -77,11 +77,11 @@ def _variance(i):
 
 @njit
 def _begin(u):
-    """Nothing is known of the phase; what is known of the odds stays."""
+    """Forget the phase; the odds stay."""
     u.known = True
     u.unseen = 0.0
     for i in range(STATES):
-        # What it was found to be is possible again, at another phase.
+        # An amplitude as large as before is possible again, at another phase.
         size = u.amplitude[i - i % 2] ** 2 + u.amplitude[i - i % 2 + 1] ** 2
         u.gain[i] = _variance(i) + 0.5 * size
     for i in range(STATES):
@@ -106,8 +106,8 @@ def _wheel_angle(u, m):
 
 
 @njit
-def turn(u, m, slope, gear_gain, relaxation_time):
-    """Advance by one sample: what each amplitude does to the force. ``slope`` N/rad of the static force."""
+def turn(u: Record, m: Record, slope: float, gear_gain: float, relaxation_time: float) -> None:
+    """Advance the effect of each amplitude on the force by one sample. ``slope`` N/rad of the static force."""
     if not u.known:
         u.log_odds = _PRIOR_ODDS
         _begin(u)
@@ -130,14 +130,14 @@ def turn(u, m, slope, gear_gain, relaxation_time):
 
 
 @njit
-def applied(u):
-    """What the fused force follows of it, N."""
+def applied(u: Record) -> float:
+    """Its part of the fused force, N."""
     return u.share * u.shift
 
 
 @njit
 def _end_stroke(u):
-    """What this stroke taught may be held against the next."""
+    """End a stroke: what it taught predicts the next one."""
     u.stroke_s = 0.0
     for i in range(STATES):
         u.earlier[i] = u.amplitude[i]
@@ -145,19 +145,20 @@ def _end_stroke(u):
 
 @njit
 def _weigh(u, leverage, without, variance):
-    """Odds after a torque: what earlier strokes foretold of it against nothing. Under noise a wrong foretelling loses."""
+    """Odds after a torque: its prediction from earlier strokes against an even disc's. Under noise a wrong prediction
+    loses."""
     foretold = 0.0
     for i in range(STATES):
         foretold += leverage * u.force[i] * u.earlier[i]
     edge = _GATE * _GATE * variance
     better = min(without * without, edge) - min((without - foretold) ** 2, edge)
     u.log_odds = min(max(u.log_odds + 0.5 * better / variance, _LEAST_ODDS), _CERTAIN_ODDS)
-    # An even disc, until something speaks for another: then no wheel frame, not even a forged one, touches the force.
+    # An even disc until there is evidence: no wheel frame, not even a forged one, then changes the force.
     u.share = 1.0 / (1.0 + exp(-u.log_odds)) if u.log_odds > _SPEAKING_ODDS else 0.0
 
 
 @njit
-def learn(u, leverage, without, variance, dt):
+def learn(u: Record, leverage: float, without: float, variance: float, dt: float) -> None:
     """Take a torque (N m) that the first hypothesis leaves unexplained ``without`` such a disc, and its variance, after ``dt``
     s of motion."""
     u.stroke_s += dt
@@ -181,7 +182,7 @@ def learn(u, leverage, without, variance, dt):
 
 
 @njit
-def force_sigma(u):
+def force_sigma(u: Record) -> float:
     """Standard deviation (N) that it leaves in the fused force."""
     variance = (1.0 - u.share) * u.shift * u.shift
     for i in range(STATES):
@@ -191,7 +192,7 @@ def force_sigma(u):
 
 
 @njit
-def unproven(u):
+def unproven(u: Record) -> float:
     """How far apart the force with and without such a disc are over a turn, N, times the probability of the less likely."""
     crest = 0.0
     for k in range(0, STATES, 2):

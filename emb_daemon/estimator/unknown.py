@@ -7,7 +7,7 @@ was against the brake in which something has jumped.
 
 from math import exp
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Floats, Record, njit
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -82,25 +82,25 @@ LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
 
 @njit
-def torque_offset(p):
+def torque_offset(p: Record) -> float:
     """Standard deviation of the motor torque's offset at power-on, N m."""
     return _OFFSET * p.gear_gain * p.maximum_force
 
 
 @njit
-def contact_jump(p):
+def contact_jump(p: Record) -> float:
     """Standard deviation of what the contact angle moves by at once, rad."""
     return _CONTACT_JUMP_M / p.gear_gain
 
 
 @njit
-def thickening(caliper):
+def thickening(caliper: float) -> float:
     """Factor by which friction's prior is wider at ``caliper`` degC than at the calibration's temperature."""
     return exp(min(max(_WARM_C - caliper, 0.0), 80.0) / _THICKENS_K)
 
 
 @njit
-def set_friction(P, p, caliper):
+def set_friction(P: Floats, p: Record, caliper: float) -> None:
     """Covariance of the gear friction of a brake at ``caliper`` degC that has not moved yet."""
     thick = thickening(caliper)
     P[LOAD, LOAD] = (p.torque_relative_sigma * p.gear_gain) ** 2 + (_FRICTION * p.load_friction * thick) ** 2
@@ -109,13 +109,13 @@ def set_friction(P, p, caliper):
 
 
 @njit
-def softening_sigma(p, temperature, history):
+def softening_sigma(p: Record, temperature: float, history: float) -> float:
     """Standard deviation of the stiffness, share, of pads whose temperature and its memory have these, K."""
     return p.thermal.softening * temperature + p.thermal.softening_history * history
 
 
 @njit
-def add_softening(P, p, rise, sigma):
+def add_softening(P: Floats, p: Record, rise: float, sigma: float) -> None:
     """What the temperature of pads that are first seen leaves open of the stiffness: they are ``rise`` K warmer than those of
     the calibration, give or take ``sigma`` K. Softening was identified on hot pads; what it says of colder ones is
     extrapolated."""
@@ -124,7 +124,7 @@ def add_softening(P, p, rise, sigma):
 
 
 @njit
-def set_priors(P, p):
+def set_priors(P: Floats, p: Record) -> None:
     """Covariance at power-on of a brake that is as its calibration says."""
     for i in range(len(P)):
         for j in range(len(P)):
@@ -143,7 +143,9 @@ def set_priors(P, p):
 
 
 @njit
-def set_walks(walked, p, x, P, winding, housing, softening, power, dt):
+def set_walks(
+    walked: Floats, p: Record, x: Floats, P: Floats, winding: float, housing: float, softening: float, power: float, dt: float
+) -> None:
     """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors and ``P`` their covariance, ``winding`` and
     ``housing`` heat, ``softening`` what of stiffness the pads' unknown temperature leaves open, W of friction ``power``."""
     # What the lags miss is a share of what heat does, not of what it might have done before driving showed it.
@@ -159,7 +161,7 @@ def set_walks(walked, p, x, P, winding, housing, softening, power, dt):
 
 
 @njit
-def add_rest(P, p, elapsed_s):
+def add_rest(P: Floats, p: Record, elapsed_s: float) -> None:
     """What a brake may have changed by while it was not watched for ``elapsed_s`` s: an hour's walk at least, and settling
     pads."""
     hour = max(elapsed_s, 3600.0)
@@ -187,7 +189,9 @@ def _draw_near(x, P, gain, state, distance, reach):
 
 
 @njit
-def stay_possible(x, P, gain, p, contact_distance, scale, growth, faded):
+def stay_possible(
+    x: Floats, P: Floats, gain: Floats, p: Record, contact_distance: float, scale: float, growth: float, faded: float
+) -> None:
     """What a brake can be at all: ``contact_distance`` rad of the contact angle and ``scale`` of the stiffness are from the
     calibration, ``growth`` rad/K from none; ``faded`` share of the motor torque is explained by heat."""
     _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
@@ -200,20 +204,20 @@ def stay_possible(x, P, gain, p, contact_distance, scale, growth, faded):
 
 
 @njit
-def add_stiffness_jumps(P, p):
+def add_stiffness_jumps(P: Floats, p: Record) -> None:
     """What may have changed at once between motor angle and force."""
     P[CONTACT, CONTACT] += contact_jump(p) ** 2
     P[SCALE, SCALE] += _SCALE_JUMP**2
 
 
 @njit
-def add_growth(P, p):
+def add_growth(P: Floats, p: Record) -> None:
     """A disc that grows with heat, which the calibration does not know."""
     P[GROWTH, GROWTH] += (_GROWTH_JUMP_M_PER_K / p.gear_gain) ** 2
 
 
 @njit
-def add_drift(P, p):
+def add_drift(P: Floats, p: Record) -> None:
     """What a brake in service may differ by from its calibration without anything having happened to it."""
     P[CONTACT, CONTACT] += (_DRIFT_CONTACT_M / p.gear_gain) ** 2
     P[SCALE, SCALE] += _DRIFT_SCALE**2
@@ -221,7 +225,7 @@ def add_drift(P, p):
 
 
 @njit
-def add_drift_walks(walked, p, turning, dt):
+def add_drift_walks(walked: Floats, p: Record, turning: bool, dt: float) -> None:
     """Variance that such a brake's contact and stiffness gain in ``dt`` s beside `set_walks`; ``turning``: the disc."""
     contact = _DRIFT_WALK_M_PER_SQRT_S / p.gear_gain * (1.0 if turning else _DRIFT_STANDING)
     walked[CONTACT] += contact * contact * dt
@@ -229,7 +233,7 @@ def add_drift_walks(walked, p, turning, dt):
 
 
 @njit
-def add_torque_jumps(P, p):
+def add_torque_jumps(P: Floats, p: Record) -> None:
     """What may have changed at once between motor current and force."""
     P[GAIN, GAIN] += _GAIN_JUMP**2
     P[OFFSET, OFFSET] += torque_offset(p) ** 2

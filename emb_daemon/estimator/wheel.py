@@ -1,10 +1,10 @@
-"""How fast the disc turns, from whichever of wheel speed, wheel pulses and vehicle speed can be true."""
+"""Speed of the disc, from those of wheel speed, wheel pulses and vehicle speed that are plausible."""
 
 from math import exp, pi
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
@@ -12,9 +12,9 @@ from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 _MOVING_M_PER_S = 0.5
 #: Time over which pulses are counted into a speed, s.
 _COUNTED_S = 0.25
-#: Pulses that a wheel which is said to stand may still give: it comes to rest.
+#: Number of pulses that a wheel with speed zero may still give while it comes to rest.
 _TURNED_PULSES = 12.0
-#: Time for which a moving vehicle may have a standing wheel: a blocked one, before its anti-lock control lets go, s.
+#: Time for which a wheel of a moving vehicle may stand, s: blocked, before anti-lock control releases it.
 _BLOCKED_S = 1.0
 #: Rolling radius of car tyres until this car's has been seen, m, its spread, and the time over which it is learned, s.
 _RADIUS_M, _RADIUS_SHARE, _RADIUS_LEARNED_S = 0.31, 0.1, 10.0
@@ -34,8 +34,8 @@ WHEEL = np.dtype(
 
 
 @njit
-def disc_speed(w, m):
-    """Speed of the disc (rad/s) and its standard deviation; NaN and infinity where nothing tells.
+def disc_speed(w: Record, m: Record) -> tuple[float, float]:
+    """Speed of the disc (rad/s) and its standard deviation; NaN and infinity if nothing shows it.
 
     Args:
         w: WHEEL record.
@@ -43,7 +43,7 @@ def disc_speed(w, m):
     """
     if not w.started:
         w.started, w.pulse, w.radius = True, np.nan, _RADIUS_M
-    # What was counted while no message came is not a speed.
+    # Pulses over a gap without messages give no speed.
     steps = 0.0
     if m.has_wheel_pulse and np.isfinite(w.pulse) and m.dt > 0.0:
         steps = (m.wheel_pulse - w.pulse + PULSE_MODULO // 2) % PULSE_MODULO - PULSE_MODULO // 2

@@ -8,9 +8,12 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from emb_daemon.errors import InputError, Unavailable
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 #: Number of workers that a task may kill before it is given up; then the file is at fault and not the machine.
 _LIVES = 3
@@ -64,13 +67,17 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
             yield client
 
 
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
 def run(
-    client: Any,
-    task: Callable,
-    items: Sequence,
+    client: "Client",
+    task: Callable[[_Item], _Result],
+    items: Sequence[_Item],
     progress: Callable[[int, int], None] = lambda done, total: None,
-    failed: Callable[[Any, str], Any] | None = None,
-) -> list:
+    failed: Callable[[_Item, str], _Result] | None = None,
+) -> list[_Result]:
     """``task(item)`` of every item, in their order.
 
     Args:

@@ -14,6 +14,7 @@ import datetime
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -149,24 +150,24 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
     return groups
 
 
-def ingested(root: Path) -> list[dict]:
+def ingested(root: Path) -> list[dict[str, Any]]:
     """Result for each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged file: of its path), ``notes``,
     ``fault`` (empty if the file is good) and its ``drives``."""
     return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
 
 
-def note(root: Path, known: dict) -> None:
+def note(root: Path, known: dict[str, Any]) -> None:
     """Store the result for a log file."""
     write_json(Path(root, "ingested", f"{known['sha256']}.json"), known)
 
 
-def write_json(path: Path, content: dict) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
     """A file of the data set; the same content gives the same bytes."""
     folder_of(path.parent)
     write_atomically(path, json.dumps(content, sort_keys=True, indent=1).encode())
 
 
-def forget(root: Path, known: dict) -> None:
+def forget(root: Path, known: dict[str, Any]) -> None:
     """Remove the data of an earlier state of a log file."""
     for entry in known["drives"]:
         drive = Drive(**entry)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class Job:
     unit: str
     day: str
     mapping: Path | None = None
-    earlier: dict | None = None
+    earlier: dict[str, Any] | None = None
 
 
 def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping: Path | None = None) -> list[Job]:
@@ -81,7 +82,7 @@ def log_files(paths: Iterable[Path]) -> list[Path]:
     return found
 
 
-def give_up(root: Path, job: Job, reason: str) -> dict:
+def give_up(root: Path, job: Job, reason: str) -> dict[str, Any]:
     """Note a file that killed its workers."""
     known = _nothing_of(job) | {"fault": f"{job.path}: {reason}"}
     note(root, known)
@@ -105,7 +106,7 @@ def _stamp(path: Path) -> tuple[int, int]:
     return stat.st_size, stat.st_mtime_ns
 
 
-def ingest(root: Path, job: Job) -> dict:
+def ingest(root: Path, job: Job) -> dict[str, Any]:
     """Ingest one log file; returns the result, see `dataset.ingested`."""
     known, words = _nothing_of(job), io.StringIO()
     try:

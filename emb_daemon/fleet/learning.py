@@ -4,6 +4,7 @@ import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,7 +28,7 @@ def learned_path(root: Path, unit: str, corner: str) -> Path:
     return Path(root, "learned", partition(unit, corner)).with_suffix(".json")
 
 
-def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict:
+def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, Any]:
     """Adaptation over one unit's drives in order; each begins with a power-on and the values learned before. Returns every
     training and its outcome.
 

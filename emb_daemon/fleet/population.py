@@ -153,13 +153,13 @@ class Readings:
         others = [scatter_of(apart[fold != part], typical) for part in range(fold.max() + 1)]
         self._inverse = np.array([np.linalg.inv(covariance) for _, covariance in others])
         means = np.array([mean for mean, _ in others])
-        self.ordinary = _ordinary(
+        self.ordinary: np.ndarray = _ordinary(
             np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
         )
         along = np.einsum("fab,kb->fka", self._inverse, prints)
-        self.filters = (along / np.einsum("fka,ka->fk", along, prints)[:, :, None])[fold]
+        self.filters: np.ndarray = (along / np.einsum("fka,ka->fk", along, prints)[:, :, None])[fold]
         self._prints, self._noise = prints, noise
-        self.inverse = self._inverse.mean(axis=0)
+        self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
     def of(self, units: np.ndarray) -> np.ndarray:
         """Amount of each cause, shape (N, K)."""

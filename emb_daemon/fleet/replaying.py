@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
@@ -23,7 +24,7 @@ def is_replayed(root: Path, drive: Drive, calibration: str) -> bool:
         return False
 
 
-def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict:
+def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict[str, Any]:
     """Write a drive's estimates (columns of the command-line contract) and figures; returns these.
 
     Raises:

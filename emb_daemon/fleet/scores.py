@@ -106,7 +106,7 @@ class Questions:
             shapes = [((own[s.name], start),) for s in effect.shapes[:1] for start in s.starts] or [()]
             probes += [Probe(own[p.name], shape) for shape in shapes for p in effect.amplitudes]
         self._probes = probes
-        self.causes = tuple(
+        self.causes: tuple[Cause, ...] = tuple(
             Cause(
                 p.coordinate.name,
                 p.coordinate.effect or p.coordinate.name,

@@ -21,9 +21,10 @@ from emb_daemon.offline.score import PATHS
 
 
 def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: Sequence[float]) -> Calibration:
-    """What the datasheet says, with a curve for each thickness that was measured; whatever it cannot say, a step moves.
+    """The datasheet's values as a calibration, with a curve for each thickness that was measured. What no datasheet states is
+    a placeholder that a step replaces.
 
-    Only heat may stay as it is here, where no log heats the pads.
+    Only the thermal section may stay as it is, if no log heats the pads.
     """
     actuator = sheet.actuator
     # Full force within a radian: whatever the gear's travel, such a curve lies within it.
@@ -67,7 +68,7 @@ def tidy(calibration: Calibration) -> Calibration:
         InputErrors: what was found is not what a calibration file may hold.
     """
     values = {key: value_of(calibration, key) for key in keys(calibration)}
-    # What is short already keeps standing as the default that a file need not state.
+    # A value that needs no rounding stays the same object: fields that are still the default are left out of the file.
     return moved(calibration, {key: rounded(v, 7) for key, v in values.items() if rounded(v, 7) != v}, checked=True)
 
 

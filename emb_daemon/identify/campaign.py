@@ -1,4 +1,5 @@
-"""A rig campaign's logs: read once, checked for what their part needs, and left out with a word when they cannot serve."""
+"""A rig campaign's logs: read once, checked for what their part needs, and left out with a message when they do not have
+it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,21 +10,21 @@ import numpy as np
 from emb_daemon.calibration.fields import Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling
+from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Training, Trial
 from emb_daemon.jit import njit
 from emb_daemon.logs.read import read_with_digest
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
 
-#: Turning points of the motor angle per second of motion that tell a slow clamp from random motion.
+#: Bounds of the turning points of the motor angle per second of motion: of a slow clamp, and of random motion.
 SLOW, RANDOM = (0.0, 1.0), (1.0, 100.0)
 NEED_RANDOM = "random motor angle from the released position to a tenth of the rated force or more"
 NEED_INTEGRATED = "training and braking heat at full frame rate"
-#: Full frame rate: samples, two seconds of them, and their distance in time, s, a fortieth above the cycle; and share of the
-#: rated force that motion must reach to tell a curve.
+#: A log has full frame rate with two seconds of samples that are no further apart than 1.025 cycles, s. Share of the rated
+#: force that a log must reach to identify a curve.
 _LEAST_SAMPLES, _LONGEST_CYCLE_S, _LEAST_FORCE = 500, 0.0041, 0.1
-#: Correlation of force and angle from which a log is the wrong way round; a curve of either direction has 0.9 and more.
+#: Correlation of force and angle below minus which the sign of one is wrong; curves have 0.9 and more.
 _AGAINST = 0.5
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.
 _SPEED_TOLERANCE = 0.2
@@ -46,7 +47,8 @@ def _turning_points(angle, threshold):
 
 
 def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
-    """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is surely free of contact.
+    """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is certainly free of
+    contact.
 
     Returns:
         (largest reference force in N, its standard deviation before the pads first touch, turning points of the motor angle by
@@ -64,7 +66,7 @@ def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
 
 
 def _runs_against(log: Log) -> bool:
-    """Whether the force falls where the motor angle rises, as a clamping brake's never does."""
+    """Whether the force falls with rising motor angle, which no clamping brake's does."""
     known = np.isfinite(log.force_N)
     angle, force = log.samples["angle"][known], log.force_N[known]
     return bool(np.ptp(angle) > 0.0 and np.ptp(force) > 0.0 and np.corrcoef(angle, force)[0, 1] < -_AGAINST)
@@ -72,7 +74,8 @@ def _runs_against(log: Log) -> bool:
 
 @dataclass
 class Campaign:
-    """A campaign with its logs; ``faults`` grows by one line for whatever could not serve or contradicts the datasheet."""
+    """A campaign with its logs; ``faults`` gets one line for each log that cannot be used and each value that contradicts the
+    datasheet."""
 
     path: Path
     file: CampaignFile
@@ -89,7 +92,7 @@ class Campaign:
         """Of the pads that the calibration is for."""
         return self.file.pad_thickness_mm or self.datasheet.pad.thickness_mm
 
-    def thickness(self, entry) -> float:
+    def thickness(self, entry: Trial | Training) -> float:
         """Pad thickness of an entry in mm; the campaign's where it states none."""
         return entry.pad_thickness_mm or self.pad_thickness_mm
 
@@ -98,7 +101,8 @@ class Campaign:
             self.faults.append(text)
 
     def compare_with_datasheet(self, key: str, value: float) -> None:
-        """A value beyond the datasheet's tolerance is more often a wrong unit or sensor gain than an odd motor."""
+        """Report a value beyond the datasheet's tolerance: more often it is a wrong unit or sensor gain than an unusual
+        motor."""
         stated, tolerance = self.datasheet.stated(key)
         if abs(value / stated - 1.0) > tolerance:
             self.fault(
@@ -122,7 +126,7 @@ class Campaign:
         return found
 
     def load(self, name: str | None, part: str, need: str) -> Log | None:
-        """A log, or None after a word about why it cannot serve as ``part`` and what was needed; None if it has no name."""
+        """A log; None without a name, or after a message why it cannot be used as ``part`` and what is needed."""
         if name is None:
             return None
         try:
@@ -144,7 +148,7 @@ class Campaign:
         if log is None:
             return None
         speed = log.slow.wheel_speed[f"WheelSpeed{log.corner}"]
-        # The second half is surely released.
+        # In the second half the brake is released.
         turns = float(np.median(speed[len(speed) // 2 :])) / (2.0 * np.pi) if len(speed) else np.nan
         if not abs(turns - entry.disc_turns_per_s) <= max(_SPEED_TOLERANCE * entry.disc_turns_per_s, 0.1):
             expected = f"{entry.disc_turns_per_s:g} turns per second in its second half, found {turns:.2g}"
@@ -187,7 +191,7 @@ class Campaign:
 
 
 def _check_dbc(path: Path, corner: str) -> None:
-    """Refuse a rig whose bus is laid out otherwise than the daemon's: its logs would be misread in silence."""
+    """Refuse a rig whose bus has another layout than the daemon's, because its logs would be misread without notice."""
     theirs, ours = load_database(path), load_database(resource("dbc/emb.dbc"))
     names = [f"EMB_{corner}_Resolver", f"EMB_{corner}_Current", f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"]
     faults = []
@@ -208,7 +212,7 @@ def _check_dbc(path: Path, corner: str) -> None:
 
 
 def _missing(value, folder: Path, key: str = "") -> list[str]:
-    """A line for each log that is named and not there."""
+    """A line for each log that is named but does not exist."""
     if isinstance(value, tuple):
         return [line for number, entry in enumerate(value) for line in _missing(entry, folder, f"{key}[{number}]")]
     if isinstance(value, Struct):
@@ -218,7 +222,7 @@ def _missing(value, folder: Path, key: str = "") -> list[str]:
     return [f"{key}: {folder / value}: no such file"] if is_log and not (folder / value).is_file() else []
 
 
-def load_campaign(path: str | Path, read=read_with_digest) -> Campaign:
+def load_campaign(path: str | Path, read: Callable[[Path], tuple[np.ndarray, str]] = read_with_digest) -> Campaign:
     """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`.
 
     Raises:

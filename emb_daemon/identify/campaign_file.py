@@ -132,7 +132,7 @@ class Actuator(Struct, kw_only=True):
     #: Motor angle between the released position and contact. Within half of it the pads must certainly not touch.
     pad_clearance_rad: Positive
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.travel.check_mean(self.gear_gain_m_per_rad)
 
 
@@ -186,7 +186,7 @@ class Wheel(Struct, kw_only=True):
     #: Pulses per turn of the wheel; must be the number that the daemon uses.
     pulses_per_revolution: Positive
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.pulses_per_revolution != PULSES_PER_TURN:
             raise ValueError(f"pulses_per_revolution: expected {PULSES_PER_TURN}, by which the daemon turns pulses into angle")
 

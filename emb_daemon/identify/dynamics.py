@@ -18,20 +18,21 @@ from emb_daemon.offline.run import stiffness_force
 #: Terms of the characteristic curve, the thesis's cubic.
 TERMS = 3
 RELAXATION = "stiffness.relaxation_time_s"
-#: By how much the rig's reference is later than its resolver, s: fitted beside the calibration's keys, none of the brake's.
+#: Delay of the rig's reference relative to its resolver, s; fitted together with the calibration's keys, but no property of
+#: the brake.
 DELAY = "reference delay"
-#: Effects on the static force, which the dynamics may have or not, and further elements of them.
+#: Optional effects on the static force, and further elements of each.
 _STATIC = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
 OPTIONAL = tuple(effect for effect in _STATIC if not effect.beside)
 FURTHER = tuple(effect for effect in _STATIC if effect.beside)
-#: Where shapes of such effects begin: times the lag's time constant, and as a share of the travel; of one more element beside
-#: another, times the other's.
+#: Starting values of these effects' shapes: time constants over the lag's, angles over the travel; of a second element, over
+#: the first's.
 _TIMES, _SHARE_OF_TRAVEL = 10.0, 0.05
 _MORE = {"s": 10.0, "rad": 0.25}
-#: Further starting points of those that are an angle, times the first, and evaluations that each is given to prove itself.
+#: Further starting values of those that are an angle, over the first, and number of evaluations after which they are compared.
 _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
-#: Positive numbers are searched as logarithms from here, in their own units.
+#: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
 EPISODE = 250
@@ -147,15 +148,15 @@ def simulate(log: Log, calibration: Calibration, thickness_mm: float, clearance:
 
 
 def path_errors(log: Log, calibration: Calibration, thickness_mm: float, clearance: float, delay_s: float = 0.0) -> Errors:
-    """Of the stiffness path on a log; as the daemon has it without ``delay_s``, for the reference's delay is none of the
-    brake's."""
+    """Errors of the stiffness path on a log. With ``delay_s`` 0 they are the daemon's, which knows nothing of the reference's
+    delay."""
     error = simulate(log, calibration, thickness_mm, clearance, delay_s) - log.force_N
     known = np.isfinite(error)
     return error[known], log.force_N[known]
 
 
 def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, slow: bool = True) -> list[Errors]:
-    """Errors of a fit to first halves: on the second halves of random logs and, if ``slow``, on slow logs whole."""
+    """Errors of a fit to first halves: on the second halves of random logs and, if ``slow``, on whole slow logs."""
     found = []
     for pads, curve in zip(groups, fit.curves, strict=True):
         for log, clearance in zip(pads.logs, curve.clearances_rad, strict=True):
@@ -168,18 +169,18 @@ def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, sl
 
 
 def _delay(into: np.ndarray, samples: np.ndarray, delay_s: float) -> None:
-    """Write the angles of samples as they were ``delay_s`` earlier; the first stays, for the clearance counts from it."""
+    """Replace the angles of samples by those ``delay_s`` earlier; the first stays, because the clearance counts from it."""
     into["angle"][1:] = (samples["angle"] - delay_s * samples["speed"])[1:]
 
 
 def is_slow(log: Log) -> bool:
-    """Whether the motor passes its travel less than once in four seconds: a slow clamp, no random motion."""
+    """Whether the motor passes its travel less than once in four seconds: a slow clamp and not random motion."""
     angle = log.samples["angle"]
     return float(np.sum(np.abs(np.diff(angle)))) < 0.25 * float(np.ptp(angle)) * log.time_s[-1]
 
 
 def clearance_guess(log: Log, travel: np.ndarray) -> float:
-    """``travel`` (rad, at each sample) of a log where the reference force first stands clear of its noise."""
+    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise."""
     clear = np.flatnonzero(log.force_N > 8.0 * max(_rest_noise(log), 1e-9))
     return float(travel[clear[0]]) if len(clear) else 0.0
 
@@ -197,7 +198,7 @@ def _travel(log: Log, calibration: Calibration) -> np.ndarray:
 
 
 def _past_contact(log: Log, calibration: Calibration) -> np.ndarray:
-    """`_travel` past what `clearance_guess` makes of it."""
+    """`_travel` beyond `clearance_guess`."""
     travel = _travel(log, calibration)
     return travel - clearance_guess(log, travel)
 
@@ -221,7 +222,7 @@ def regress_free(log: Log, x: np.ndarray) -> tuple[np.ndarray, float]:
 def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[Effect, ...] = OPTIONAL) -> Calibration:
     """Where a search for curves and dynamics starts: thesis 3-5 for curves and time constant, the rest by proportion."""
     logs = [log for pads in groups for log in pads.logs]
-    # Slow logs hardly show the lag: they count only where there are no others.
+    # Slow logs hardly show the lag; they are used only if there are no others.
     fast = [log for log in logs if not is_slow(log)] or logs
     time = float(np.clip(np.median([regress_free(log, _past_contact(log, calibration))[1] for log in fast]), 2e-3, 0.5))
     usual = {"s": _TIMES * time, "rad": _SHARE_OF_TRAVEL * max(_span(log, calibration) for log in logs)}
@@ -246,12 +247,12 @@ def _span(log: Log, calibration: Calibration) -> float:
 
 
 def _scale(pads: Pads, calibration: Calibration) -> np.ndarray:
-    """What makes newtons at full travel of a curve's coefficients."""
+    """Factors from a curve's coefficients to newtons at full travel."""
     return max(_span(log, calibration) for log in pads.logs) ** np.arange(1, TERMS + 1)
 
 
 def _free(calibration: Calibration, key: str) -> Free:
-    """Positive ones are searched as logarithms: with plain ones the slip angle can cross zero and not come back."""
+    """Positive parameters are searched as logarithms; otherwise the slip angle can become negative and stay so."""
     known = parameter(calibration, key)
     return Free(known.value, 5e-5, max(known.low, _LEAST), known.high, logarithmic=True)
 
@@ -271,13 +272,13 @@ class _Model:
         for pads, own in zip(self.groups, self.curves, strict=True):
             values, scale = [value_of(self.start, key) for key in own], _scale(pads, self.start)
             full = float(np.abs(values) @ scale)
-            # Force rises from contact: the first coefficient stays positive.
+            # The force rises from contact, so that the first coefficient is positive.
             for n, key in enumerate(own):
                 free[key] = Free(values[n], 2e-5 * full / scale[n], -np.inf if n else 1e-3 * full / scale[0])
         for g, pads in enumerate(self.groups):
             span = max(_span(log, self.start) for log in pads.logs)
             for number, log in enumerate(pads.logs):
-                # Force stands clear of its noise somewhat past contact.
+                # The force is clear of its noise only somewhat past contact.
                 free[g, number] = Free(clearance_guess(log, _travel(log, self.start)) - 0.02 * span, 5e-6 * span)
         return free
 
@@ -348,7 +349,7 @@ def fit_dynamics(
     blocks, first = model.blocks(), model.free()
     angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]
     if search and angles:
-        # A loop's width and its turning length trade off: other turning lengths may lead to another valley.
+        # A loop's width and its turning length compensate each other: another turning length may lead to another minimum.
         starts = [first]
         for factor in _ANGLE_STARTS:
             starts.append(first | {key: replace(first[key], start=factor * first[key].start) for key in angles})

@@ -1,4 +1,4 @@
-"""A campaign to start from: files of a made-up rig with another bus than ours, to be replaced by one's own one by one."""
+"""A campaign as a template: files of a made-up rig with a bus of its own, to be replaced one by one."""
 
 from pathlib import Path
 

@@ -12,17 +12,17 @@ from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, frictio
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import Log
 
-#: Step of the grid by what a log is shorter than, both s: fine enough for what a log of that length does.
+#: (longest duration of a log, step of its grid), both s.
 _STEPS_S = ((930.0, 0.2), (3600.0, 0.5), (float("inf"), 1.0))
-#: Share of the steps at which the reference force comes that often, from which its friction is looked at.
+#: Share of steps with a reference force that often from which a friction coefficient is computed.
 _DENSE = 0.9
-#: Grid on which flags and torque are put together before they are averaged over a step.
+#: Fine grid on which flags and torque are combined before they are averaged over a step, s.
 _FINE_S = 0.1
-#: A reference force at least this often tells when the pads touch; a rarer one leaves it to the brake request.
+#: Period of the reference force, s, up to which it says when the pads touch; otherwise the brake request does.
 _OFTEN_S = 0.25
-#: Time over which backing plate readings are averaged: they creep, their noise does not.
+#: Time over which backing plate readings are averaged, s: the plates change slowly.
 _PLATE_WINDOW_S = 1.0
-#: Grids beyond this, of logs that last for hours, are stepped whole.
+#: Steps above this length, s, of logs that last for hours, are not divided further.
 _COARSE_S = 0.5
 
 
@@ -153,7 +153,7 @@ def _braking(log: Log, seconds, count: int, step: float) -> np.ndarray:
     turning = speed > TURNING_RAD_PER_S
     latest = np.clip(np.searchsorted(seconds(slow.status["time_ns"]), middle) - 1, 0, None)
     requested = slow.status["BrakeRequest"][latest] > 0.5
-    # The request also covers clamping at standstill, for which only the force tells.
+    # The request is also set at standstill, where only the force shows whether the pads touch.
     touching = np.where(often | ~turning, force > TOUCHING_N, requested)
     torque = np.interp(middle, times, reference.brake_torque_Nm)
     pressed = (reference.clamp_force_N > TOUCHING_N) & (np.interp(times, wheel_times, speeds) > TURNING_RAD_PER_S)

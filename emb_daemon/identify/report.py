@@ -1,4 +1,4 @@
-"""The report of an identification: what it is worth on logs that fitted nothing, then every step with its evidence."""
+"""The report of an identification: its errors on logs that were not fitted, then every step with its evidence."""
 
 from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.identify import validation

@@ -36,7 +36,7 @@ class Identification:
 
     @property
     def notes(self) -> list[str]:
-        """Of the steps whose section of the report does not show them."""
+        """Notes of steps whose section of the report does not show them."""
         return [note for step in (self.stiffness, self.torque, self.contact, self.noise) for note in step.notes]
 
 

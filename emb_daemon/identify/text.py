@@ -4,7 +4,7 @@ import numpy as np
 
 
 def with_sigma(value: float, sigma: float | None, factor: float = 1.0) -> str:
-    """Value ± sigma, with the digits that sigma leaves."""
+    """Value ± sigma, with the digits that sigma makes meaningful."""
     value *= factor
     if sigma is None or not np.isfinite(sigma) or sigma <= 0.0:
         return f"{value:.5g}"

@@ -1,6 +1,7 @@
-"""Calibrations validated on logs that fitted nothing, by the estimator as it runs."""
+"""Validation of calibrations with the running estimator, on logs that were not fitted."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -16,22 +17,22 @@ from emb_daemon.offline.score import PATHS, force_figures
 from emb_daemon.report.figures import BAND, MODEL, PALE, REFERENCE, Panel, Trace, time_figure
 from emb_daemon.report.page import Page
 
-#: Share of the errors inside two sigma, 95 % of normal ones, below which sigma is too small: errors of several per cent of the
-#: samples last, and no more of them are chance.
+#: Share of the errors inside two sigma, 95 % of normal ones, below which sigma is too small: errors last, so that chance may
+#: take several per cent of the samples out, but no more.
 _LEAST_INSIDE = 0.9
 _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 
 
 @dataclass(frozen=True)
 class Validation:
-    """One log that fitted nothing.
+    """One log that was not fitted.
 
     Attributes:
         kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it.
         calibration: that was run.
         estimates: ESTIMATE rows.
         figures: `offline.score.force_figures`.
-        innovation_ratio: mean squared normalised innovation; one where the filter's noise levels fit.
+        innovation_ratio: mean squared normalised innovation; one if the filter's noise levels fit.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Validation:
     log: Log = field(repr=False)
     calibration: Calibration = field(repr=False)
     estimates: np.ndarray = field(repr=False)
-    figures: dict
+    figures: dict[str, Any]
     innovation_ratio: float
 
     def rmse_N(self, path: str = "fused") -> float:
@@ -55,7 +56,7 @@ def validate(name: str, kind: str, log: Log, calibration: Calibration) -> Valida
 
 
 def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_mm: float) -> Calibration:
-    """For pads of another thickness, with what interpolation of the curve then adds to the noise."""
+    """The calibration for pads of another thickness, with the error of the interpolated curve in its noise."""
     there = thickness.interpolation_error(thickness_mm)
     here = thickness.interpolation_error(calibration.pad_thickness_mm)
     relative = float(np.sqrt(max(calibration.noise.stiffness_relative**2 - here**2, 0.0) + there**2))
@@ -63,7 +64,7 @@ def at_thickness(calibration: Calibration, thickness: ThicknessStep, thickness_m
 
 
 def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessStep, torque: TorqueStep) -> list[Validation]:
-    """Logs of the campaign that no step fitted, each with the curve that its thickness asks for."""
+    """Validations of the campaign's logs that no step fitted, each with the curve for its pad thickness."""
     found = []
 
     def add(entry, kind, name, log, calibration=ours):
@@ -122,7 +123,7 @@ def rows(validations: list[Validation]) -> list[list[str]]:
 
 
 def section(page: Page, validations: list[Validation]) -> None:
-    """Figures of every such log, and pictures of those that the estimator meets last."""
+    """Figures of every such log, and time plots of some."""
     part = page.section(
         "On logs that fitted nothing",
         "RMSE over every sample. A random log's dynamics and torque path come from the other pads, its curve from its own "

@@ -1,7 +1,7 @@
 """The estimator as an FMU: FMI 3.0 co-simulation, over the library that is compiled ahead, with no Python inside.
 
-Inputs and outputs are `signals`, parameters are the calibration's numbers by their keys (`places`). A step takes the inputs as
-the sample at its beginning and tells the estimate of it at its end, as a brake controller hears it one cycle later.
+Inputs and outputs are `signals`, parameters are the calibration's numbers by their keys (`places`). A step takes its inputs as
+the sample at its beginning and returns the estimate from it at its end, as a brake controller receives it one cycle later.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from emb_daemon.wire.contract import CYCLE_S
 
 _NAME = "emb_brake"
 _KINDS = {"f": ("FLOAT64", "Float64"), "i": ("INT64", "Int64"), "b": ("BOOLEAN", "Boolean")}
-#: In powers of base units, and what is added to reach them.
+#: Units as powers of base units, and offsets to them.
 _BASE_UNITS = {
     "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
@@ -144,7 +144,7 @@ def _description(variables: list[_Variable], token: str, about: str) -> bytes:
 
 
 def _compile(folder: Path, kernels: Path) -> bytes:
-    """The FMU's own library, which finds the kernels beside itself. Raises Unavailable without a compiler."""
+    """The FMU's own library, which loads the kernels from its own folder. Raises Unavailable without a compiler."""
     if not shutil.which("cc"):
         raise Unavailable("no C compiler is installed: gcc is one")
     library = folder / f"{_NAME}.so"
@@ -177,7 +177,7 @@ def make_fmu(calibration: Calibration, kernels: Path) -> bytes:
     content = io.BytesIO()
     with tempfile.TemporaryDirectory() as name, zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as fmu:
         folder = Path(name)
-        # Under a name of its own: of two libraries with the same name, a process loads only one.
+        # Under a unique name, because a process loads only one of two libraries with the same name.
         library = folder / f"kernels-{manifest.sources}.so"
         library.write_bytes(kernels.read_bytes())
         (folder / "emb.h").write_text(text)

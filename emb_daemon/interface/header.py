@@ -1,4 +1,4 @@
-"""The C header of the estimator: its records, two functions, and one calibration, made from the records themselves.
+"""The C header of the estimator: its records, two functions and one calibration, generated from the dtypes.
 
 The functions are in the header: they call the library of ``emb-daemon compile``, which must have been made from the same
 sources, or the program does not link.
@@ -20,7 +20,7 @@ from emb_daemon.interface.places import Place, places
 from emb_daemon.interface.signals import describe
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
-#: The header, with places for `str.format`.
+#: The header, a template for `str.format`.
 _TEXT = Path(__file__).with_name("emb.h.in").read_text(encoding="utf-8")
 _KINDS = {"f": "double", "i": "int64_t", "b": "bool"}
 
@@ -57,7 +57,7 @@ def _number(value) -> str:
 
 
 def _initialise(record: np.void, offset: int, keys: dict[int, Place], indent: str) -> Iterator[str]:
-    """Lines that set what of a record is not zero, with the calibration's key and unit beside each number that has one."""
+    """Lines that set those fields of a record that are not zero, with the calibration's key and unit in a comment."""
     for field in record.dtype.names:
         value, start = record[field], offset + record.dtype.fields[field][1]
         if not any(value.tobytes()):
@@ -94,7 +94,7 @@ def header(calibration: Calibration) -> str:
     return _TEXT.format(
         version=__version__,
         hash=calibration_hash(calibration),
-        # No file brings code: a name ends no comment.
+        # The calibration's name must not end the comment, or a file could contain code.
         actuator=calibration.actuator.replace("*/", "* /"),
         cycle=CYCLE_S,
         codes="/* Codes of mode and source, and bits of reasons. */\n" + "\n".join(codes),

@@ -26,9 +26,9 @@ def _words(calibration: Calibration) -> np.ndarray:
 
 
 def places(calibration: Calibration) -> list[Place]:
-    """Every number that the file states and the estimator takes as it is, in the record's order.
+    """Every number of the file that the estimator uses unchanged, in the record's order.
 
-    They are found by moving one number after the other, so that `to_parameters` alone knows where they go. Of the
+    They are found by changing one number after the other, so that only `to_parameters` defines where they go. Of the
     characteristic curves, which are interpolated, the mounted pads' coefficients are given as ``stiffness.curve[0]`` on.
     """
     before, found = _words(calibration), []

@@ -1,4 +1,4 @@
-"""The one table of what goes into the estimator and comes out of it, for interfaces that name signals.
+"""The table of the estimator's inputs and outputs, for interfaces that name signals.
 
 Inputs are named as `emb_daemon.api` names its arguments, outputs as replay names its columns: both state the unit.
 """
@@ -74,7 +74,7 @@ OUTPUTS = (
     Signal("reasons", "reasons", "", "reasons not to trust the estimate: bits of DegradedReasons"),
 )  # fmt: skip
 
-#: Fields of a SAMPLE that say which sample it is, in words.
+#: Meaning of the fields that identify a SAMPLE.
 BOOKKEEPING = {
     "time_ns": "of the sample, ns, on the caller's clock; told again in the estimate",
     "cycle": "cycles of 4 ms since the first sample; told again",
@@ -98,7 +98,7 @@ def field_of(record: np.dtype, path: str) -> tuple[np.dtype, int]:
 
 
 def describe(record: np.dtype, field: str) -> str:
-    """What a field of SAMPLE or ESTIMATE is, with its unit, or what its elements are; empty for what no interface names."""
+    """Meaning of a field of SAMPLE or ESTIMATE, or of its elements, with unit; empty for fields that no interface has."""
     if record is SAMPLE and field in BOOKKEEPING:
         return BOOKKEEPING[field]
     table = {SAMPLE: INPUTS, ESTIMATE: OUTPUTS}[record]

@@ -1,7 +1,7 @@
-"""Readers that a damaged file may crash, hold up or have take all memory, in a process of their own.
+"""Readers for which a damaged file may mean a crash, an endless loop or exhausted memory, in a process of their own.
 
-python-can's BLF reader follows sizes that the file states, asammdf is compiled: neither was written for hostile files. Here
-such a reader gets the file's content on its standard input, bounded time and memory, and gives arrays back, or nothing.
+python-can's BLF reader trusts sizes that the file states, and asammdf is compiled code: neither was written for hostile files.
+Here such a reader gets the file's content on its standard input and bounded time and memory, and returns arrays or nothing.
 """
 
 import io
@@ -17,11 +17,11 @@ import numpy as np
 from emb_daemon.errors import InputError
 from emb_daemon.wire.frames import FRAME, row_of
 
-#: CPU time that a reader gets: to start, s, and for each megabyte, s. BLF takes python-can up to 5 s a megabyte.
+#: CPU time that a reader may take: to start, s, and for each megabyte, s. BLF takes python-can up to 5 s a megabyte.
 _START_S, _PER_MEGABYTE_S = 30.0, 60.0
-#: Readers that count from zero the channels that their tools count from one.
+#: Readers that number channels from zero where the tools number them from one.
 _FROM_ZERO = ("BLFReader", "ASCReader")
-#: The child's words for a library that is not installed.
+#: What the child reports for a library that is not installed.
 _MISSING = 3
 
 
@@ -67,7 +67,7 @@ def frames_apart(path: Path, content: bytes, reader_name: str, most_bytes: int) 
 def main() -> int:
     reader_name, seconds, most_bytes = sys.argv[1], *(int(word) for word in sys.argv[2:])
     for kind, most in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_DATA, most_bytes), (resource.RLIMIT_CORE, 0)):
-        # Somebody may have set a lower bound, which nobody may raise.
+        # A lower hard limit cannot be raised.
         bound = resource.getrlimit(kind)[1]
         most = most if bound == resource.RLIM_INFINITY else min(most, bound)
         resource.setrlimit(kind, (most, bound))

@@ -7,7 +7,7 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _OPEN, _CLOSE, _POINT, _ZERO, _NINE, _REMOTE, _REMOTE_SMALL, _SPACE, _HASH = b"().09Rr #"
 _RETURN, _NEWLINE = b"\r\n"
-#: In `_HEX`, of what is no hexadecimal digit.
+#: Entry of `_HEX` for a byte that is no hexadecimal digit.
 _NO_HEX = 255
 
 
@@ -90,11 +90,11 @@ def _parse_line(text, start, stop, frame, octets):
     at += 1
     data, length = np.uint64(0), 0
     if at < stop and text[at] == _HASH:
-        # A digit of flags follows that no reader needs.
+        # A digit of flags follows, which is not needed.
         flags |= FD
         at += 2
     if at < stop and (text[at] == _REMOTE or text[at] == _REMOTE_SMALL):
-        # A remote request; its length, which may follow, is of no use.
+        # A remote request; a length may follow, which is not needed.
         flags |= REMOTE
         at += 1
         while at < stop and text[at] != _SPACE:
@@ -136,8 +136,8 @@ def _parse(text, frames, octets):
 
 
 def parse_candump(text: bytes, octets: np.ndarray = _NOWHERE) -> tuple[np.ndarray, int, bool]:
-    """FRAME array of a whole candump log, the number of the first malformed line (0: none) and whether that line is the
-    last one and lacks its newline, as a log does whose writer was killed.
+    """FRAME array of a whole candump log, the number of the first malformed line (0: none) and whether that line is the last
+    one and lacks its newline, as in a log whose writer was killed.
 
     ``octets``, a uint8 array of half the text's length, takes the payloads, one after the other, those of CAN FD whole."""
     array = np.frombuffer(text, np.uint8)

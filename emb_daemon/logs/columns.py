@@ -5,16 +5,16 @@ from functools import cache
 import numpy as np
 
 from emb_daemon.estimator.records import DEPTHS_M
-from emb_daemon.jit import njit
+from emb_daemon.jit import Booleans, Records, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import load_database, signal_columns, unpack
 
-#: Depths below the friction surface at which a rig's pads have thermocouples, mm: where the estimator tells temperatures.
+#: Depths below the friction surface at which a rig's pads have thermocouples, mm: those of the estimator's temperatures.
 DEPTHS_MM = tuple(round(1e3 * depth_m) for depth_m in DEPTHS_M)
-#: How far a reference's frame may be from a sample that it belongs to: half a cycle.
+#: Largest distance in time between a sample and its reference's frame: half a cycle.
 _NEAR_NS = CYCLE_NS // 2
 
 
@@ -38,7 +38,7 @@ def _decode(frames, rows, signals, values):
 
 
 @njit
-def crc_is_right(frames):
+def crc_is_right(frames: Records) -> Booleans:
     """Of each FRAME row, as an E2E protected message, shape (n,)."""
     right = np.empty(len(frames), np.bool_)
     for row in range(len(frames)):
@@ -75,12 +75,12 @@ class Decoder:
 
 
 def absent_raw(length: int) -> int:
-    """Raw value of a signed reference signal that says that the rig has no such instrument: the least there is."""
+    """Raw value of a signed reference signal that means that the rig has no such instrument: the least possible one."""
     return -(1 << (length - 1))
 
 
 def nearest(time_ns: np.ndarray, at_ns: np.ndarray) -> np.ndarray:
-    """Row of the ascending times that is nearest to each of ``at_ns``; there has to be one."""
+    """Row of the ascending times, at least one, that is nearest to each of ``at_ns``."""
     after = np.clip(np.searchsorted(time_ns, at_ns), 0, len(time_ns) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(time_ns[after] - at_ns) < np.abs(at_ns - time_ns[before]), after, before)
@@ -101,11 +101,11 @@ class References:
     def __init__(self, frames: np.ndarray, corner: str):
         decoder = Decoder("dbc/rig.dbc")
         force = decoder.columns(frames, f"RIG_{corner}_Force")
-        self.time_ns = force["time_ns"]
-        self.clamp_force_N = force["ClampForceRef"]
-        self.brake_torque_Nm = force["BrakeTorqueRef"]
-        self.disc_C = force["DiscTempRef"]
-        self.pads = {}
+        self.time_ns: np.ndarray = force["time_ns"]
+        self.clamp_force_N: np.ndarray = force["ClampForceRef"]
+        self.brake_torque_Nm: np.ndarray = force["BrakeTorqueRef"]
+        self.disc_C: np.ndarray = force["DiscTempRef"]
+        self.pads: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for side in ("Inner", "Outer"):
             pad = decoder.columns(frames, f"RIG_{corner}_{side}Pad")
             depths = np.array([pad[f"{side}PadTemp{depth}mm"] for depth in DEPTHS_MM])

@@ -1,44 +1,45 @@
-"""What a mapped log says that no brake does: a direction turned round, an angle that starts anew, a column that is one number.
+"""What in a mapped log contradicts any brake: a wrong sign, an angle that wraps around, a constant column.
 
-A unit or a sign that a mapping states wrongly cannot be known from numbers alone; what they contradict can, and is said.
+A wrong unit or sign of a mapping is not visible in the numbers themselves, but in contradictions between them, which are
+reported.
 """
 
 import numpy as np
 
 from emb_daemon.logs.resample import Series, Signals
 
-#: Samples from which anything is judged; parts of the travel for which a mean is taken, and samples that each has to have.
+#: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
-#: Share of the largest current that its means at one end of the travel must reach, and multiple of those at the other.
+#: Least mean of the current at one end of the travel, as a share of the largest, and as a multiple of that at the other end.
 _HOLDS, _MORE = 0.2, 2.0
-#: Travel below which a motor stands, and whatever follows its angle is noise, rad.
+#: Travel below which a motor stands, rad, and everything that correlates with its angle is noise.
 _TRAVEL_RAD = 1.0
-#: Correlation of angle and acceleration up to which the current for both can be told apart.
+#: Correlation of angle and acceleration up to which their parts of the current can be separated.
 _TOLD_APART = 0.5
-#: Share of the largest force that it must change by from one end of the travel to the other.
+#: Least change of the force over the travel, as a share of the largest.
 _FOLLOWS = 0.2
-#: Correlation of force and the current that accelerates nothing, negative, from which one of the two is turned round. Friction
-#: that holds the force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
+#: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
+#: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
-#: What no brake pad is pressed with at most, N: production brakes reach 10 to 40 kN.
+#: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
 _LEAST_CLAMP_N = 100.0
 #: Fastest change of an angle that our message of the motor's speed carries, rad/s: 6 000 rpm; share of the time in which it
-#: may be faster, and steps over which it is told.
+#: may be faster, and number of steps over which it is computed.
 _FASTEST, _SELDOM, _STEPS = 655.0, 0.01, 5
-#: An angle in rad as other units would have it, by what one of them is in rad.
+#: Other units of an angle, in rad.
 _DEGREE, _TURN = np.pi / 180.0, 2.0 * np.pi
 #: Fewest counts that an encoder has in a turn, if a power of two.
 _LEAST_COUNTS = 256
-#: Relative deviation by which a jump is still that of a whole turn.
+#: Largest relative deviation of a jump from a whole turn.
 _ABOUT = 0.1
-#: Share of the range that one step takes where a value starts anew, and how often it has to.
+#: Least step where a value wraps around, as a share of its range, and least number of such steps.
 _ANEW, _LEAST_JUMPS = 0.5, 3
 
 
 def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
-    """A line for each contradiction in what a corner's messages hold before anything missing is filled in."""
+    """A line for each contradiction in a corner's messages, before missing signals are filled in."""
 
     def series(message: str, signal: str) -> Series | None:
         found = messages.get(message.format(corner), {}).get(signal)
@@ -56,13 +57,13 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             return [*lines, text + _turn_as(jump)]
         lines += _find_too_fast(angle)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
-    # A motor whose load is a constant clamps nothing.
+    # A motor with constant load clamps nothing.
     is_free = isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
     moves = not (speed is None or current is None or (angle or speed.integral()).way_is_unknown)
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
-        # The travel tells nothing of directions; current and force do.
+        # Travel alone does not show directions; current and force do.
         return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
     if current is not None and np.ptp(current.values) and not is_free:
         lines += _find_turned_current(angle, current)
@@ -72,8 +73,8 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
 
 
 def _find_too_fast(angle: Series) -> list[str]:
-    """A line on an angle that no motor turns by, and what its values may be instead."""
-    # Over some samples: stamps of a busy computer make any single step fast.
+    """A line on an angle that turns faster than any motor, and the unit that it may have."""
+    # Over several samples, because jitter of the stamps makes single steps fast.
     way, took = (column[_STEPS:] - column[:-_STEPS] for column in (angle.values, 1e-9 * angle.time_ns))
     fastest = float(np.quantile(np.abs(way / took), 1.0 - _SELDOM))
     if fastest <= _FASTEST:
@@ -106,7 +107,7 @@ def _turn_as(jump: float) -> str:
 
 
 def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
-    """A line where the force falls whenever the current rises that does not accelerate the motor."""
+    """A line if the force falls whenever the current without acceleration rises."""
     times = current.time_ns
     at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
     known = np.isfinite(at) & np.isfinite(acceleration)
@@ -123,7 +124,7 @@ def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
 
 
 def _find_driving_friction(speed: Series, current: Series, force: Series | None) -> list[str]:
-    """A line where the current that neither load nor inertia takes is against the motion: friction takes current."""
+    """A line if the current that neither load nor inertia explains opposes the motion, which friction's does not."""
     times = current.time_ns
     at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
     moving = np.isfinite(load) & (np.abs(at) > _MOVING * np.nanquantile(np.abs(at), 0.99))
@@ -143,14 +144,14 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | None)
 
 
 def _starts_anew(values: np.ndarray) -> float:
-    """Size of the jumps of a value that starts anew again and again; 0 if it does not."""
+    """Size of the jumps of a value that wraps around; 0 if it does not."""
     jumps = np.abs(np.diff(values))
     jumps = jumps[jumps > _ANEW * np.ptp(values)]
     return float(np.median(jumps)) if len(jumps) >= _LEAST_JUMPS else 0.0
 
 
 def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
-    """Means of another signal over the lowest and the highest part of the travel that hold enough samples."""
+    """Means of another signal over the lowest and the highest part of the travel with enough samples."""
     at = other.sampled(angle.time_ns)
     known = np.isfinite(at)
     part = np.minimum(_PARTS * (angle.values - angle.values.min()) / np.ptp(angle.values), _PARTS - 1).astype(int)
@@ -159,8 +160,7 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
 
 
 def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
-    """The current that does not accelerate the motor; None where what loads it and acceleration cannot be told apart, as in a
-    sine."""
+    """The current that does not accelerate the motor; None if load and acceleration cannot be separated, as in a sine."""
     if not np.ptp(acceleration):
         return current
     if abs(np.corrcoef(load, acceleration)[0, 1]) > _TOLD_APART:

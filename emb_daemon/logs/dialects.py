@@ -1,4 +1,4 @@
-"""Frames as other tools write them in text, in can-utils' log format, which is read in bulk."""
+"""Frames in other tools' text formats, converted to can-utils' log format, which is read in bulk."""
 
 import re
 
@@ -12,11 +12,11 @@ _GVRET = b"Time Stamp,ID,Extended,Dir,Bus,LEN"
 
 
 def as_candump(content: bytes) -> bytes | None:
-    """Text of candump's log format with the frames of a text that is of another, line by line; None of one that is none of
-    those known here. A line that cannot be read stays as it is."""
+    """A text in another format converted to candump's log format line by line; None if the format is unknown. A line that
+    cannot be read stays as it is."""
     first = content[:1000].lstrip().split(b"\n", 1)[0]
     if first.startswith(_GVRET):
-        # The header's line stays, an empty one, for the numbers of those below it.
+        # The header becomes an empty line, so that the line numbers stay the same.
         return b"\n".join([b"", *map(_of_gvret, content.split(b"\n")[1:])])
     if _SHOWN.fullmatch(first.strip()):
         return b"\n".join(map(_of_terminal, content.split(b"\n")))

@@ -1,13 +1,15 @@
-"""Another rig's live bus as ours: its frames become our messages as they arrive, by the mapping file that reads its logs.
+"""Another rig's live bus as ours: its frames are converted to our messages as they arrive, by the same mapping file as its
+logs.
 
 The motor angle's frames are the clock, as in logs. Faster ones than ours are thinned out to our cycle, the current in between
-averaged; slower ones stay as they are, since nothing can be put between samples of which the second has not come yet.
+averaged; slower ones stay as they are, because interpolation would have to wait for the next sample.
 """
 
 import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,15 +18,18 @@ from emb_daemon.logs import j1939
 from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.mapping import Mapping, Source, alone
 from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
-from emb_daemon.runtime.bus import PythonCanBus, open_python_can
+from emb_daemon.runtime.bus import PythonCan, PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME, row_of
 from emb_daemon.wire.layout import CORNERS, pack, signal_columns
 
-#: A sample is due when this share of our cycle has passed since the last; a bus delays single frames by as much.
+if TYPE_CHECKING:
+    from can import Message
+
+#: A sample is due after this share of our cycle since the last one; a bus may delay single frames by the rest.
 _DUE = 0.9
-#: Between two looks at several buses, s: a fraction of our cycle.
+#: Period of polling several buses, s: a fraction of our cycle.
 _POLL_S = 0.0005
 
 
@@ -49,7 +54,7 @@ class _Value:
         self.count += 1
 
     def mean(self) -> float:
-        """Of what came since the last call; the last value where nothing did."""
+        """Mean of the values since the last call; the last value if there were none."""
         mean = self.total / self.count if self.count else self.last
         self.total, self.count = 0.0, 0
         return mean
@@ -78,7 +83,7 @@ class _Message:
         return {name: value.last if isinstance(value, _Value) else value for name, value in self.signals.items()}
 
     def frame(self, values: dict[str, float], time_ns: int) -> tuple | None:
-        """A FRAME row; None where a value is none that the message can carry."""
+        """A FRAME row; None if the message cannot carry a value."""
         payload = 0
         for name, value in values.items():
             layout = self.layout[name]
@@ -104,13 +109,13 @@ class SeveralBuses:
     """python-can buses by channel as one: frames of all, each with its channel; what is sent goes to its channel's, or to the
     first."""
 
-    def __init__(self, buses: dict):
+    def __init__(self, buses: dict[str, PythonCan]):
         self._buses = buses
 
     def fileno(self) -> int:
         raise NotImplementedError
 
-    def recv(self, timeout_s: float):
+    def recv(self, timeout_s: float) -> "Message | None":
         """The next frame of any, None if none comes in time."""
         until = time.monotonic() + timeout_s
         while True:
@@ -122,7 +127,7 @@ class SeveralBuses:
                 return None
             time.sleep(min(_POLL_S, left))
 
-    def send(self, message) -> None:
+    def send(self, message: "Message") -> None:
         self._buses.get(str(message.channel), next(iter(self._buses.values()))).send(message)
 
     def shutdown(self) -> None:
@@ -137,7 +142,7 @@ class _Signals:
         mapping.require_frames()
         self.messages = {name: _message(name, mapping) for name in names}
         self._readers: dict[tuple[int, bool], list[tuple]] = {}
-        #: The same of J1939's groups, and who was the first to send one: others' frames of it are of something else.
+        #: The same of J1939's groups, and the first sender of each: other senders' frames of a group are ignored.
         self._groups: dict[int, list[tuple]] = {}
         self._senders: dict[int, int] = {}
         for our in self.messages.values():
@@ -174,7 +179,7 @@ class _Signals:
 def _message(name: str, mapping: Mapping) -> _Message:
     message, database = our_messages()[name]
     names = tuple(signal.name for signal in message.signals if signal.name not in HEADER)
-    # Each of ours has its own value, for two may come from one of the rig's, by different scales.
+    # Each of our signals has its own value, because two may come from one of the rig's with different scales.
     signals = {
         signal: _Value(source) if isinstance(source, Source) else source for signal, source in mapping.messages[name].items()
     }
@@ -187,10 +192,10 @@ class MappedBus(PythonCanBus):
 
     Args:
         bus: python-can's, without filters; for CAN FD opened with it (`open_buses`).
-        mapping: by the rig's DBC; its references stay outside.
+        mapping: by the rig's DBC; references are not converted.
     """
 
-    def __init__(self, bus, mapping: Mapping):
+    def __init__(self, bus: PythonCan, mapping: Mapping):
         super().__init__(bus, [])
         self._signals = _Signals(mapping, [name for name in mapping.messages if not name.startswith("RIG_")])
         self._messages = self._signals.messages
@@ -208,8 +213,8 @@ class MappedBus(PythonCanBus):
             rows += self.heard(message, time_ns)
         return np.array(rows, FRAME)
 
-    def heard(self, message, time_ns: int) -> list[tuple]:
-        """FRAME rows that a frame of the rig (python-can Message) makes of ours."""
+    def heard(self, message: "Message", time_ns: int) -> list[tuple[int, ...]]:
+        """FRAME rows of our messages that follow from a frame of the rig (python-can Message)."""
         if not self._signals.take(message, time_ns):
             return []
         rows = []
@@ -246,7 +251,7 @@ class MappedBus(PythonCanBus):
 
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
-    """Angle and speed at a sample; one that the rig does not measure from the other, since the sample before."""
+    """Angle and speed at a sample; if the rig measures one of them, the other from its change since the sample before."""
     known = resolver.last()
     elapsed_s = 1e-9 * (time_ns - resolver.sent_ns) if resolver.sent_ns else math.inf
     before = resolver.before
@@ -261,7 +266,7 @@ def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
 
 
 def _complete(slow: _Message) -> dict[str, float]:
-    """A slow message's values, with those that others stand in for (`resample.SUBSTITUTES`)."""
+    """A slow message's values, with substitutes for missing ones (`resample.SUBSTITUTES`)."""
     known = slow.last()
     plates = [known[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in known]
     if plates:
@@ -273,7 +278,7 @@ def _complete(slow: _Message) -> dict[str, float]:
 class ReferenceBus(PythonCanBus):
     """A bus on which frames of ``ids`` are ours and the rig's force sensors are heard beside them, as RIG_c_Force."""
 
-    def __init__(self, bus, mapping: Mapping, ids: list[int]):
+    def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)
         names = [name for name in mapping.messages if name.startswith("RIG_") and name.endswith("_Force")]
         if not names:
@@ -290,7 +295,7 @@ class ReferenceBus(PythonCanBus):
         return np.array(rows, FRAME)
 
 
-def open_buses(options: dict, mapping: Mapping):
+def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
     """python-can's bus by its options (`cli.busoptions`), or as many as the mapping names channels; for CAN FD if the rig's
     messages are.
 
@@ -304,12 +309,12 @@ def open_buses(options: dict, mapping: Mapping):
     channels = sorted({channel for channel in mapping.channels.values() if channel is not None})
     if not channels:
         return open_python_can(options)
-    # The daemon's own channel first: what it sends goes there.
+    # The daemon's own channel first, because that is where it sends.
     ours = str(options.get("channel") or channels[0])
     return SeveralBuses({name: open_python_can(options | {"channel": name}) for name in dict.fromkeys([ours, *channels])})
 
 
-def open_mapped(options: dict, mapping: Mapping, layout: np.ndarray) -> MappedBus:
+def open_mapped(options: dict[str, Any], mapping: Mapping, layout: np.ndarray) -> MappedBus:
     """A bus read through a mapping, for a daemon of a LAYOUT.
 
     Raises:

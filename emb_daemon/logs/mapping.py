@@ -1,14 +1,14 @@
 """Logs of other people's rigs as our frames, by a mapping file: CAN logs by the rig's own DBC, tables and measurements by
 column.
 
-A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` makes our messages of it.
+A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta, field
@@ -26,12 +26,15 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
 from emb_daemon.wire.units import TRAVELS, UNITS, conversion
 
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message
+
 #: Signals that the estimator does not use; they may stay unmapped and are sent as zero.
 _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 #: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
-#: Share of the payloads that a gateway or the beginning of a log may leave out of a copy.
+#: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
 
 
@@ -57,7 +60,7 @@ class Mapped(Struct, kw_only=True):
     #: A constant in our unit, for what the rig does not measure.
     value: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
         alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
@@ -80,7 +83,7 @@ class Time(Struct, kw_only=True):
     #: Of a table without such a column: rows per second.
     rate_Hz: Positive | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.signal is None) == (self.rate_Hz is None):
             raise ValueError("expected either signal (a column) or rate_Hz (rows per second)")
         if UNITS.get(self.unit, ("",))[0] != "s":
@@ -110,7 +113,7 @@ class MappingFile(Struct, kw_only=True):
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.dbc is not None and self.buses:
             raise ValueError("buses: each has a dbc of its own; expected dbc or buses")
         if (self.dbc is not None or self.buses) and self.time is not None:
@@ -122,9 +125,15 @@ class Source:
     ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a sampling period."""
 
     def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
-        self.name, self.bus, self.period = mapped.signal, mapped.bus, mapped.period
-        self.message, _, self.signal = mapped.signal.rpartition(".")
-        self.scale, self.offset, self.span_ns = scale, offset, span_ns
+        self.name: str = mapped.signal
+        self.bus: str | None = mapped.bus
+        self.period: float | None = mapped.period
+        message, _, signal = mapped.signal.rpartition(".")
+        self.message: str = message
+        self.signal: str = signal
+        self.scale = scale
+        self.offset = offset
+        self.span_ns = span_ns
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
@@ -149,11 +158,15 @@ class Mapping:
     """
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
-        self.databases = {name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()}
-        self.channels = {name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()}
+        self.databases: dict[str | None, Database] = {
+            name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()
+        }
+        self.channels: dict[str | None, str | None] = {
+            name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
+        }
         self._ours = our_messages()
         self._faults: list[str] = []
         self.notes: list[str] = []
@@ -179,7 +192,7 @@ class Mapping:
             signals[signal_name] = mapped.value
             [layout] = signal_columns(self._ours[message_name][1], message_name, (signal_name,))
             if not layout["low"] <= mapped.value <= layout["high"]:
-                # No frame could carry it, and the message would never be heard.
+                # No frame could carry it, and the message would never be sent.
                 self._fault(
                     name, f"value: {mapped.value:g}; expected {layout['low']:g} to {layout['high']:g} {ours.unit or ''}"
                 )
@@ -214,7 +227,7 @@ class Mapping:
         return ", ".join(signal.name for signal in self._ours[message][0].signals if signal.name not in HEADER)
 
     def _like(self, bus: str | None, signal: str) -> str:
-        """What the rig's DBC has that is called most like it, in words; empty if nothing is."""
+        """The most similar names in the rig's DBC, in words; empty if there are none."""
         known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
         like = get_close_matches(signal, known, 3)
         return f"; did you mean {' or '.join(like)}?" if like else ""
@@ -243,14 +256,15 @@ class Mapping:
         return self.databases[bus].get_message_by_name(signal.rpartition(".")[0])
 
     def _check_complete(self) -> None:
-        """A message is sent whole: what is left out and cannot be had from others would be a zero that somebody believes."""
+        """Find missing signals: a message is sent whole, and a signal without source or substitute would be sent as a valid
+        zero."""
         corners = [corner for corner in CORNERS if f"EMB_{corner}_Resolver" in self.messages]
         if not corners and not self._faults:
             self._faults.append(
                 f"{self.path}: signals: expected EMB_c_Resolver.MotorAngle, MotorSpeed or both of at least one corner; of a "
                 "bench without a motor, or whose motor stands, say so by `EMB_FL_Resolver.MotorAngle: {value: 0}`"
             )
-        # Of a message with a fault nobody knows yet what will be missing.
+        # What a message with a fault lacks is not known yet.
         whole = [name for name in self.messages if not any(f"signals.{name}." in fault for fault in self._faults)]
         for name in whole:
             signals = self.messages[name]
@@ -291,7 +305,7 @@ class Mapping:
         """Whether any of the rig's mapped messages is CAN FD."""
         return any(self.message_of(source).is_fd for name in self.messages for source in self._sources(name).values())
 
-    def message_of(self, source: Source):
+    def message_of(self, source: Source) -> "Message":
         """The rig's message (cantools) that has a signal."""
         return self._message(source.bus, source.name)
 
@@ -347,7 +361,7 @@ class Mapping:
             raise InputError(
                 f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
             )
-        # No log has times before zero, as a recorder has them before its trigger.
+        # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
 
@@ -374,7 +388,7 @@ class Mapping:
         return ", ".join(names) or "a signal"
 
     def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
-        """Times and values of the rig's signals by bus and name; one in a frame too short for it is left out."""
+        """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
         found = {}
         by_message: dict[tuple[str | None, str], list[str]] = {}
         for bus, signal in sorted(wanted, key=str):
@@ -389,7 +403,7 @@ class Mapping:
             if in_group or message.protocol == "j1939":
                 parameters = {signal: message.get_signal_by_name(signal.rpartition(".")[2]) for signal in columns}
                 columns = {signal: j1939.known(parameters[signal], values) for signal, values in columns.items()}
-            # Parts of a multiplexed message are messages of their own.
+            # Each multiplexed part counts as a message of its own.
             for part in [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]:
                 heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
                 values = [columns[signal][heard] for signal in part]
@@ -401,7 +415,8 @@ class Mapping:
         """Of a message's frames.
 
         Raises:
-            InputError: the log has nothing of the channel, or two channels or senders carry the message and nothing names one.
+            InputError: the log has nothing of the channel, or the message comes from two channels or senders and the mapping
+                names none.
         """
         frames = recorded.frames
         flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
@@ -427,9 +442,9 @@ class Mapping:
         return np.flatnonzero(mine)
 
 
-def alone(message, name: str) -> Callable[[bytes], float]:
-    """What reads one signal of a message (cantools) out of a payload, whatever overlaps with it in other people's DBC files;
-    NaN of a payload that is too short for it, and of one that a multiplexer's number gives to others.
+def alone(message: "Message", name: str) -> Callable[[bytes], float]:
+    """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
+    the payload is too short or belongs to other multiplexed signals.
 
     Raises:
         cantools.database.Error: the message has no room for it.
@@ -453,7 +468,7 @@ def alone(message, name: str) -> Callable[[bytes], float]:
 
 
 def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bool:
-    """Whether what one channel carries of a message is what another does: a gateway's copy, or two loggers of one bus."""
+    """Whether two channels carry the same frames of a message: a gateway's copy, or two loggers of one bus."""
     rows = np.flatnonzero(mine)
     payloads = np.array([payload.hex() for payload in recorded.payloads(rows)])
     by_channel = [set(payloads[channels[rows] == channel].tolist()) for channel in np.unique(channels[rows])]

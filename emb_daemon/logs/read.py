@@ -30,30 +30,30 @@ except ImportError:
     isal_zlib = None
 
 _PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
-#: Those that a damaged file may crash or hold up.
+#: Formats whose readers a damaged file may crash or hang.
 _APART = ("BLFReader", "MF4Reader")
 #: Endings of log files, before ``.gz``.
 LOG_ENDINGS = (".log", *_PYTHON_CAN)
-#: What a log begins with, whatever the file is called: its ending.
+#: First bytes of a log: the ending of its format.
 _BEGINNINGS = {
     b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
 }  # fmt: skip
-#: Ids listed of a log where those that were looked for are not in it.
+#: Number of ids listed if the expected ones are not in a log.
 _LISTED = 8
 
 
 def _most_bytes() -> int:
-    """Bytes of a log that this machine can hold, with what is made of them: a quarter of its memory."""
+    """Largest size of a log, in bytes: a quarter of this machine's memory, because what is made of it needs memory too."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
 
 
 def log_ending(path: Path) -> str:
-    """What decides a log's format: its last ending, before .gz."""
+    """The ending that decides a log's format: the last one before .gz."""
     return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
 
 
 def ending_of_content(content: bytes) -> str:
-    """A log's format by how it begins, as its ending; empty where that tells nothing."""
+    """A log's format by its first bytes, as its ending; empty if they do not show it."""
     return next((ending for beginning, ending in _BEGINNINGS.items() if content.startswith(beginning)), "")
 
 
@@ -68,11 +68,11 @@ def read_file(path: Path) -> bytes:
 
 
 def unpack_gzip(path: Path, raw: bytes) -> bytes:
-    """A file's bytes, unpacked if they are gzip's, whatever the file is called; one that is cut off, up to the cut."""
+    """A file's bytes, unpacked if they are gzip's, whatever the file is called; a truncated one up to its end."""
     if raw[:2] != b"\x1f\x8b":
         return raw
     if isal_zlib:
-        # What is wrong with a file that is not one whole stream, and how much of it is left, is zlib's to say.
+        # For a file that is not one complete stream, zlib says what is wrong and how much can be read.
         unpacker = isal_zlib.decompressobj(zlib.MAX_WBITS | 16)
         with contextlib.suppress(isal_zlib.error):
             content = unpacker.decompress(raw, _most_bytes())

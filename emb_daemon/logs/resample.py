@@ -1,13 +1,14 @@
 """Columns of any sampling rate as our frames.
 
-What another rig measured becomes our messages, E2E protected, with counters that count resolver cycles, so that the pipeline
-stays the only way into the estimator.
+Another rig's measurements are converted to our messages, E2E protected, with counters that count resolver cycles, so that the
+pipeline is the only way into the estimator.
 """
 
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,40 +19,44 @@ from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS, signal_columns
 
-#: Deviation of a rig's sampling period from ours up to which its samples are taken as they are.
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message
+
+#: Relative deviation of a rig's sampling period from ours up to which its samples are used unchanged.
 _SAME_PERIOD = 0.05
-#: Sampling period from which a fast motion's way between two samples is unknown, in cycles: such samples are taken as they are
-#: too, and the estimator bridges what lies between. A brake clamps in some fifty cycles.
+#: Sampling period, in cycles, from which a fast motion between two samples is unknown: such samples are used unchanged too,
+#: and the estimator bridges the gaps. A brake clamps in some fifty cycles.
 _SPARSE_CYCLES = 5
 #: Sampling period up to which slow motion is filled in between its samples: a stop that comes and goes takes longer, ns. Share
 #: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
 #: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
 _LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
-#: Longest silence, in nominal cycles of our message or in periods of theirs, over which a value is carried on.
+#: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
-#: Share of values beyond what our message carries that an instrument's own faults do not make.
+#: Share of values outside our message's range that is too large for faults of an instrument.
 _MOST_BEYOND = 0.01
-#: Silence of every motor over which slow messages go on: what cools in between is warm for an hour, ns.
+#: Longest time without any motor's messages over which slow messages go on, ns: a hot brake cools for an hour.
 _SILENT_NS = 3_600_000_000_000
-#: Between two samples of a motor that stands and of which nothing was measured, ns.
+#: Sampling period of a standing motor of which nothing was measured, ns.
 _STANDING_NS = 1_000_000_000
-#: Samples from which a log's rate is known, and share of them whose counter is the next: a bus that works loses few frames.
+#: Least number of samples from which a log's rate is computed, and least share of them with consecutive counters: a working
+#: bus loses few frames.
 _LEAST_SAMPLES, _IN_TURN = 50, 0.9
-#: Periods from which a step of time is a pause.
+#: Number of periods from which a step of time is a pause.
 _PAUSE = 10
-#: Angle (rad) by which a step and the speed over it are apart, with the change of speed times a time (s) by which the two may
-#: be sampled apart, from which the estimator takes it for a resolver that lost its zero. That happens once, not again and
-#: again: share of the steps.
+#: A step of the angle that differs from the integrated speed by more than this angle (rad), plus the change of speed times the
+#: time (s) between the sampling of both, looks to the estimator like a resolver that lost its zero. That happens once and not
+#: repeatedly: largest share of such steps.
 _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
-#: Way from which an angle tells how fast it changes, rad; correlation of both from which it does; and how far their ratio may
-#: be from 1: a filter's delay makes some hundredths of it.
+#: Travel from which the angle's derivative is compared with the speed, rad; least correlation of both; largest deviation of
+#: their ratio from 1, of which a filter's delay causes some hundredths.
 _WAY_RAD, _CORRELATED, _OTHER_SCALE = 1.0, 0.8, 0.1
 #: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
 #: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
 _RESOLVED = 0.95
-#: Share of itself by which a steady value varies in the last digits of a number.
+#: Relative variation of a constant value by rounding.
 _STEADY = 1e-6
-#: Ratios of units that are taken for one another.
+#: Ratios of units that are often confused.
 _RATIOS = {
     30.0 / np.pi: "rpm taken for rad/s, or the reverse",
     180.0 / np.pi: "degrees taken for radians, or the reverse",
@@ -62,7 +67,7 @@ _RATIOS = {
 }
 #: Least step of the wire's MotorSpeed.
 _STEP_RAD_PER_S = 0.02
-#: Signals of an E2E protected message that its protection fills.
+#: Signals of an E2E protected message that protection fills in.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
@@ -80,13 +85,13 @@ class Series:
 
     @classmethod
     def of(cls, time_ns: np.ndarray, values: np.ndarray) -> "Series":
-        """Values of the moment in any order; those that are no numbers are left out."""
+        """Instantaneous values in any order; NaN values are left out."""
         known = np.isfinite(values)
         order = np.argsort(time_ns[known], kind="stable")
         return cls(time_ns[known][order], values[known][order])
 
     def averaged(self, span_ns: float | None = None) -> "Series":
-        """The same taken for means over ``span_ns`` that end with their stamps; None is the sampling period."""
+        """The same values as means over ``span_ns`` that end at their stamps; None is the sampling period."""
         span_ns = self.period_ns if span_ns is None else span_ns
         return Series(self.time_ns - round(0.5 * span_ns), self.values)
 
@@ -100,7 +105,7 @@ class Series:
         return abs(self.period_ns / CYCLE_NS - 1.0) <= _SAME_PERIOD
 
     def held(self, at_ns: np.ndarray, cycle_ns: int) -> np.ndarray:
-        """The value last heard, NaN where that is too long ago."""
+        """The last value at each time, NaN if it is too old."""
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
         row = np.searchsorted(self.time_ns, at_ns, side="right") - 1
@@ -126,7 +131,7 @@ class Series:
         if not self.is_sparse or self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
             return self.is_sparse
         missed = 0.25 * np.abs(self.values[1:-1] - 0.5 * (self.values[2:] + self.values[:-2]))
-        # A brake that stands for an hour says nothing of how its stops are sampled.
+        # Long standstill does not show how stops are sampled.
         moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
         return bool(moving.any()) and float(np.quantile(missed[moving], _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD
 
@@ -138,13 +143,13 @@ class Series:
     def smoothed(self, at_ns: np.ndarray) -> np.ndarray:
         """Of a slow signal: mean over a period about each time, NaN in gaps.
 
-        Its change over a cycle is then that of means over periods, straight between their middles, as `mean` has it of the
-        current: speed and current of a slow rig agree in what they say of the inertia.
+        Its change over a cycle is then that of means over periods, interpolated between their middles, as in `mean` for the
+        current, so that speed and current of a slow rig give the same inertia.
         """
         half = round(0.5 * self.period_ns)
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
-        # Straight on either side of the one corner in the period.
+        # Linear on either side of the only corner in the period.
         corner = np.clip(self.time_ns[nearest(self.time_ns, at_ns)], at_ns - half, at_ns + half)
         share = (corner - at_ns + half) / (2.0 * half)
         before, at, after = self._between(at_ns - half), self._between(corner), self._between(at_ns + half)
@@ -154,8 +159,8 @@ class Series:
     def mean(self, at_ns: np.ndarray) -> np.ndarray:
         """Mean over the cycle that ends at each time, NaN in gaps.
 
-        A value that is sampled as fast as we do stands for its own period about its time, so that means over periods add up to
-        means over cycles; means of one that is sampled more slowly run straight from one to the next.
+        A value that is sampled at our rate represents the period about its time, so that means over periods add up to means
+        over cycles; slower values are interpolated linearly.
         """
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
@@ -173,7 +178,7 @@ class Series:
             end = np.clip(end, *edges[[0, -1]])
             mean = (np.interp(end, edges, area) - np.interp(start, edges, area)) / np.maximum(end - start, 1.0)
         if self.is_ours:
-            # A mean over our own cycle is one, whatever the jitter of its stamp.
+            # A mean over our own cycle is used unchanged, whatever the jitter of its stamp.
             row = nearest(self.time_ns, middle)
             mean = np.where(np.abs(self.time_ns[row] - middle) < CYCLE_NS // 4, self.values[row], mean)
         return np.where(self._near(middle), mean, np.nan)
@@ -204,11 +209,11 @@ class Series:
         return apart <= max(CYCLE_NS, _CARRIED_PERIODS * self.period_ns)
 
 
-#: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig has not.
+#: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig does not have.
 Signals = Mapping[str, Series | float | None]
 
 
-#: By the last word of a message's name: which of its signals may be missing, and what stands in for them.
+#: By the last word of a message's name: which of its signals may be missing, and their substitutes.
 SUBSTITUTES = {
     "Resolver": {
         "MotorSpeed": "it is the change of MotorAngle",
@@ -223,7 +228,7 @@ SUBSTITUTES = {
 
 
 def fill_missing(name: str, signals: Signals) -> Signals:
-    """A message's signals with those that are missing (`SUBSTITUTES`) from those that are there, of which there is one."""
+    """A message's signals, at least one, completed by substitutes for missing ones (`SUBSTITUTES`)."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
         if isinstance(angle, Series) and isinstance(speed, Series) and (why := _another_motion(angle, speed)):
@@ -252,7 +257,7 @@ def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Ser
 
 
 def _another_motion(angle: Series, speed: Series) -> str:
-    """How speed and angle contradict each other; empty if they do not, or if nobody knows the way between two samples."""
+    """How speed and angle contradict each other; empty if they do not, or if the motion between two samples is unknown."""
     if angle.is_sparse:
         return ""
     steps = np.diff(angle.time_ns)
@@ -263,7 +268,7 @@ def _another_motion(angle: Series, speed: Series) -> str:
     if not known.any():
         return ""
     moved, explained = float(np.sum(np.abs(way[known]))), float(np.sum(np.abs(turned[known])))
-    # What noise adds up to is no way.
+    # The sum of noise is no travel.
     if (
         min(moved, explained) > _WAY_RAD
         and abs(ratio := float(way[known] @ turned[known] / (turned[known] @ turned[known]))) > 0.0
@@ -289,7 +294,7 @@ def _correlation(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _meaning(ratio: float) -> str:
-    """What an angle that changes ``ratio`` times as fast as its speed says may come from."""
+    """Possible causes of an angle that changes ``ratio`` times as fast as the speed says."""
     sign = "a direction turned round" if ratio < 0.0 else ""
     for known, text in _RATIOS.items():
         for expected in (known, 1.0 / known):
@@ -299,7 +304,7 @@ def _meaning(ratio: float) -> str:
 
 
 def _mean(first: Series | float, second: Series | float) -> Series | float:
-    """Of two temperatures, at the times of one that is measured."""
+    """Mean of two temperatures, at the times of one that is measured."""
     if not isinstance(first, Series):
         first, second = second, first
     if isinstance(first, Series):
@@ -309,14 +314,14 @@ def _mean(first: Series | float, second: Series | float) -> Series | float:
 
 
 @cache
-def our_messages() -> dict[str, tuple]:
-    """cantools message and its database by name, of what the daemon receives and sends and what rigs add."""
+def our_messages() -> "dict[str, tuple[Message, Database]]":
+    """cantools message and its database by name: the daemon's messages and those of rigs."""
     databases = (shipped_database("dbc/emb.dbc"), shipped_database("dbc/rig.dbc"))
     return {message.name: (message, database) for database in databases for message in database.messages}
 
 
-def cycle_ns(message) -> int:
-    """Of a cantools message."""
+def cycle_ns(message: "Message") -> int:
+    """Nominal cycle of a cantools message, ns."""
     return (message.cycle_time or _SLOW_MS) * 1_000_000
 
 
@@ -334,7 +339,7 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     if not any(len(times) for times, _ in ticks.values()):
         return np.zeros(0, FRAME)
     stretches = _stretches(np.unique(np.concatenate([times for times, _ in ticks.values()])), _SILENT_NS)
-    # A force sensor's frame comes before those of its sample, which do not wait for it.
+    # A force sensor's frame comes before the other frames of its sample, which do not wait for it.
     in_turn = sorted(messages, key=lambda name: not name.endswith("_ForceSensor"))
     result = np.concatenate([_frames(*ours[name], messages[name], ticks, stretches) for name in in_turn])
     # Stable: at one instant slow messages come first and the resolver last, as the pipeline pairs it with its current.
@@ -368,9 +373,9 @@ def at_our_rate(frames: np.ndarray) -> np.ndarray:
 
 
 def _has_another_rate(resolver: np.ndarray) -> bool:
-    """Whether one sender sends a corner's resolver frames at a rate of its own, that fills the way between two samples.
+    """Whether a single sender sends a corner's resolver frames at another rate that is high enough to interpolate.
 
-    Two senders, or one whose frames are repeated, have no counter that goes up by one."""
+    Counters of two senders, or of repeated frames, do not increase by one."""
     if len(resolver) < _LEAST_SAMPLES:
         return False
     counters = (resolver["data"] >> np.uint64(8) & np.uint64(0xF)).astype(int)
@@ -378,7 +383,7 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
     if np.mean(in_turn) <= _IN_TURN:
         return False
     steps = np.diff(resolver["time_ns"])[in_turn]
-    # The mean, but for pauses: a busy machine's delays cancel in it, and not in the median.
+    # The mean without pauses, in which a busy machine's delays cancel, unlike in the median.
     middle = np.median(steps)
     cycles = np.mean(steps[steps <= max(_PAUSE * middle, _PAUSE * CYCLE_NS)]) / CYCLE_NS
     return abs(cycles - 1.0) > _SAME_PERIOD and middle < (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
@@ -390,13 +395,14 @@ def is_received(message: str) -> bool:
 
 
 def _stretches(times: np.ndarray, silent_ns: float) -> list[tuple[int, int]]:
-    """First and last of ascending times (there has to be one) between silences longer than ``silent_ns``."""
+    """First and last of ascending times (at least one) between gaps longer than ``silent_ns``."""
     ends = np.flatnonzero(np.diff(times) > silent_ns)
     return list(zip(times[np.append(0, ends + 1)].tolist(), times[np.append(ends, -1)].tolist(), strict=True))
 
 
 def _grid(stretches: list[tuple[int, int]], cycle_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times every ``cycle_ns`` from the first stretch on, those that lie in one, and how many cycles lie before each."""
+    """Times every ``cycle_ns`` from the start of the first stretch that lie in a stretch, and the number of cycles before
+    each."""
     origin = stretches[0][0]
     cycles = np.concatenate(
         [np.arange(-((origin - first) // cycle_ns), (last - origin) // cycle_ns + 1) for first, last in stretches]
@@ -445,13 +451,13 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
     frames["time_ns"], frames["can_id"], frames["length"] = times[usable], message.frame_id, 8
     frames["data"] = payload[usable]
     if not is_reference:
-        frames["data"] = _protected(frames["data"], message.frame_id, cycles[usable] % COUNTER_MODULO)
+        frames["data"] = _protected(payload[usable], message.frame_id, cycles[usable] % COUNTER_MODULO)
     return frames
 
 
 @njit
 def _protected(payloads, can_id, counters):
-    """`protect` of one after the other."""
+    """`protect` of an array of payloads."""
     protected = np.empty_like(payloads)
     for row in range(len(payloads)):
         protected[row] = protect(can_id, payloads[row], counters[row], 0)
@@ -459,8 +465,8 @@ def _protected(payloads, can_id, counters):
 
 
 def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndarray:
-    """An angle (rad) that starts anew by whole turns where our message no longer carries it: of a motor that turns on and on,
-    the load is a function of its current, not of how far it has come."""
+    """An angle (rad), shifted by whole turns where it leaves our message's range: the load of a motor that turns on and on
+    depends on its current and not on its travel."""
     if not np.any((angle < low) | (angle > high)):
         return angle
     period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
@@ -483,10 +489,10 @@ def _fast(name: str, source: Series | float | None, times: np.ndarray) -> np.nda
 
 
 def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray | float:
-    """Speeds in which that of a motor that stands goes to and fro by the wire's least step.
+    """Speeds in which that of a standing motor alternates by the message's least step.
 
-    A resolver's speed has noise, and one that repeats itself to the bit hangs. An encoder at rest repeats itself for minutes,
-    as does a speed that is the change of an angle."""
+    The estimator expects noise and takes a speed that repeats to the bit for frozen, but an encoder's speed at rest, or the
+    derivative of an angle, is constant for minutes."""
     return np.where(np.abs(speed) < 0.5 * _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 

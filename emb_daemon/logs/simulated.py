@@ -1,4 +1,6 @@
-"""The simulated car on another rig's bus: our frames leave as the rig's, by the mapping that reads them back."""
+"""The simulated car on another rig's bus: our frames are sent as the rig's messages, by the mapping that reads them."""
+
+from typing import Any
 
 import numpy as np
 
@@ -6,7 +8,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.live import open_buses
 from emb_daemon.logs.mapping import Mapping, Source
 from emb_daemon.logs.resample import our_messages
-from emb_daemon.runtime.bus import PythonCanBus
+from emb_daemon.runtime.bus import PythonCan, PythonCanBus
 from emb_daemon.wire.layout import signal_columns, unpack
 
 
@@ -34,7 +36,7 @@ class _Theirs:
 
 
 def _bounds(signal) -> tuple[float, float]:
-    """What a cantools signal can carry."""
+    """Range of a cantools signal."""
     if signal.is_float:
         return -np.inf, np.inf
     least, most = (
@@ -45,18 +47,18 @@ def _bounds(signal) -> tuple[float, float]:
 
 
 class SimulatedRig(PythonCanBus):
-    """A bus with the calls of `runtime.bus.PythonCanBus` on which what is sent leaves as the rig's messages.
+    """A bus that sends our frames as the rig's messages.
 
     Args:
         bus: python-can's, opened for CAN FD where the rig's messages need it.
         mapping: by the rig's DBC.
-        ids: of the frames to receive, as they are.
+        ids: of the frames to receive, unchanged.
 
     Raises:
         InputError: a mapping of tables has no frames, and one signal cannot select what else its message holds.
     """
 
-    def __init__(self, bus, mapping: Mapping, ids: list[int]):
+    def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)
         self._theirs: dict[tuple, _Theirs] = {}
         self._readers: dict[int, list[tuple]] = {}
@@ -78,8 +80,6 @@ class SimulatedRig(PythonCanBus):
         return theirs
 
     def send(self, frames: np.ndarray) -> None:
-        import can
-
         changed = {}
         for frame in frames:
             for column, source, theirs in self._readers.get(int(frame["can_id"]), ()):
@@ -87,14 +87,10 @@ class SimulatedRig(PythonCanBus):
                 theirs.set(source.signal, value if source.period is None else value % source.period)
                 changed[id(theirs)] = theirs
         for theirs in changed.values():
-            if theirs.missing:
-                continue
-            try:
-                self._bus.send(theirs.frame())
-            except can.CanError:
-                self.unsent += 1
+            if not theirs.missing:
+                self._hand_over(theirs.frame())
 
 
-def open_simulated(options: dict, mapping: Mapping, ids: list[int]) -> SimulatedRig:
+def open_simulated(options: dict[str, Any], mapping: Mapping, ids: list[int]) -> SimulatedRig:
     """A bus by python-can's options (`cli.busoptions`); errors as in `logs.live.open_buses`."""
     return SimulatedRig(open_buses(options, mapping), mapping, ids)

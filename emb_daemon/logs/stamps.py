@@ -1,4 +1,4 @@
-"""Time stamps as recorders write them: coarse, in bunches, twice, gone back; and values that are only held."""
+"""Faults of recorders' time stamps: coarse, in bunches, repeated, going back; and values that are only held."""
 
 import sys
 from collections.abc import Sequence
@@ -7,22 +7,24 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 
-#: What int64 nanoseconds hold: the year 2262, s.
+#: Largest time that int64 nanoseconds can express, s: the year 2262.
 LATEST_S = 9.2e9
 #: Step back in time from which a file holds two recordings; frames of two buses stand less out of order, ns.
 _BACK_NS = 1_000_000_000
-#: Share of the values from which those between two steps back are the recording; others were stamped before a clock was set.
+#: Least share of the values between two steps back that makes them the recording; other values were stamped before a clock was
+#: set.
 _ONE_RECORDING = 0.99
-#: Share of the mean period up to which two stamps are one: jitter leaves more, a gateway or a queue that is emptied less.
+#: Share of the mean period up to which two stamps count as one: jitter leaves more, a gateway or a burst from a queue less.
 _ONE = 0.2
-#: Shares of the steps in motion that have to be so short, and to be none at all, for stamps to come in bunches; chance makes
-#: 0.18 and 0 of a sender that sends at random.
+#: Least shares of steps in motion that are that short, and that are zero, for stamps to count as bunched; a sender at random
+#: times has 0.18 and 0.
 _BUNCHED, _SAME_STAMP = 0.3, 0.05
-#: Share of the steps that are no pauses, and multiple of the longest of them from which a step is one.
+#: Share of the steps that are certainly no pauses, and multiple of the longest of them from which a step is a pause.
 _ORDINARY, _PAUSE = 0.95, 10.0
-#: Bunches over which a mean time is taken: a stamp is then wrong by a twentieth of the time between two.
+#: Number of bunches over which a mean time is taken: the error of a stamp is then a twentieth of the time between two.
 _BUNCHES = 20
-#: Changes from which a value can be told to be held, and share of them that have to come in step.
+#: Least number of changes of a value that is held, and least share of them at whole multiples of the time for which it is
+#: held.
 _LEAST_CHANGES, _IN_STEP = 50, 0.98
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
@@ -31,12 +33,12 @@ _WHOLE = 4
 def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Times of a recording, int64 ns and rising, and the rows that they belong to.
 
-    What was recorded twice is left out. Stamps that come in bunches, of a coarse clock or of a queue that is emptied now and
-    then, are spread evenly. Both are said on stderr.
+    Repeated samples are left out. Stamps in bunches, from a coarse clock or from bursts of a queue, are spread evenly. Both
+    are reported on stderr.
 
     Args:
         source: what messages call it.
-        columns: of values, shape (n,) each, that tell a repetition from a sample.
+        columns: of values, shape (n,) each, by which repetitions are recognised.
 
     Raises:
         InputError: time goes back by more than a second, or does not pass.

@@ -8,6 +8,7 @@ import sys
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, rea
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS
 
+if TYPE_CHECKING:
+    from emb_daemon.logs.mapping import Time
+
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 _TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
@@ -24,37 +28,37 @@ _TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
 _FRAMES, _BINARY = (".blf", ".asc", ".trc"), (b"PK\x03\x04", b"\x89HDF", b"\xd0\xcf\x11\xe0")
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
-#: Lines of words that measurement tools write before a table's header at most, and of units between header and numbers.
+#: Largest number of lines of text before a table's header, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
-#: Share of a column's cells that may be no numbers; half of them if they are a few words, as of an instrument out of range.
+#: Share of a column's cells that may be no numbers; half of them if they are a few words, as from an instrument out of range.
 _MOST_ODD, _FEW_WORDS = 0.01, 3
-#: A time of day with parts of a second, or minutes and seconds, after a date or none; what ISO 8601 has is pyarrow's to read.
+#: A time of day with parts of a second, or minutes and seconds, after a date or none; pyarrow reads ISO 8601.
 _CLOCK = re.compile(
     r"(?:(?P<date>\d{1,4}[./-]\d{1,2}[./-]\d{1,4}),?[ T])?"
     r"(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?"
 )
-#: A number with marks between its thousands, or with a decimal comma; the marks that are never decimal.
+#: A number with thousands separators or a decimal comma; separators that are never decimal.
 _GROUPED, _SPACES = re.compile(r"[+-]?\d[\d.,'’\s]*(?:[eE][+-]?\d+)?"), re.compile(r"['’\s]")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
-#: Months of a year, and digits by which a date begins with it.
+#: Number of months in a year, and of digits of a year at the beginning of a date.
 _MONTHS, _YEAR = 12, 4
-#: What calls a column by its place.
+#: Name of a column by its number.
 _BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 #: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits, in its unit; how
 #: many ordinary steps may pass meanwhile.
 _CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 2**32), 10.0
-#: What calls a channel by its group, and one of the frames that loggers of a bus write.
+#: What separates a channel's name from its group, and the channel of raw frames in bus loggers' files.
 _IN_GROUP, _BUS = " group ", "CAN_DataFrame"
-#: Octets of which every second is zero in UTF-16 without a mark.
+#: Number of octets of which every second is zero in UTF-16 without a byte order mark.
 _MARK = 200
-#: Column names listed where one was not found.
+#: Number of column names listed if one was not found.
 _LISTED = 20
-#: Cells that say that nothing was measured.
+#: Cells that mean that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
 
-def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
+def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
     """Times (int64 ns) and values of the named columns or channels, and the SHA-256 of the file.
 
     Args:
@@ -67,7 +71,7 @@ def read_table(path: Path, names: list[str], time) -> tuple[dict[str, tuple[np.n
     ending = log_ending(path)
     content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
     begins = ending_of_content(content)
-    # `.dat` is what INCA calls a measurement, and what others call a text.
+    # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
     if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):
         return _channels(path, content, names), digest
     if begins or ending in _FRAMES or (ending not in arrays.ENDINGS and content.startswith(_BINARY)):
@@ -99,13 +103,13 @@ def _seconds(path: Path, table, time) -> np.ndarray:
     known = np.isfinite(times)
     if is_clock or np.all(times[known] == np.rint(times[known])):
         times[known] = _going_on(times[known], _CLOCKS_S if is_clock else _COUNTERS)
-    # Of a clock, seconds already.
+    # Times of a clock are in seconds already.
     return times * (1.0 if is_clock else UNITS[time.unit][1])
 
 
 def _going_on(times: np.ndarray, periods: tuple[int, ...]) -> np.ndarray:
-    """Times that start anew, as a clock does at midnight and a counter when it is full, put together; as they are where a step
-    back is none of the least of ``periods`` that they keep within."""
+    """Times that wrap around, as a clock at midnight or a counter on overflow, made continuous; unchanged if a step back does
+    not match the least of ``periods`` that contains them."""
     steps = np.diff(times)
     period = next((period for period in periods if len(steps) and np.max(times) < period), None)
     anew = steps < -0.5 * (period or np.inf)
@@ -115,7 +119,7 @@ def _going_on(times: np.ndarray, periods: tuple[int, ...]) -> np.ndarray:
 
 
 def _other_unit(largest_s: float, time) -> str:
-    """What the largest time would be in the largest smaller unit that makes a time of it, in words."""
+    """The largest time in the largest smaller unit in which it is plausible, in words."""
     for unit in ("ms", "us", "ns"):
         seconds = largest_s * UNITS[unit][1] / UNITS[time.unit][1]
         if seconds <= LATEST_S:
@@ -157,7 +161,7 @@ def _of_arrays(path: Path, found: dict[str, np.ndarray], names: list[str]):
 
 
 def _place(name: str, names: list[str]) -> int | None:
-    """Place of a column among a table's ``names``, also of one that is called by it; None if there is none, or several."""
+    """Index of a column among a table's ``names``, by name or by number; None if there is none, or several."""
     if names.count(name) == 1:
         return names.index(name)
     place = _BY_PLACE.fullmatch(name)
@@ -165,7 +169,7 @@ def _place(name: str, names: list[str]) -> int | None:
 
 
 def _some(wanted: str, names: list[str]) -> str:
-    """Names to tell someone who misspelt one: all, or of many those most like it."""
+    """Names to list if one was misspelt: all, or the most similar ones."""
     return ", ".join(names if len(names) <= _LISTED else [*get_close_matches(wanted, names, _LISTED, 0.0), "…"])
 
 
@@ -178,8 +182,8 @@ def _is_clock(column) -> bool:
 
 
 def _numbers(path: Path, table, name: str) -> np.ndarray:
-    """A column's values; of dates and times of day, seconds. A few cells that are no numbers, as tools write of an overflow
-    or a division by zero, are left out, with a word on stderr."""
+    """A column's values; of dates and times of day, seconds. A few cells that are no numbers, as tools write for an overflow
+    or a division by zero, are left out, with a note on stderr."""
     import pyarrow
 
     column = table[name]
@@ -209,7 +213,7 @@ def _numbers(path: Path, table, name: str) -> np.ndarray:
 
 
 def _ungrouped(cells: list[str | None]) -> list[str | None]:
-    """A column's numbers without marks between thousands, and with a decimal point; other texts as they are."""
+    """A column's numbers without thousands separators and with a decimal point; other texts unchanged."""
     numbers = [cell for cell in cells if cell and _GROUPED.fullmatch(cell)]
     both = next((cell for cell in numbers if "," in cell and "." in cell), None)
     if both is not None:
@@ -220,14 +224,14 @@ def _ungrouped(cells: list[str | None]) -> list[str | None]:
 
     def plain(cell: str) -> str:
         text = _SPACES.sub("", cell)
-        # A point alone is a decimal one.
+        # A single point is a decimal point.
         return (text.replace(group, "") if both or group == "," else text).replace(",", ".")
 
     return [plain(cell) if cell and _GROUPED.fullmatch(cell) else cell for cell in cells]
 
 
 def _number(cell: str | None, day_first: bool) -> float:
-    """Of a cell's text; of a date and a time of day, or of one of them, seconds; NaN of anything else."""
+    """Number in a cell's text; seconds of a date, a time of day, or both; NaN for anything else."""
     if cell is None:
         return np.nan
     try:
@@ -251,8 +255,8 @@ def _number(cell: str | None, day_first: bool) -> float:
 
 
 def _text_table(path: Path, content: bytes, names: list[str]):
-    """A table as text, as measurement tools write it: words before the header and units after it are skipped, rows of another
-    number of cells (a last one that was cut off) left out, with a word on stderr."""
+    """A table as text, as measurement tools write it: text before the header and units after it are skipped, rows with another
+    number of cells (a truncated last one) left out, with a note on stderr."""
     import pyarrow.csv
 
     content = _as_utf8(content)
@@ -261,7 +265,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
-    # The header has most of the names, and parts of its lines do what parts it; before it stands what the tool has to say.
+    # The header is the line with most of the names, and the lines below it have its separator; before it is the tool's own
+    # text.
     header, delimiter = max(
         ((row, mark) for row in range(min(len(lines), _PREAMBLE)) for mark in _DELIMITERS),
         key=lambda at: (
@@ -304,7 +309,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     table = read(".")
     wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
     texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
-    # Where a comma does not separate, it is a decimal one; a number may have it for the first time after many rows.
+    # A comma that does not separate is decimal; it may occur for the first time after many rows.
     if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
         table = read(",")
     if len(odd) > table.num_rows:
@@ -318,13 +323,13 @@ def _text_table(path: Path, content: bytes, names: list[str]):
 
 
 def _parts(lines: list[str], delimiter: str) -> bool:
-    """Whether a mark parts any of the lines below a header; true of none."""
+    """Whether a separator occurs in any of the lines below a header; true if there are none."""
     return not any(lines) or any(len(_cells(line, delimiter)) > 1 for line in lines)
 
 
 def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: str) -> list[str]:
-    """Names of a table whose rows, ``line`` the first of them, have more cells than its header: a first column that counts or
-    names the rows, as R and pandas write it, has none; else the last ones have none."""
+    """Names of a table whose rows, the first of which is ``line``, have more cells than its header: the unnamed column is the
+    first if that numbers or names the rows, as R and pandas write it; otherwise the last ones are unnamed."""
     more = len(rows[0]) - len(names)
     if more == 1 and not rows[0][-1]:
         return [*names, ""]
@@ -351,7 +356,7 @@ def _as_utf8(content: bytes) -> bytes:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    # As numpy.savetxt and MATLAB write a header.
+    # numpy.savetxt and MATLAB write a header like this.
     line = line.lstrip("#%")
     if delimiter == " ":
         line = " ".join(line.split())
@@ -359,12 +364,12 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
-    """Line before the first of a table of numbers alone, and what parts its cells; None where words stand above them, unless
-    ``words`` may."""
+    """Index of the line before a table of numbers without header (-1: none), and its separator; None if there is text above
+    it, unless ``words`` allows it."""
     for row, line in enumerate(lines):
         if not line.strip() or line.lstrip().startswith(("#", "%")):
             continue
-        # A comma last but for blanks: it may be a decimal one.
+        # Of separators other than blanks the comma last, because it may be decimal.
         mark = next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ",")
         if all(map(_is_number, filter(None, _cells(line, mark)))):
             return row - 1, mark
@@ -378,7 +383,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
-    """Where a channel stands in a measurement, also of one that is called by its group where several have its name.
+    """Group and index of a channel in a measurement; several of the same name are distinguished by their group.
 
     Raises:
         InputError: there is none, or several.

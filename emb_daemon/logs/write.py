@@ -1,4 +1,4 @@
-"""Tables of estimates and logs of frames, by the output file's ending; whole or not at all."""
+"""Tables of estimates and logs of frames, by the output file's ending; a file is written completely or not at all."""
 
 import datetime
 import os
@@ -20,15 +20,16 @@ TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
 FRAME_ENDINGS = (".log", ".blf", ".asc", ".trc", ".mf4")
 
 
-#: What columns of a table are that are no signal of the estimator's, for files that can say so.
+#: Descriptions of table columns that are no signals of the estimator, for formats that can store them.
 _COMMENTS = {"reasons": "why not to trust the row, joined by '; '", "corner": "wheel"}
 _UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
-#: Signals that no column is of.
+#: Signals without a column.
 _NOT_WRITTEN = ("stiffness_force_sigma_N", "torque_force_sigma_N", "contact_angle_sigma_rad", "reasons")
 
 
 def ending_of(path: Path) -> str:
-    """What decides an output's format: the last ending, or ``.signals.mf4`` for measurement channels instead of CAN frames."""
+    """The ending that decides an output's format: the last one, or ``.signals.mf4`` for measurement channels instead of CAN
+    frames."""
     return ".signals.mf4" if path.name.lower().endswith(".signals.mf4") else path.suffix.lower()
 
 
@@ -47,7 +48,7 @@ def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.nda
 
 
 def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.ndarray) -> dict[str, np.ndarray]:
-    """What a rig's instruments measured at the samples, as far as it has them: force and torque of the nearest frame (NaN
+    """Measurements of a rig's instruments at the samples, as far as it has them: force and torque of the nearest frame (NaN
     where none is near), temperatures as last heard."""
     columns = {
         "clamp_force_ref_N": force_N,
@@ -89,7 +90,7 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
         from asammdf import MDF, Signal
     except ImportError as error:
         raise needs_extra(path, error) from None
-    # A measurement's times count from its start: viewers add the two.
+    # A measurement's times count from its start, because viewers add the two.
     start_s = np.floor(columns["time_s"][0]) if len(columns["time_s"]) else 0.0
     signals = []
     for name, values in columns.items():
@@ -120,7 +121,7 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
     import can
 
     with naming(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        # python-can takes every dot in a name for part of the format.
+        # python-can takes everything after the first dot of a name for the format.
         part = Path(folder) / f"frames{path.suffix.lower()}"
         try:
             with can.Logger(part) as logger:

@@ -3,20 +3,20 @@
 Thesis 2.5 signals contact when lambda = dT_m/dtheta exceeds a threshold. A difference of torques at 4 ms is mostly noise, so
 lambda is used in its integrated form: the rise of the torque over its level in the clearance, summed one-sidedly (Page,
 "Continuous inspection schemes", Biometrika 41, 1954). The level is learned in each clearance, so that an offset of current or
-friction raises no alarm. At speed the torque says nothing within a few radians; there the tracked contact angle signals, as
-soon as it is passed by several of its standard deviations.
+friction raises no alarm. At speed the torque says nothing within a few radians; there contact is signalled as soon as the
+motor has passed the tracked contact angle by several of its standard deviations.
 """
 
 from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
-#: ``rise``: summed torque above the clearance level and the believed force; ``shortfall``: summed torque missing there; both
-#: in standard deviations of one sample. ``level`` in N m, over ``samples`` of it. ``early``: what was above it, N m, in the
-#: mean of the first ``begun`` samples of this stroke. ``excess``: torque not believed, smoothed over ``watched`` samples.
-#: ``agreed``: closing samples that confirm.
+#: ``rise``, ``shortfall``: summed torque above and below what clearance level and believed force need, in standard deviations
+#: of one sample. ``level``: torque in the clearance, N m, mean of ``samples``. ``early``: torque above that, N m, mean of the
+#: first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched`` samples. ``agreed``: number
+#: of closing samples that confirm the contact angle.
 CONTACT = np.dtype(
     [
         *fields("?", "engaged lost confirmed"),
@@ -30,29 +30,30 @@ CONTACT = np.dtype(
 #: What a watch found: nothing, force where clearance was believed, or clearance where force was believed.
 NOTHING, TOO_LATE, TOO_EARLY = range(3)
 
-#: Torque (standard deviations of one sample) that a sum gives away with each sample, and logarithm of the number of samples
-#: between false alarms: an hour of nothing but closing makes 1e6.
+#: Torque (standard deviations of one sample) that is subtracted from a sum with each sample, and logarithm of the mean number
+#: of samples between false alarms: an hour of closing has 1e6 samples.
 _DRIFT, _LOG_RUN = 0.45, 17.0
-#: Friction must have turned over by this much for the torque to count.
+#: Friction state from which the torque counts: friction must have developed in the closing direction.
 _TURNED_OVER = 0.9
 #: Samples from which the clearance level may raise an alarm, and over which it averages at most.
 _LEAST, _MOST = 100.0, 500.0
 #: Samples over which torque is smoothed, and closing samples in agreement that confirm the contact angle.
 _SMOOTHED, _CONFIRMING = 15.0, 100
-#: Share of the force by which curve and friction may be wrong without the contact angle being blamed, and torque (standard
-#: deviations of one sample) from which agreement means something.
+#: Error of curve and friction, as a share of the force, that is not attributed to the contact angle; torque (standard
+#: deviations of one sample) above which agreement confirms it.
 _TOLERANCE, _TELLING = 0.07, 3.0
-#: Clearance samples that show an offset of torque, and factor by which correlated noise makes their mean less certain.
+#: Number of clearance samples whose mean replaces the believed offset, and factor by which correlated noise enlarges the
+#: standard deviation of that mean.
 _SHOWN, _CORRELATED = 20.0, 1.5
-#: Samples at the beginning of a stroke that tell an offset, which is there at once, from a force, which grows; least number of
-#: them; and share of the excess that an offset must have shown by then.
+#: An offset is there from the first sample of a stroke, a force grows. Number of first samples that are averaged to tell them
+#: apart, least number, and share of the excess that an offset must have shown in them.
 _BEGINNING, _BEGUN, _AT_ONCE = 8.0, 3.0, 0.5
 #: Standard deviations of the contact angle beyond which it counts as passed.
 _CERTAIN = 4.0
 
 
 @njit
-def threshold(current_share, correlation_time, dt):
+def threshold(current_share: float, correlation_time: float, dt: float) -> float:
     """Alarm threshold of the sums for noise of which ``current_share`` of the variance is correlated over
     ``correlation_time``: the sum of correlated noise wanders further (Siegmund, Sequential Analysis, 1985, ch. 2)."""
     rho = exp(-dt / correlation_time)
@@ -61,9 +62,9 @@ def threshold(current_share, correlation_time, dt):
 
 
 @njit
-def engaged(state, x, contact_sigma):
-    """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; keeps what it said
-    last while that is open."""
+def engaged(state: Record, x: float, contact_sigma: float) -> bool:
+    """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; the last answer while
+    neither is certain."""
     if x > _CERTAIN * contact_sigma:
         state.engaged = True
     elif x < -_CERTAIN * contact_sigma or (x < 0.0 and state.rise == 0.0):
@@ -72,7 +73,10 @@ def engaged(state, x, contact_sigma):
 
 
 @njit
-def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, contact_sigma, offset=0.0, offset_sigma=0.0):
+def watch_closing(
+    state: Record, torque: float, predicted: float, friction_mean: float, sigma: float, limit: float, x: float,
+    contact_sigma: float, offset: float, offset_sigma: float,
+) -> int:  # fmt: skip
     """Compare torque with belief for one sample.
 
     Args:
@@ -83,7 +87,7 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
         sigma: standard deviation of ``torque``, N m.
         limit: `threshold`.
         x, contact_sigma: rad past the believed contact angle, and its standard deviation.
-        offset, offset_sigma: what is believed of an offset of ``torque``, N m; counts until the clearance has shown it.
+        offset, offset_sigma: the filter's offset of ``torque``, N m; used until enough clearance samples have shown it.
 
     Returns:
         NOTHING, TOO_LATE or TOO_EARLY: how the believed contact angle is wrong.
@@ -127,7 +131,7 @@ def watch_closing(state, torque, predicted, friction_mean, sigma, limit, x, cont
 
 
 @njit
-def clearance_level(state, sigma, offset, offset_sigma):
+def clearance_level(state: Record, sigma: float, offset: float, offset_sigma: float) -> tuple[float, float]:
     """Torque in the clearance and its standard deviation, N m: as the clearance showed it to samples of standard deviation
     ``sigma``, or else as the filter believes."""
     if state.samples < _SHOWN:
@@ -136,27 +140,27 @@ def clearance_level(state, sigma, offset, offset_sigma):
 
 
 @njit
-def forget_level(state):
-    """The clearance level is another now: the offset of the torque has changed."""
+def forget_level(state: Record) -> None:
+    """Learn the clearance level anew, because the offset of the torque has changed."""
     state.level = state.samples = 0.0
 
 
 @njit
-def start_anew(state):
-    """Forget what was summed: another contact angle is now believed."""
+def start_anew(state: Record) -> None:
+    """Forget all sums, because the believed contact angle has changed."""
     state.lost, state.confirmed, state.agreed = True, False, 0
     state.rise = state.shortfall = state.excess = state.watched = 0.0
 
 
 @njit
-def clearly_above(state, sigma):
+def clearly_above(state: Record, sigma: float) -> float:
     """Smoothed excess (N m) that noise of standard deviation ``sigma`` per sample does not reach; infinite before the first
     sample."""
     return 5.0 * sigma / sqrt(state.watched) if state.watched > 0.0 else np.inf
 
 
 @njit
-def torque_sigma(current_torque, speed_torque):
+def torque_sigma(current_torque: float, speed_torque: float) -> tuple[float, float]:
     """Standard deviation of one sample's torque from noise of current and of both speeds, N m, and the current's share."""
     variance = current_torque * current_torque + 2.0 * speed_torque * speed_torque
     return sqrt(variance), current_torque * current_torque / variance

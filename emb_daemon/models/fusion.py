@@ -23,32 +23,29 @@ for noise, which takes slow model error for white noise. Here the filter estimat
                                           - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
                                           + white noise,  D = gamma + mu s
 
-so that what is slow stays correlated and the standard deviation means what it says.
+so that slow errors stay correlated in time, and the standard deviation is that of the force.
 """
 
 from math import sqrt
 
-import numpy as np
+from emb_daemon.jit import Floats, njit
 
-from emb_daemon.jit import njit
-
-#: Of numpy: numba would compile what takes one of Python's numbers anew for each of them.
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = np.arange(14)
 STATES = 14
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(STATES)
 #: States that the clamp force itself rests on.
 OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
 
 
 @njit
-def maximum_likelihood(stiffness, stiffness_sigma, torque, torque_sigma):
+def maximum_likelihood(stiffness: float, stiffness_sigma: float, torque: float, torque_sigma: float) -> tuple[float, float]:
     """Fused force and its standard deviation."""
     vs, vt = stiffness_sigma * stiffness_sigma, torque_sigma * torque_sigma
     return stiffness + vs / (vs + vt) * (torque - stiffness), sqrt(vs * vt / (vs + vt))
 
 
 @njit
-def copy_errors(x, P, from_x, from_P):
-    """Into ``x`` and ``P``. Loops, because each assignment of a whole array costs the compiler a tenth of a second."""
+def copy_errors(x: Floats, P: Floats, from_x: Floats, from_P: Floats) -> None:
+    """Copy into ``x`` and ``P``, by loops: assigning a whole array takes a tenth of a second to compile."""
     for i in range(STATES):
         x[i] = from_x[i]
         for j in range(STATES):
@@ -56,7 +53,7 @@ def copy_errors(x, P, from_x, from_P):
 
 
 @njit
-def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
+def predict_errors(x: Floats, P: Floats, decay: float, noise_decay: float, noise_variance: float, walked: Floats) -> None:
     """Time update of the error state and its covariance.
 
     ``decay`` and ``noise_decay`` of FAST and NOISE over the step, ``noise_variance`` the stationary variance of NOISE;
@@ -74,9 +71,9 @@ def predict_errors(x, P, decay, noise_decay, noise_variance, walked):
 
 
 @njit
-def variance_along(P, h, gain):
+def variance_along(P: Floats, h: Floats, gain: Floats) -> float:
     """h P h'; ``gain``, shape (STATES,), becomes P h'."""
-    # Columns outside: the sums of a row are independent of each other, and one instruction takes several.
+    # The loop over columns is outside, because then the sums of all rows are independent, and are vectorised.
     for i in range(STATES):
         gain[i] = P[0, i] * h[0]
     for j in range(1, STATES):
@@ -89,7 +86,7 @@ def variance_along(P, h, gain):
 
 
 @njit
-def update_errors(x, P, gain, innovation, s):
+def update_errors(x: Floats, P: Floats, gain: Floats, innovation: float, s: float) -> None:
     """Measurement update with an innovation of variance ``s``; ``gain`` is P h' (`variance_along`)."""
     scale = 1.0 / s
     for i in range(STATES):
@@ -100,7 +97,7 @@ def update_errors(x, P, gain, innovation, s):
 
 
 @njit
-def force_variance(P, h):
+def force_variance(P: Floats, h: Floats) -> float:
     """h P h' over the states that the force rests on."""
     total = 0.0
     for i in OF_THE_FORCE:

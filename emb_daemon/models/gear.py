@@ -1,16 +1,16 @@
-"""A gear whose travel is no constant times its angle: ball and roller ramps, cams.
+"""A gear whose travel is not proportional to its angle: ball and roller ramps, cams.
 
-Everything that moves with the pads (contact, characteristic curve, hysteresis, thickness) is told in equivalent angle: that by
-which a constant gear of the calibration's gear gain would have moved the pads as far. Only torque sees the gear's own slope,
-dx/dθ over the gear gain, by virtual work. So one brake model serves both kinds of gear, and a constant gear costs nothing.
+Everything that moves with the pads (contact, characteristic curve, hysteresis, thickness) is expressed in equivalent angle:
+the angle by which a constant gear of the calibration's gear gain would move the pads as far. Only the torque depends on the
+gear's own slope, dx/dθ over the gear gain (virtual work). So one brake model serves both kinds of gear.
 """
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Floats, Record, njit
 from emb_daemon.models.stiffness import travel_at
 
-#: Intervals into which the range of a travel table is divided: a table of a datasheet has fewer points.
+#: Number of intervals into which the range of a travel table is divided; tables in datasheets have fewer points.
 INTERVALS = 64
 
 #: ``step`` rad between nodes, 0 for a constant gear; equivalent angle (rad) at each and its ``slope``.
@@ -18,7 +18,7 @@ GEAR = np.dtype([("step", "f8"), ("turned", "f8", (INTERVALS + 1,)), ("slope", "
 
 
 @njit
-def through_gear(gear, angle):
+def through_gear(gear: Record, angle: float) -> tuple[float, float]:
     """Equivalent angle (rad) at ``angle`` rad past the released position, and its slope: cubic between the nodes (Hermite),
     straight outside of them."""
     if gear.step == 0.0:
@@ -35,7 +35,7 @@ def through_gear(gear, angle):
 
 
 @njit
-def all_through_gear(gear, angles):
+def all_through_gear(gear: Record, angles: Floats) -> tuple[Floats, Floats]:
     """Equivalent angles (rad) of angles past the released position, and slopes there, shape (n,) each."""
     turned, slopes = np.empty(len(angles)), np.empty(len(angles))
     for row, angle in enumerate(angles):
@@ -44,7 +44,7 @@ def all_through_gear(gear, angles):
 
 
 @njit
-def back_through_gear(gear, turned):
+def back_through_gear(gear: Record, turned: float) -> float:
     """Angle (rad) past the released position of an equivalent angle ``turned`` (rad)."""
     if gear.step == 0.0:
         return turned
@@ -63,7 +63,7 @@ def back_through_gear(gear, turned):
 
 
 @njit
-def steepest(gear):
+def steepest(gear: Record) -> tuple[float, float]:
     """Least and largest slope."""
     if gear.step == 0.0:
         return 1.0, 1.0
@@ -74,7 +74,7 @@ def steepest(gear):
 
 
 @njit
-def most_of_spring(p):
+def most_of_spring(p: Record) -> float:
     """Force (N) of the release spring at the largest clamp force; PARAMETERS record ``p``."""
     if p.spring == 0.0:
         return 0.0

@@ -1,42 +1,41 @@
-"""By how much the resolver's angle is older than the speed that comes with it, and by which share its ways differ.
+"""Age of the resolver's angle relative to the speed that comes with it, and error of the resolver's gain.
 
-What the angle lacks of the integrated speed is then the time times the speed. Both are followed over a tenth of a second.
-A gain of the resolver lacks a share of the way: it is fitted beside the time, because without it a gain of seven hundredths
-looks like an age. Neither signal can be ahead of the motor: a speed that is older, as a filtered one is, says nothing of the
-angle.
+An angle that is late lags the integrated speed by age times speed; one of wrong gain, by a share of the way. Both are followed
+over a tenth of a second and fitted together, because otherwise a gain error of seven hundredths looks like an age. Neither
+signal can be ahead of the motor: a speed that is older than the angle, as a filtered one is, says nothing about the angle.
 """
 
 from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
-#: Time over which angle and speed are followed, s: that of a stroke, over which neither an offset of the speed nor a slip of
-#: the resolver adds up. Time over which what they said is kept, s: some stops.
+#: Time over which angle and speed are followed, s: that of a stroke, in which neither an offset of the speed nor a slip of the
+#: resolver adds up much. Time over which the normal equations forget, s: some stops.
 _FOLLOWED_S, _KEPT_S = 0.1, 60.0
 #: Noise of the angle less integrated speed, rad, standard deviation: 0.3 rad/s of the speed, added up over the time above in
-#: samples of 4 ms, make 0.004, a resolver's own error of ten arc minutes 0.003, counts 0.002. Samples that share it: those of
-#: the time above.
+#: samples of 4 ms, make 0.004, a resolver's own error of ten arc minutes 0.003, counts 0.002. Number of samples with the same
+#: error: those of the time above.
 _NOISE_RAD, _ALIKE = 0.01, 25.0
-#: Standard deviation of ages before anything is known, s: a value of any moment of the last cycle of 4 ms. The oldest, s: a
-#: sample, a frame and a gateway each a cycle late; an older one is a fault that `plausibility` tells.
+#: Standard deviation of the age before anything is known, s: any moment of the last cycle of 4 ms. Largest age, s: sample,
+#: frame and gateway each a cycle late; `plausibility` finds an older angle as a fault.
 _AGE_S, _OLDEST_S = 0.002, 0.015
-#: Standard deviation of a resolver's gain, share; and what the trapezoid may miss of the way of a stroke: where a motor goes
-#: over from speeding up at 8000 rad/s2 to its full speed T^2 / 8 of that, twice, on some 10 rad.
+#: Standard deviation of a resolver's gain, share; and share of a stroke's way that the trapezoidal rule may miss: T² / 8 of an
+#: acceleration of 8000 rad/s² at each of its two changes, on some 10 rad.
 _GAIN, _MISSED = 0.02, 0.003
-#: Standard deviations by which a gain is sure.
+#: Standard deviations from which a gain error is certain.
 _SURELY = 3.0
-#: How much further off than the oldest angle makes it a sample may be, rad: ten times its noise; beyond is another fault's.
+#: Difference (rad) beyond that of the largest age up to which a sample is used: ten times its noise. More is another fault.
 _BEYOND_RAD = 0.1
 
 #: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. The others:
-#: normal equations of the two, and ``age`` s as they solve them; ``gain``: share by which ways are surely off, or 0.
+#: normal equations of age and gain, and their solution: ``age`` s, and ``gain``, the gain error if it is certain, or 0.
 LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age gain"), align=True)
 
 
 @njit
-def follow(a, travel, turned, gained, dt):
+def follow(a: Record, travel: float, turned: float, gained: float, dt: float) -> None:
     """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s."""
     keep = exp(-dt / _FOLLOWED_S)
     a.apart = keep * a.apart + travel - turned
@@ -59,6 +58,6 @@ def follow(a, travel, turned, gained, dt):
 
 
 @njit
-def interrupt(a):
-    """A sample was missing or was no motion."""
+def interrupt(a: Record) -> None:
+    """Begin to follow anew after a missing sample or a standstill."""
     a.apart = a.gained = a.gone = 0.0

@@ -1,31 +1,31 @@
 """Plausibility between the force paths: whether they contradict each other, and which of them is wrong.
 
-The filter's normalised innovation says by how many of its own standard deviations the torque is off what stiffness and
-everything learned let expect. Its squares, less what model errors may make of them, are summed one-sidedly (Page, "Continuous
-inspection schemes", Biometrika 41, 1954): a few samples far off or many less far off raise the alarm, and as many good ones
-end it. Which path is wrong is decided by what only one of them uses:
+The filter's normalised innovation is the difference between the torque and what the stiffness path and the learned errors
+predict, in its standard deviations. Its squares, less what model errors account for, are summed one-sidedly (Page, "Continuous
+inspection schemes", Biometrika 41, 1954): a few large differences or many smaller ones raise the alarm, and as many good
+samples end it. Which path is wrong is decided by the sensor that only one of them uses:
 
     resolver   angle and speed repeat to the bit although torque or speed must turn the motor, the angle stands while the
                torque swings up and down by more than friction at rest can carry, or the angle does not follow the speed
     current    repeats to the bit, or asks for force while the pads do not touch
 
-Otherwise it stays open; then stiffness goes on, and its standard deviation covers the difference.
+Otherwise it is undecided: the estimate goes on with the stiffness path, and its standard deviation covers the difference.
 """
 
 from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import fields, njit
+from emb_daemon.jit import Record, fields, njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
-#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``held_low``, ``held_high``: between
-#: what it has been since the angle left ``held_angle`` (rad), ``held`` samples ago, or the torque last swung, ``swings`` times
-#: since then, upwards (``swing`` 1) or downwards (-1); ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s),
-#: ``due_angle`` (rad): how it should have turned.
+#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one. The angle has stood at
+#: ``held_angle`` (rad) for ``held`` samples; meanwhile the torque swung ``swings`` times, the last time upwards (``swing`` 1)
+#: or downwards (-1); ``held_low``, ``held_high``: its least and largest value since the last swing. ``due_acceleration``
+#: (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must have caused since.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -40,44 +40,47 @@ PLAUSIBILITY = np.dtype(
     align=True,
 )
 
-#: What `watch` finds: both paths agree, or the one that is wrong, or that it is one of them.
+#: What `watch` finds: both paths agree, the path that is wrong, or that one of them is wrong but not which.
 AGREE, TORQUE_WRONG, TORQUE_FROZEN, STIFFNESS_WRONG, UNDECIDED = range(5)
 
-#: Squared normalised innovation that model errors make, at most counted, and sums that raise and end the alarm. Innovations
-#: of twelve standard deviations raise it within five samples, of six within forty, of four never. No log of the simulated
-#: rig, with effects that its calibration does not know, brings the sum above a third of the alarm.
+#: Squared normalised innovation that is attributed to model errors, the most that one sample counts, and the sums that raise
+#: and end the alarm. Innovations of twelve standard deviations raise it within five samples, of six within forty, of four
+#: never. No log of the simulated rig, with effects that its calibration does not know, reaches a third of the alarm.
 _TOLERATED, _COUNTED, _RAISE, _CLEAR = 20.0, 144.0, 600.0, 150.0
-#: Times as much before the contact angle is confirmed.
+#: Factor on the sum that raises the alarm while the contact angle is not confirmed.
 _UNCONFIRMED = 5.0
-#: Samples that repeat to the bit although torque should change them, or although the speed is not zero.
+#: Number of samples that repeat to the bit although the torque should change them, or although the speed is not zero, from
+#: which the sensor counts as frozen.
 _REPEATED, _NEVER_REPEATED = 8, 50
-#: A speed that has changed in so many samples while the angle stood is noise, and noise does not repeat to the bit so often:
-#: at one repetition in five by chance, once in 1e8.
+#: A speed that changed in `_FLICKERED` samples while the angle stood is noise, which does not repeat to the bit `_FROZEN`
+#: times in a row: with one repetition in five by chance, once in 1e8.
 _FLICKERED, _FROZEN = 50, 12
-#: Time constant over which angle and integrated speed are compared (s), and their difference that is a fault (rad) beyond what
-#: a signal delay of 10 ms makes. A resolver is believed again after this many samples in each of which the angle moved
-#: and went where the speed says within this angle (rad).
+#: Time constant over which angle and integrated speed are compared (s), and difference (rad) that is a fault, in addition to
+#: what a signal delay of `_DELAY_S` causes. A resolver is believed again after `_RETURNED` samples in which the angle moved
+#: and followed the speed within `_ALIKE_RAD`.
 _COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
 _STICTION = 0.3
 #: Standard deviations of one sample's torque that its mean over `_AVERAGED_S` does not reach.
 _CERTAIN = 6.0
-#: An angle that stands changes by less, rad: three counts of a resolver of 12 bit. By so many times as much may friction turn
-#: over as the calibration's does within that.
+#: Change below which an angle counts as standing, rad: three counts of a resolver of 12 bit; and factor on the share of
+#: friction that may turn over within it, over the calibration's.
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
-#: Angle by which a motor must have turned to be contradicted by one that stands, rad: eight times as much it would turn from
-#: rest where in truth it came from one side and went back there. And the torque's standard deviations that do not turn it:
-#: chance shows as much in one sample of 700, and this takes three in a row.
+#: Angle that the torque must have turned the motor by, rad, to contradict an angle that stands: eight times what is computed
+#: from rest for a motor that in truth came from one side and went back there. Torque beyond friction, in standard deviations,
+#: that noise may cause: one sample of 700 has more, and three in a row are needed.
 _DUE_RAD, BEYOND_CHANCE = 10.0 * _STANDS_RAD, 3.0
-#: Standard deviations of the contact angle by which the motor is clear of it when the pads do not touch.
+#: Distance from the contact angle, in its standard deviations, from which the pads certainly do not touch.
 _CLEAR_OF_CONTACT = 6.0
 #: Time over which torque is averaged when it must do without the resolver, s.
 _AVERAGED_S = 0.04
 
 
 @njit
-def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirmed):
+def watch(
+    c: Record, m: Record, angle_before: float, speed_before: float, past_contact: float, contact_sigma: float, confirmed: bool
+) -> int:
     """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is of those before.
 
     Args:
@@ -107,7 +110,7 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
     if was == STIFFNESS_WRONG:
         c.frozen_s += m.dt
         if c.alike >= _RETURNED:
-            # What was summed against the resolver is not held against the current.
+            # The sum was the resolver's fault, and must not count against the current.
             c.contradiction = c.apart = c.frozen_s = 0.0
             c.verdict = AGREE
         return c.verdict
@@ -136,21 +139,24 @@ def watch(c, m, angle_before, speed_before, past_contact, contact_sigma, confirm
 
 
 @njit
-def frozen(c):
-    """Whether one sensor repeats itself while the other goes on: then their difference tells nothing of the contact angle."""
+def frozen(c: Record) -> bool:
+    """Whether one sensor repeats its value while the other changes: then their difference says nothing about the contact
+    angle."""
     return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
 
 
 @njit
-def beyond_friction(torque, force, sigma, gear_gain, load_friction, offset_friction):
-    """Torque (N m) that neither the clamp force ``force`` (N) nor friction at rest can carry, in units of its standard
-    deviation ``sigma``: where it is not zero, the motor turns."""
+def beyond_friction(
+    torque: float, force: float, sigma: float, gear_gain: float, load_friction: float, offset_friction: float
+) -> float:
+    """Torque that neither the clamp force ``force`` (N) nor friction at rest can carry, over its standard deviation ``sigma``
+    (N m); where it is not zero, the motor turns."""
     band = (1.0 + _STICTION) * (offset_friction + load_friction * force)
     return max(abs(torque - gear_gain * force) - band, 0.0) / sigma
 
 
 @njit
-def stands(c, angle):
+def stands(c: Record, angle: float) -> bool:
     """Whether the motor angle ``angle``, rad, stands."""
     if abs(angle - c.held_angle) <= _STANDS_RAD:
         c.held += 1
@@ -162,10 +168,13 @@ def stands(c, angle):
 
 
 @njit
-def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_angle):
-    """How often the motor must have turned though the angle stands: the smoothed torque went up or down by more than friction
-    at rest carries in both directions under a clamp force of ``force`` N, as far as it turns over within that angle. Once
-    alone may be an offset of the current, there and back is none.
+def hold(
+    c: Record, force: float, sigma: float, gear_gain: float, load_friction: float, offset_friction: float,
+    presliding_angle: float,
+) -> int:  # fmt: skip
+    """How often the motor must have turned although the angle stands: number of times that the smoothed torque rose or fell by
+    more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as friction turns over
+    within that angle. A single swing may be an offset of the current, a swing back cannot.
 
     ``sigma``: standard deviation of the torque, N m; ``presliding_angle`` rad."""
     c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
@@ -180,14 +189,14 @@ def hold(c, force, sigma, gear_gain, load_friction, offset_friction, presliding_
 
 
 @njit
-def due(c, acceleration, delay, dt):
-    """Whether the motor must have turned though the angle stands, which is ``delay`` s late, by an ``acceleration``, rad/s²,
-    that is beyond doubt."""
-    # What a torque does at a sample it has done since the last only if it did it then: it may have just begun.
+def due(c: Record, acceleration: float, delay: float, dt: float) -> bool:
+    """Whether the motor must have turned although the angle, which is ``delay`` s late, stands; ``acceleration``, rad/s²: what
+    the torque causes at least."""
+    # The torque may have begun just before this sample: only what it also did at the last one has lasted a cycle.
     lasting = min(acceleration, c.due_acceleration)
     c.due_acceleration = acceleration
     if c.held < 2:
-        # Any acceleration turns a motor that comes in back to where it was a sample ago.
+        # A motor that arrives and turns round is where it was a sample ago, whatever the acceleration.
         return False
     c.due_speed = c.due_speed + lasting * dt if lasting > 0.0 else 0.0
     c.due_angle += c.due_speed * dt
@@ -195,14 +204,14 @@ def due(c, acceleration, delay, dt):
 
 
 @njit
-def disbelieve_resolver(c):
-    """Until the angle moves as the speed says."""
+def disbelieve_resolver(c: Record) -> None:
+    """Use the resolver no more until its angle moves as the speed says."""
     if c.verdict != STIFFNESS_WRONG:
         c.verdict, c.alike, c.frozen_s = STIFFNESS_WRONG, 0, _AVERAGED_S
 
 
 @njit
-def count_contradiction(c, ratio):
+def count_contradiction(c: Record, ratio: float) -> None:
     """Add one contradiction, in standard deviations, to the sum; NaN says nothing."""
     if np.isfinite(ratio):
         total = max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0)
@@ -210,14 +219,16 @@ def count_contradiction(c, ratio):
 
 
 @njit
-def force_of_torque_alone(c, torque, has_current, dt, gear_gain, load_friction, offset_friction):
+def force_of_torque_alone(
+    c: Record, torque: float, has_current: bool, dt: float, gear_gain: float, load_friction: float, offset_friction: float
+) -> tuple[float, float]:
     """Clamp force (N) and its standard deviation from motor torque without a resolver.
 
-    Which way friction acts and what accelerates the motor is unknown: friction counts in full, and inertia as the torque's
-    own variation over `_AVERAGED_S`, which is kept up to date here and so must be called with every sample.
+    The direction of friction and the motor's acceleration are unknown: friction counts in full, and inertia as the torque's
+    variation over `_AVERAGED_S`. Must be called with every sample, because it keeps that variation up to date.
     """
     if has_current:
-        # The first torque counts in full: a start may be clamped.
+        # The first torque counts in full, because the brake may be clamped at the start.
         share = 1.0 - exp(-dt / _AVERAGED_S) if c.averaged else 1.0
         c.averaged = True
         off = torque - c.torque_mean

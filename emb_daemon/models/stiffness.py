@@ -9,11 +9,11 @@ from math import exp
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Floats, njit
 
 
 @njit
-def characteristic_curve(x, coefficients):
+def characteristic_curve(x: float, coefficients: Floats) -> tuple[float, float]:
     """Static clamp force (N) and its slope (N/rad) at ``x`` rad past contact; zero in the clearance.
 
     ``coefficients[n]`` in N/rad^(n+1): the thesis's A0, A1, A2 of F = A0 x + A1 x^2 + A2 x^3.
@@ -28,7 +28,7 @@ def characteristic_curve(x, coefficients):
 
 
 @njit
-def mean_slope(x, spread, coefficients):
+def mean_slope(x: float, spread: float, coefficients: Floats) -> float:
     """Slope (N/rad) of the curve between ``spread`` rad below and above ``x``: what the force tells of an uncertain contact
     angle (statistical linearisation; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 5). Not zero just before contact."""
     above, _ = characteristic_curve(x + spread, coefficients)
@@ -44,7 +44,7 @@ def _short_of(x, force, coefficients):
 
 
 @njit
-def travel_at(force, coefficients):
+def travel_at(force: float, coefficients: Floats) -> float:
     """Travel past contact (rad) at which a rising curve reaches ``force`` (N), or where it stops rising below; infinite beyond
     1000 rad."""
     low, high = 0.0, 1.0
@@ -62,7 +62,7 @@ def travel_at(force, coefficients):
 
 
 @njit
-def first_order_lag(state, before, now, dt, time_constant):
+def first_order_lag(state: float, before: float, now: float, dt: float, time_constant: float) -> float:
     """State after ``dt`` of tau dy/dt + y = u, with u running straight from ``before`` to ``now``: exact for such inputs.
 
     A time constant of zero lets ``now`` through.

@@ -12,7 +12,7 @@ loses the other gains, for any k(T) and C(T).
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Floats, Record, njit
 
 STEFAN_BOLTZMANN = 5.670374419e-8
 KELVIN = 273.15
@@ -29,17 +29,17 @@ LONGEST_S = 0.25
 def mesh(thickness: float) -> np.ndarray:
     """Node positions (m, shape (NODES,)) from the friction surface to the backing plate, spacing growing by a tenth.
 
-    More growth resolves the surface better and thermocouples near the backing plate worse.
+    A larger growth would resolve the surface better, and the region of thermocouples near the backing plate worse.
     """
     steps = _GROWTH ** np.arange(NODES - 1)
     return np.concatenate([[0.0], np.cumsum(steps / steps.sum())]) * thickness
 
 
 @njit
-def at_depth(temperatures, positions, depth):
+def at_depth(temperatures: Floats, positions: Floats, depth: float) -> float:
     """Temperature at ``depth`` m from the friction surface; NaN beyond the pad.
 
-    A cubic through the four nodes around it: a straight line would lose more between two nodes than the mesh itself does.
+    A cubic through the four nodes around it: linear interpolation would have a larger error than the mesh itself.
     """
     if depth > positions[-1] + 1e-9:
         return np.nan
@@ -58,7 +58,7 @@ def at_depth(temperatures, positions, depth):
 
 
 @njit
-def mean_temperature(temperatures, positions):
+def mean_temperature(temperatures: Floats, positions: Floats) -> float:
     """Mean over the thickness."""
     total = 0.0
     for node in range(len(positions) - 1):
@@ -67,13 +67,13 @@ def mean_temperature(temperatures, positions):
 
 
 @njit
-def conductance(p, below, above, distance):
+def conductance(p: Record, below: float, above: float, distance: float) -> float:
     """W/(m^2 K) between two nodes at temperatures ``below`` and ``above``, for k = k0 (1 + k1 (T - 20 degC))."""
     return p.conductivity * (1.0 + p.conductivity_rise * (0.5 * (below + above) - REFERENCE_C)) / distance
 
 
 @njit
-def disc_loss(p, disc, ambient, wheel_speed):
+def disc_loss(p: Record, disc: float, ambient: float, wheel_speed: float) -> float:
     """W/K from disc to surroundings: convection rising with wheel speed (rad/s; thesis 8.2), and radiation."""
     hot, cold = disc + KELVIN, ambient + KELVIN
     radiation = p.disc_radiating_area * STEFAN_BOLTZMANN * (hot + cold) * (hot * hot + cold * cold)
@@ -150,8 +150,9 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
 
 @njit
 def heat_step(
-    p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work, longest=LONGEST_S
-):
+    p: Record, pads: Floats, disc: float, inner_backplate: float, outer_backplate: float, ambient: float, power: float,
+    braking: bool, wheel_speed: float, dt: float, work: Floats, longest: float,
+) -> float:  # fmt: skip
     """Advance pads and disc by ``dt`` seconds.
 
     Args:
@@ -161,7 +162,7 @@ def heat_step(
         inner_backplate, outer_backplate: measured, degC.
         power: friction power of both pads, W, mean over the step.
         braking: pads press on the disc and exchange heat by contact; else across a gap, which the wheel ventilates.
-        longest: s, of the steps that it is done in.
+        longest: length of a single step at most, s.
         work: scratch, shape (4, CHAIN).
 
     Returns:
@@ -176,11 +177,11 @@ def heat_step(
 
 
 @njit
-def friction_power(p, force, wheel_speed, surface):
+def friction_power(p: Record, force: float, wheel_speed: float, surface: float) -> float:
     """Friction power of both pads in W without a brake torque sensor (thesis 8.5).
 
     2 mu r F w, the friction coefficient interpolated from a table over clamp force (N), disc speed (rad/s) and surface
-    temperature (degC); held at its edges, because a table knows nothing beyond them.
+    temperature (degC), constant beyond its edges.
     """
     if force <= 0.0 or wheel_speed <= 0.0:
         return 0.0
@@ -211,7 +212,7 @@ def _cell(grid, value):
 
 
 @njit
-def stiffness_factor(p, rise, history):
+def stiffness_factor(p: Record, rise: float, history: float) -> float:
     """alpha: stiffness over that of the cold pads (thesis 8.4), from the mean pad temperature and its history.
 
     ``rise`` K is the present mean over the temperature at which the curve was identified (thesis T_p,c, equation 8-10; not

@@ -9,32 +9,34 @@ from math import exp
 
 from emb_daemon.jit import njit
 
-#: Time over which turning back is counted, s: a dozen samples. One reversal makes 0.08 of it.
+#: Time constant over which reversals are counted, s: a dozen samples. One reversal adds 0.08 to the share.
 _OF_LATE_S = 0.05
-#: Share of turning back beyond which an angle's motion is noise: that turns back in two of three samples, in every other if it
-#: is a noisy speed added up, and a motor that swings at 10 Hz in one of twelve.
+#: Share of samples with a reversal above which an angle's motion is noise. Noise of the angle reverses in two of three
+#: samples, a sum of noisy speeds in every other, a motor that swings at 10 Hz in one of twelve.
 NOISE_TURNS_BACK = 0.15
 
 
 @njit
-def turned_back(share, direction, travel, dt):
-    """Share of the samples in which the motor turned back of late, after one of ``travel`` rad in ``dt`` s; ``direction``: its
-    last way, any size."""
+def turned_back(share: float, direction: float, travel: float, dt: float) -> float:
+    """Share of recent samples with a reversal of the motor, after a sample of ``travel`` rad in ``dt`` s; the sign of
+    ``direction`` is that of the last motion."""
     return share + ((travel * direction < 0.0) - share) * min(dt / _OF_LATE_S, 1.0)
 
 
 @njit
-def slid_angle(before, angle, flicker):
+def slid_angle(before: float, angle: float, flicker: float) -> float:
     """Angle that the gear has slid to: it follows ``angle`` once that leaves ``before`` by more than ``flicker`` rad.
 
-    A reading that flickers between two counts at standstill would otherwise turn the friction state over and over, until it
-    forgets which way the motor came.
+    Otherwise a reading that flickers between two counts at standstill would turn the friction state over again and again, and
+    the direction from which the motor came would be lost.
     """
     return min(max(before, angle - flicker), angle + flicker)
 
 
 @njit
-def friction_state(state, variance, travel, presliding_angle, dissolving_rate, dt):
+def friction_state(
+    state: float, variance: float, travel: float, presliding_angle: float, dissolving_rate: float, dt: float
+) -> tuple[float, float, float]:
     """Friction state s in [-1, 1] after ``travel`` rad of sliding, its mean over the travel, and its variance.
 
     Starts unknown (variance 1) and becomes known by sliding; at standstill vibration dissolves the memory at
@@ -54,7 +56,9 @@ def friction_state(state, variance, travel, presliding_angle, dissolving_rate, d
 
 
 @njit
-def unexplained_torque(motor_torque, inertia, speed_change, dt, offset_friction, friction_mean):
+def unexplained_torque(
+    motor_torque: float, inertia: float, speed_change: float, dt: float, offset_friction: float, friction_mean: float
+) -> float:
     """Motor torque (N m) that inertia and the friction offset leave to the clamp force, mean over the cycle.
 
     The current is a mean over the cycle, so the matching inertia term is J dw/dt between the samples that bound it.
@@ -63,6 +67,6 @@ def unexplained_torque(motor_torque, inertia, speed_change, dt, offset_friction,
 
 
 @njit
-def torque_balance(torque, leverage):
+def torque_balance(torque: float, leverage: float) -> float:
     """Clamp force in N from ``torque`` N m left to it and its ``leverage`` gamma + mu s in m/rad. Thesis 4-3."""
     return torque / leverage

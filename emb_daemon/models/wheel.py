@@ -4,7 +4,7 @@ from math import floor, pi
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
 #: Speed above which a wheel turns, rad/s: sensors' noise at standstill stays below.
@@ -16,7 +16,7 @@ WHEEL = np.dtype([("known", "?"), ("count", "f8"), ("turned", "f8")], align=True
 
 
 @njit
-def track(s, pulse, wheel_speed, dt):
+def track(s: Record, pulse: float, wheel_speed: float, dt: float) -> float:
     """Wheel angle in rad: carried on by ``wheel_speed`` rad/s, corrected when the pulse counter has moved."""
     width = 2.0 * pi / PULSES_PER_TURN
     if not s.known:
@@ -25,13 +25,13 @@ def track(s, pulse, wheel_speed, dt):
         s.turned = (pulse + 0.5) * width
         return s.turned
     s.turned += wheel_speed * dt
-    # Of the counts that the counter may stand for, the one nearest to where the speed has carried the wheel.
+    # The counter wraps: of all counts that it may mean, take the one nearest to the carried angle.
     wraps = floor((s.turned / width - 0.5 - pulse) / PULSE_MODULO + 0.5)
     count = pulse + wraps * PULSE_MODULO
     if count != s.count:
         s.count = count
         error = (s.count + 0.5) * width - s.turned
-        # More than two pulses off is no interpolation error: frames were missing.
+        # An error of more than two pulses is no interpolation error: frames were missing.
         s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
     return s.turned
 

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,7 @@ class Corner:
 
     def __init__(self, name: str, cycles_ns: list[int]):
         self.name = name
-        self.streams = [Stream(cycle) for cycle in cycles_ns]
+        self.streams: list[Stream] = [Stream(cycle) for cycle in cycles_ns]
         #: [second, largest usable force in kN, number of forces], the newest last.
         self._seconds: deque[list] = deque(maxlen=HISTORY_S + 1)
         self._reference_kN, self._reference_ns = math.nan, 0
@@ -128,7 +129,7 @@ class Corner:
         status = self.streams[ESTIMATOR_STATUS]
         return contract.reason_words(status.values[3]) if status.values else ()
 
-    def state(self, now_ns: int) -> dict:
+    def state(self, now_ns: int) -> dict[str, Any]:
         """Everything known, for scripts. None: not received yet, or not to be used by the sender's Status."""
         force, heat, status, request = (
             self.streams[kind] for kind in (CLAMP_FORCE, PAD_TEMP, ESTIMATOR_STATUS, ADAPT_REQUEST)
@@ -202,7 +203,7 @@ class Listener:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.corners = [Corner(name, self._cycles) for name in CORNERS]
+        self.corners: list[Corner] = [Corner(name, self._cycles) for name in CORNERS]
 
     def hear(self, frames: np.ndarray) -> None:
         for time_ns, data, can_id, length, flags in frames.tolist():

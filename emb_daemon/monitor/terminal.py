@@ -9,6 +9,7 @@ import tty
 
 from emb_daemon.errors import Unavailable
 from emb_daemon.monitor.listener import SECOND_NS, Listener
+from emb_daemon.runtime.bus import Bus
 
 _DRAIN_S, _DRAW_NS = 0.05, 250_000_000
 #: Time to wait for the first frame: a running daemon sends every 4 ms, but its bus may not be up yet.
@@ -39,14 +40,14 @@ def _keys():
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
-def _listener(bus) -> Listener:
+def _listener(bus: Bus) -> Listener:
     """A listener that begins now: the socket's buffer holds only part of the frames that came while the program loaded."""
     listener = Listener()
     bus.drain()
     return listener
 
 
-def watch(bus, title: str) -> None:
+def watch(bus: Bus, title: str) -> None:
     """Show broadcasts on the terminal until the user quits."""
     from rich.console import Console
     from rich.live import Live
@@ -72,7 +73,7 @@ def watch(bus, title: str) -> None:
                 live.update(render(listener, now, title, width, height, paused), refresh=True)
 
 
-def listen(bus) -> tuple[Listener, int]:
+def listen(bus: Bus) -> tuple[Listener, int]:
     """Listen until one complete second of the clock was received; returns listener and time.
 
     Raises:

@@ -7,13 +7,15 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any, Protocol
 
 from emb_daemon.errors import Unavailable
 from emb_daemon.monitor.listener import HISTORY_S, Listener
 from emb_daemon.monitor.metrics import exposition
+from emb_daemon.runtime.bus import Bus
 
 #: Period of taking frames and sending datagrams, s; period for browsers, which draw a minute on some hundred pixels, s.
 _HEAR_S, _SHOW_S = 0.02, 0.1
@@ -22,7 +24,7 @@ _PAGE = Path(__file__).with_name("page.html")
 _HISTORY = round(HISTORY_S / _SHOW_S)
 
 
-def state(listener: Listener, now_ns: int) -> dict:
+def state(listener: Listener, now_ns: int) -> dict[str, Any]:
     """State of all corners; times in s, on the machine's clock."""
     return {"timestamp": time.time(), "corners": {corner.name: corner.state(now_ns) for corner in listener.heard}}
 
@@ -61,7 +63,7 @@ class Web:
         except OSError as error:
             raise Unavailable(f"--web {port}: {error.strerror}") from None
         self._server.daemon_threads = True
-        self.port = self._server.server_address[1]
+        self.port: int = self._server.server_address[1]
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def show(self, listener: Listener, now_ns: int) -> None:
@@ -146,7 +148,13 @@ class Datagrams:
         self._socket.close()
 
 
-def hand_out(bus, receivers: list, stopped: Callable[[], bool]) -> None:
+class Receiver(Protocol):
+    """Who is shown the bus's state."""
+
+    def show(self, listener: Listener, now_ns: int) -> None: ...
+
+
+def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool]) -> None:
     """Receive a bus for ``receivers``, until ``stopped()``."""
     listener = Listener()
     bus.drain()

@@ -1,8 +1,8 @@
 """Least squares through the estimator: few parameters, many samples, most parameters belonging to one log.
 
-`scipy.optimize.least_squares` searches. What it is given is the problem reduced to as many rows as there are parameters and
-one more (an orthogonal reduction, block by block, which changes neither cost nor gradient nor Gauss-Newton matrix), so that
-the Jacobian of half a million samples, most of it zeros, never stands in memory.
+`scipy.optimize.least_squares` searches over a problem that is reduced to one row more than there are parameters (an orthogonal
+reduction, block by block, which changes neither cost nor gradient nor Gauss-Newton matrix), so that the Jacobian of half a
+million samples, most of it zeros, is never stored.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -22,10 +22,10 @@ class Free:
 
     Attributes:
         start: where the search begins.
-        step: of the derivative's difference quotient: small, but visible in the residual.
+        step: of the derivative's difference quotient: small, but large enough to change the residual.
         low, high: bounds.
         prior: (mean, standard deviation) of what is known beforehand; residuals then have to be in units of their own standard
-            deviation, or the two cannot be weighed against each other.
+            deviation, or the two are not weighted correctly.
         logarithmic: searched as a logarithm, for positive parameters of unknown size. ``step`` and the prior's deviation are
             then relative, and the prior's mean is still a value.
     """
@@ -45,10 +45,10 @@ class Block:
     Attributes:
         residual: from values by key (those in ``keys`` at least) to residuals, shape (n,), all finite.
         keys: parameters that these residuals depend on; only they are moved for the derivative.
-        episode: number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated; what happens in
-            one episode says little about the next, so that episodes are what the covariance counts.
-        derivative: from values to the derivatives of the residuals, shape (n, keys), where something better than difference
-            quotients is known.
+        episode: number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated within an episode
+            and nearly independent between episodes, so that the covariance is computed over episodes.
+        derivative: from values to the derivatives of the residuals, shape (n, keys), if they are known better than by
+            difference quotients.
     """
 
     residual: Callable[[Values], np.ndarray]
@@ -63,9 +63,9 @@ class Fit:
 
     Attributes:
         values: by key.
-        sigmas: standard deviations by key, infinite where neither residuals nor prior say anything.
+        sigmas: standard deviations by key, infinite where neither residuals nor prior determine it.
         covariance: of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out;
-            Wu, Annals of Statistics 14, 1986), which stays honest with few episodes, and the priors' own part.
+            Wu, Annals of Statistics 14, 1986), which is not too small with few episodes, and the priors' part.
         residuals: one array per block.
         from_prior: share of each parameter's information that is its prior's, 0 to 1.
     """
@@ -89,7 +89,7 @@ class Fit:
 
 
 def fit(blocks: Sequence[Block], free: Mapping[Hashable, Free], *, tolerance: float = 1e-8, evaluations: int = 100) -> Fit:
-    """Values that make the residuals small.
+    """Least-squares estimate.
 
     Args:
         tolerance: relative fall of the cost that ends the search.
@@ -124,8 +124,8 @@ def fit(blocks: Sequence[Block], free: Mapping[Hashable, Free], *, tolerance: fl
 
 
 def _triangle(tall: np.ndarray) -> np.ndarray:
-    """R of a QR decomposition, by pieces small enough that no BLAS shares them among threads, which would wait for each
-    other on a busy machine."""
+    """R of a QR decomposition, in pieces so small that no BLAS distributes them over threads, which is slow on a busy
+    machine."""
     count = tall.shape[1]
     rows = max(256, 4 * count)
     pieces = np.zeros((-(-len(tall) // rows), rows, count))
@@ -263,7 +263,7 @@ def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None 
     return covariance
 
 
-def valley(cost: Callable[[float], float], grid: np.ndarray, **options) -> float:
+def valley(cost: Callable[[float], float], grid: np.ndarray, **options: float) -> float:
     """Where a cost is least: over a grid, which finds the valley, then between the neighbours of the best.
 
     ``options``: of `scipy.optimize.minimize_scalar`."""

@@ -1,4 +1,4 @@
-"""What an error of a clamp force is like, as the filter needs it: how large, and how long it stays."""
+"""Size and correlation time of a clamp force's error, as the filter needs them."""
 
 from collections.abc import Iterable
 
@@ -7,10 +7,10 @@ import numpy as np
 from emb_daemon.estimator.unknown import GAIN_SIGMA
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Cycles up to which an error is followed, ten seconds, and correlation below which nothing of it is left.
+#: Largest lag of an autocorrelation, in cycles: ten seconds; correlation below which it counts as zero.
 _LAGS, _GONE = 2500, 0.05
-#: Share of the largest load from which a relative error is looked for, cycles of a manoeuvre, how many of them must show it,
-#: and standard errors of their mean by which it is more than chance.
+#: Least load for a relative error, as a share of the largest; cycles of a manoeuvre; least number of manoeuvres, and least
+#: mean in its standard errors, from which a lasting error is accepted.
 _LOADED, _MANOEUVRE, _MANOEUVRES, _SURE = 0.1, 250, 8, 3.0
 
 
@@ -18,17 +18,17 @@ def autocorrelation(series: list[np.ndarray], lags: int) -> np.ndarray:
     """Covariance at lags 0 to ``lags``, shape (lags + 1,), over gap-free series of zero mean."""
     total, count = np.zeros(lags + 1), np.zeros(lags + 1)
     for s in series:
-        # By the spectrum, padded with as many zeros as no lag wraps around.
+        # By the spectrum, zero-padded so that no lag wraps around.
         total += np.fft.irfft(np.abs(np.fft.rfft(s, 2 * len(s))) ** 2)[: lags + 1]
         count += len(s) - np.arange(lags + 1)
     return total / np.maximum(count, 1)
 
 
 def integral_time(series: list[np.ndarray]) -> float:
-    """Seconds over which an error stays: the integral of its autocorrelation up to the first lag at which it is gone.
+    """Correlation time of an error, s: the integral of its autocorrelation up to the first lag at which it counts as zero.
 
-    A first-order process with this time constant has the error's own density at the slow end of the spectrum, where the
-    filter works; white parts shorten it as they should.
+    A first-order process with this time constant has the error's spectral density at low frequency, where the filter works; a
+    white part of the error makes it shorter.
     """
     covariance = autocorrelation(series, min(_LAGS, min(len(s) for s in series) // 4))
     correlation = covariance / covariance[0]
@@ -55,10 +55,11 @@ def force_error_levels(errors: np.ndarray, force: np.ndarray) -> tuple[float, fl
 
 
 def lasting_share(pairs: Iterable[tuple[np.ndarray, np.ndarray]], largest: float) -> float:
-    """Relative error of a torque that lasts for a manoeuvre; 0 where noise may be all of it. What the estimator grants any
-    torque constant does not count.
+    """Relative error of a torque that lasts for a manoeuvre; 0 if noise may explain it. The estimator's prior of the torque
+    constant is subtracted.
 
-    The two halves of a manoeuvre err alike by what lasts and not by noise: the mean of their errors' products is its variance.
+    Both halves of a manoeuvre have the same lasting error and independent noise, so that the mean product of their errors is
+    its variance.
 
     Args:
         pairs: error and load of gap-free series, one value for each cycle, in the same unit.

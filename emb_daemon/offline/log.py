@@ -1,5 +1,6 @@
 """A log, read once: samples by the daemon's own pipeline, slow channels, and what reference instruments measured."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,13 +15,13 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.frames import EXTENDED, FRAME
 from emb_daemon.wire.layout import CORNERS
 
-#: Samples that a pipeline takes in one call; a log is collected piece by piece.
+#: Samples that a pipeline takes in one call; a log is collected in pieces.
 CAPACITY = 1 << 14
 
 
 @dataclass(frozen=True)
 class SlowChannels:
-    """What is sent more rarely than the motor's frames, at its own times and signal names of dbc/emb.dbc.
+    """Messages with a longer period than the motor's, at their own times, with the signal names of dbc/emb.dbc.
 
     Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out.
     """
@@ -39,7 +40,7 @@ class Log:
         time_ns: of each sample, on the log's clock.
         reference: rig instruments; empty in a car.
         force_N: reference clamp force at each sample, NaN where none was recorded.
-        frames: FRAME array of the slow messages, from which `slow` is decoded when it is asked for.
+        frames: FRAME array of the slow messages, from which `slow` is decoded when it is used.
     """
 
     path: Path
@@ -66,7 +67,7 @@ def _slow_messages(corner: str) -> tuple[str, str, str]:
     return f"EMB_{corner}_Thermocouple", "VEH_WheelSpeed", "VEH_Status"
 
 
-def load_log(path: str | Path, corner: str = "FL", read=read_frames) -> Log:
+def load_log(path: str | Path, corner: str = "FL", read: Callable[[Path], np.ndarray] = read_frames) -> Log:
     """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
 
     Raises:
@@ -101,7 +102,7 @@ def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
 
 
 def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -> Log:
-    """A corner's samples with what its frames say beside them; errors as in `log_of`."""
+    """A corner's samples and references as a `Log`; errors as in `log_of`."""
     decoder = Decoder()
     if not len(samples):
         raise InputError(f"{path}: {_why_empty(frames, corner, decoder.can_id(f'EMB_{corner}_Resolver'))}")
@@ -112,7 +113,7 @@ def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -
 
 
 def _why_empty(frames: np.ndarray, corner: str, resolver_id: int) -> str:
-    """Why frames hold no resolver sample of a corner, and what helps."""
+    """Why frames contain no resolver sample of a corner, and what to do."""
     mine = frames["can_id"] == resolver_id
     if (frames["flags"][mine] & EXTENDED == 0).any():
         return f"no resolver sample of corner {corner} that passes its CRC and counter check"

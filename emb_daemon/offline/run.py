@@ -2,15 +2,16 @@
 
 One convention for the start, the estimator's own at power-on: at the first sample the motor stands, contact lies
 ``parameters["clearance"]`` ahead of its angle, forces have settled there, friction is unknown and nothing is hot. A caller who
-knows the contact angle says so by the clearance: ``contact_angle - samples["angle"][0]``. The settled start is what makes a
-piece out of the middle of a log, which may begin clamped, like a log of its own; a released brake settles at zero force, where
-the whole step begins too, so that paths and whole step give the same forces to the last bit (`tests/test_offline.py`).
+knows the contact angle sets the clearance to ``contact_angle - samples["angle"][0]``. Because forces start settled, a part of
+a log may begin clamped; a released brake starts at zero force, as in the whole step, so that paths and whole step give the
+same forces to the last bit (`tests/test_offline.py`).
 
-What fits move are PARAMETERS; records are cheap, so that callers copy and change them freely.
+Fits change PARAMETERS; records are small, so that callers copy and change them freely.
 """
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
@@ -117,7 +118,7 @@ def _run_step(samples, parameters, states, estimate, out, heat):
 def held(parameters: np.ndarray | np.void) -> np.ndarray:
     """PARAMETERS, shape (1,), with which the step does not learn the contact angle.
 
-    Learning spreads an error of one path over both and hides a slow effect in an angle that wanders.
+    Learning would spread an error of one path over both, and hide a slow effect in a changing contact angle.
     """
     fixed = np.atleast_1d(parameters).copy()
     fixed["clearance_sigma"] = 0.0
@@ -136,7 +137,10 @@ def run_step(samples: np.ndarray, parameters: np.ndarray | np.void, heat: np.nda
 
 
 def estimate(
-    samples: np.ndarray, parameters: np.ndarray | np.void, state: np.ndarray | None = None, adaptation=None
+    samples: np.ndarray,
+    parameters: np.ndarray | np.void,
+    state: np.ndarray | None = None,
+    adaptation: Adaptation | None = None,
 ) -> np.ndarray:
     """The whole step as the daemon runs it; returns ESTIMATE rows.
 

@@ -1,6 +1,7 @@
 """Error figures of estimates against reference instruments: the one module in which an RMSE is computed."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
 _MOVING = 5.0
-#: Reference force (N) below which the pads hang in the clearance.
+#: Reference force (N) below which the pads do not touch.
 _CLEARANCE_N = 100.0
 #: Surface temperature (degC) above which the pads are hot.
 _HOT_C = 100.0
@@ -66,17 +67,17 @@ def conditions(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarr
 
 
 def is_turning(samples: np.ndarray) -> np.ndarray:
-    """Where the disc turns."""
+    """Mask of the rows in which the disc turns."""
     return samples["has_wheel_speed"] & (samples["wheel_speed"] > TURNING_RAD_PER_S)
 
 
 def first_known(estimates: np.ndarray) -> int:
-    """First of the ESTIMATE rows that knows the contact angle; before it the fused force says that it knows nothing. The first
-    of all if none does: then there is nothing else to judge."""
+    """First ESTIMATE row with a known contact angle; before it the fused force is flagged as unknown. 0 if there is none, so
+    that all rows are judged."""
     return int(np.argmax((estimates["source"] == FUSED) & (estimates["reasons"] & CONTACT_UNCERTAIN == 0)))
 
 
-def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict:
+def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.ndarray) -> dict[str, Any]:
     """Figures in N for each force path, and the share of fused errors inside two sigma; empty without a reference.
 
     The fused force is judged from `first_known` on; ``unknown_samples`` counts what comes before, or all if the contact angle
@@ -98,7 +99,7 @@ def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.nd
     return result
 
 
-def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: References) -> dict:
+def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: References) -> dict[str, dict[str, float]]:
     """Figures in K for each pad and depth and for the disc, at the reference's own times; empty without a reference."""
     result: dict = {}
     errors = []

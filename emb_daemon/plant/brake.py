@@ -4,7 +4,7 @@ from math import cos, exp, sin
 
 import numpy as np
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
 #: Temperature (degC) at which effects of heat are zero, and at which magnets have their full strength.
@@ -21,7 +21,7 @@ POWER, SATURATION, ONSET = range(3)
 
 
 @njit
-def turned(p, angle):
+def turned(p: Record, angle: float) -> float:
     """Angle (rad) by which a constant gear would have moved the pads as far; everything behind the gear depends on it."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
         return angle
@@ -29,20 +29,20 @@ def turned(p, angle):
 
 
 @njit
-def slope_at(p, angle):
+def slope_at(p: Record, angle: float) -> float:
     """Slope of `turned`, by differences over two intervals of the table; 1 for a constant gear."""
     reach = p.travel_angle[1]
     return (turned(p, angle + reach) - turned(p, angle - reach)) / (2.0 * reach) if reach > 0.0 else 1.0
 
 
 @njit
-def gear_load(p, s):
+def gear_load(p: Record, s: Record) -> float:
     """Force (N) of pads and release spring on the gear's output."""
     return s.force + p.release_spring * p.gear_gain * max(turned(p, s.angle), 0.0)
 
 
 @njit
-def motor_angle(p, x):
+def motor_angle(p: Record, x: float) -> float:
     """Motor angle (rad) at which `turned` is ``x``."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
         return x
@@ -57,7 +57,7 @@ def _along(x, xs, ys):
 
 
 @njit
-def static_curve(p, x):
+def static_curve(p: Record, x: float) -> float:
     """Cold static clamp force (N) at ``x`` rad past contact."""
     if x <= 0.0:
         return 0.0
@@ -68,7 +68,7 @@ def static_curve(p, x):
 
 
 @njit
-def static_angle(p, force):
+def static_angle(p: Record, force: float) -> float:
     """Angle past contact (rad) at which the cold static curve reaches ``force`` N, by bisection."""
     if force <= 0.0:
         return 0.0
@@ -119,7 +119,7 @@ def _shaped(e, x):
 
 
 @njit
-def drawn(e, s, place):
+def drawn(e: Record, s: Record, place: int) -> float:
     """Amount that one drawn effect adds."""
     if e.size == 0.0:
         return 0.0
@@ -133,7 +133,7 @@ def drawn(e, s, place):
 
 
 @njit
-def grown(p, s):
+def grown(p: Record, s: Record) -> float:
     """Motor angle (rad) by which pads and disc are thicker than when cold and new: thickness variation over the turn, growth
     with the disc's temperature, less wear."""
     e = p.effects
@@ -171,7 +171,7 @@ def _cold_viscosity(p, s):
 
 
 @njit
-def move_motor(p, s, demand):
+def move_motor(p: Record, s: Record, demand: float) -> None:
     """One sub-step of current, motor and gear under a current ``demand`` in A."""
     e, h = p.effects, SUBSTEP_S
     if s.latched:
@@ -227,7 +227,7 @@ def _settle(state, before, now, time_constant):
 
 
 @njit
-def clamp(p, s):
+def clamp(p: Record, s: Record) -> None:
     """One sub-step of the clamp force: backlash, static curve, slip, relaxations.
 
     The first relaxation is the thesis's (3.3.2): force lags the motor angle, so that a fast stroke returns more work to the
@@ -278,13 +278,13 @@ def _earlier(s, history, delay, largest):
 
 
 @njit
-def delayed_angle(p, s):
+def delayed_angle(p: Record, s: Record) -> float:
     """Angle that the resolver measures now: the motor angle ``signal_delay`` ago."""
     return _earlier(s, s.angle_history, p.effects.signal_delay.delay_s, HISTORY - 2.0)
 
 
 @njit
-def delayed_mean_current(p, s):
+def delayed_mean_current(p: Record, s: Record) -> float:
     """Current that the sensor measures now: the mean over a cycle that ended ``current_delay`` ago."""
     delay, total = p.effects.current_delay.delay_s, 0.0
     for step in range(SUBSTEPS):

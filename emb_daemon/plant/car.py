@@ -368,9 +368,9 @@ class Car:
     ):
         if len(plants) != len(corners):
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
-        self.plants = np.ascontiguousarray(plants, PLANT)
-        self.corners = tuple(corners)
-        self.states = np.zeros(len(plants), PLANT_STATE)
+        self.plants: np.ndarray = np.ascontiguousarray(plants, PLANT)
+        self.corners: tuple[str, ...] = tuple(corners)
+        self.states: np.ndarray = np.zeros(len(plants), PLANT_STATE)
         for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
             self.states[field] = ambient
         self.states["stiffness_factor"] = 1.0
@@ -379,10 +379,10 @@ class Car:
         self.states["angle_reading"] = self.plants["released_angle"]
         self.states["past_contact"] = -self.plants["contact_angle"]
         self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
-        self.trainings = np.zeros(len(plants), TRAINING)
-        self.truth = np.zeros(len(plants), TRUTH)
+        self.trainings: np.ndarray = np.zeros(len(plants), TRAINING)
+        self.truth: np.ndarray = np.zeros(len(plants), TRUTH)
         self._rng = rng = np.random.default_rng(seed)
-        self.motion = np.zeros(1, CAR)
+        self.motion: np.ndarray = np.zeros(1, CAR)
         motion = self.motion[0]
         # A medium-sized car; each simulated brake stops a quarter of it.
         motion["mass"], motion["wheel_radius"] = 400.0 * len(corners), 0.31

@@ -4,7 +4,7 @@ The controller may use signals that no car can measure. The motion then has no e
 tested.
 """
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.plant.brake import gear_load, motor_angle, slope_at, static_angle
 from emb_daemon.plant.records import ANGLE, FORCE, LATCH, SUBSTEP_S
 from emb_daemon.wire.contract import CYCLE_S
@@ -22,7 +22,7 @@ _FORCE_BAND_N, _FORCE_BAND = 20.0, 0.005
 
 
 @njit
-def set_target(p, s, mode, target, rate):
+def set_target(p: Record, s: Record, mode: int, target: float, rate: float) -> None:
     """Position target for the coming cycle from a command."""
     s.target_rate = 0.0
     s.latched = mode == LATCH
@@ -45,7 +45,7 @@ def set_target(p, s, mode, target, rate):
 
 
 @njit
-def current_demand(p, s):
+def current_demand(p: Record, s: Record) -> float:
     """Current (A) that the position and speed loops ask for, one sub-step."""
     error = s.position_target - s.angle
     if abs(error) <= _AT_TARGET_RAD:

@@ -6,7 +6,7 @@ are states.
 
 from math import ceil
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.plant.brake import drawn
 from emb_daemon.plant.records import CELLS
 from emb_daemon.wire.contract import CYCLE_S
@@ -18,13 +18,13 @@ _CELL_M = 0.0004
 
 
 @njit
-def cell_count(p):
+def cell_count(p: Record) -> int:
     """Cells in use through one pad: near 0.4 mm each."""
     return min(max(ceil(p.pad_thickness / _CELL_M), 5), CELLS)
 
 
 @njit
-def pad_mean(p, s, side):
+def pad_mean(p: Record, s: Record, side: int) -> float:
     """Mean temperature of one pad."""
     cells = cell_count(p)
     total = 0.0
@@ -34,7 +34,7 @@ def pad_mean(p, s, side):
 
 
 @njit
-def pad_at(p, s, side, depth):
+def pad_at(p: Record, s: Record, side: int, depth: float) -> float:
     """Temperature ``depth`` m below a pad's friction surface, linear between surface, cell centres and the plate's face;
     the pad's own plate face beyond its thickness."""
     cells = cell_count(p)
@@ -49,7 +49,7 @@ def pad_at(p, s, side, depth):
 
 
 @njit
-def friction_of_pads(p, s, wheel_speed):
+def friction_of_pads(p: Record, s: Record, wheel_speed: float) -> float:
     """Friction coefficient between pads and disc."""
     surface = 0.5 * (s.surface[0] + s.surface[1])
     value = p.friction_coefficient + p.friction_per_K * (surface - _REFERENCE_C)
@@ -62,7 +62,7 @@ def friction_of_pads(p, s, wheel_speed):
 
 
 @njit
-def heat_cycle(p, s, wheel_speed, ambient):
+def heat_cycle(p: Record, s: Record, wheel_speed: float, ambient: float) -> None:
     """One 4 ms cycle of all temperatures, and of what depends on them: friction torque, wear, softening."""
     e, dt = p.effects, CYCLE_S
     # Friction that depends on brake torque uses the torque of the previous cycle.

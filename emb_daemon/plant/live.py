@@ -3,9 +3,12 @@
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import CYCLE_NS
 from emb_daemon.plant.scenarios import Schedule, commands_of
+from emb_daemon.runtime.bus import Bus
 
 #: If the machine delays the frames of a cycle by more than this, they are lost, as on a real bus; the car's time and counters
 #: follow the clock.
@@ -21,19 +24,24 @@ class LiveCar:
         lost: cycles whose frames were not sent at all because their time had passed.
     """
 
-    def __init__(self, car: Car, bus, schedule: Schedule):
+    def __init__(self, car: Car, bus: Bus, schedule: Schedule):
         self.car = car
         self._bus = bus
         self._drives = schedule.drives
         self._commands = commands_of(schedule, car.corners)
-        self.ticks = self.late = self.lost = 0
+        self.ticks: int = 0
+        self.late: int = 0
+        self.lost: int = 0
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, what a cycle calls; the car stays as it is."""
         spare = Car(self.car.plants, self.car.corners)
         spare.hear(spare.tick(self._commands[0], self._drives[0]))
 
-    def run(self, stopped: Callable[[], bool], seconds: float | None = None, sent=None, heard=None) -> None:
+    def run(
+        self, stopped: Callable[[], bool], seconds: float | None = None, sent: Callable[[int, np.ndarray], None] | None = None,
+        heard: Callable[[np.ndarray], None] | None = None,
+    ) -> None:  # fmt: skip
         """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;
@@ -57,7 +65,7 @@ class LiveCar:
             deadline += CYCLE_NS
             self._listen(deadline, heard)
 
-    def _listen(self, deadline: int, heard) -> None:
+    def _listen(self, deadline: int, heard: Callable[[np.ndarray], None] | None) -> None:
         while True:
             remaining = deadline - time.monotonic_ns()
             if remaining > 0:

@@ -219,7 +219,7 @@ def simulate_log(
     seed: int = 0,
     corners: tuple[str, ...] = ("FL",),
     reference: bool = True,
-    **car_options,
+    **car_options: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A whole log at once, reproducible from its seed.
 

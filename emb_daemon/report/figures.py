@@ -3,8 +3,12 @@
 import base64
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 ACCENT = "#0b5cad"
 INK = "#1d2430"
@@ -201,11 +205,11 @@ class _Detail:
         return {"times": name, "values": base64.b64encode(np.ascontiguousarray(y, dtype="<f4").tobytes()).decode()}
 
 
-def time_figure(panels: list[Panel]):
+def time_figure(panels: list[Panel]) -> "Figure":
     """Panels over one time axis; zooming one zooms all, down to single samples. Shown points are decimated; peaks stay."""
     return _figure(panels, "time / s", reduce=True, shared=True)
 
 
-def xy_figure(panels: list[Panel], x_title: str):
+def xy_figure(panels: list[Panel], x_title: str) -> "Figure":
     """Panels over a quantity other than time."""
     return _figure(panels, x_title, reduce=False, shared=len(panels) > 1)

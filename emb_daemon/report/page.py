@@ -1,11 +1,16 @@
 """The page: verdict, sections, tables. Everything is inside one file; nothing is loaded from elsewhere."""
 
 import html
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.report.figures import SCREEN_POINTS
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 PASS, FAIL = "pass", "fail"
 _STYLE, _DRAW = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
@@ -42,7 +47,7 @@ class Section:
         self._parts.append("<ul>" + "".join(f"<li>{html.escape(text)}</li>" for text in texts) + "</ul>")
         return self
 
-    def table(self, columns: list[str], rows: list[list], caption: str = "") -> "Section":
+    def table(self, columns: list[str], rows: Sequence[Sequence[object]], caption: str = "") -> "Section":
         """A table; a column in which every entry begins with a digit or a sign is aligned right.
 
         Entries are texts or `Cell`."""
@@ -70,7 +75,7 @@ class Section:
         )
         return self
 
-    def figure(self, figure, caption: str = "") -> "Section":
+    def figure(self, figure: "Figure", caption: str = "") -> "Section":
         """A plotly figure as `report.figures` builds them."""
         name = self._page.add_figure(figure)
         height = figure.layout.height or 400
@@ -108,7 +113,7 @@ class Page:
         self._sections.append(section)
         return section.text(text) if text else section
 
-    def add_figure(self, figure) -> str:
+    def add_figure(self, figure: "Figure") -> str:
         """Keep a figure's data; returns the element id that holds them."""
         self._figures.append(_inside_script(figure.to_json()))
         return f"f{len(self._figures)}"

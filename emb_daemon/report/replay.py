@@ -1,6 +1,8 @@
 """The page of a replay: estimates, errors and events of a drive on one time axis."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,9 +10,13 @@ from emb_daemon import __version__
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.offline.score import PATHS, figures, share_inside
+from emb_daemon.replay import Result
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
+
+if TYPE_CHECKING:
+    from emb_daemon.adapt.memory import Store
 
 #: Shortest interval that is visible on the complete time axis, as a share of it; intervals closer together are drawn as one.
 _SEEN = 1.0 / 1000.0
@@ -187,7 +193,10 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
     )
 
 
-def replay_page(results: list, corner: str, described: str, learned=None, calibration: Calibration | None = None) -> Page:
+def replay_page(
+    results: Sequence[Result], corner: str, described: str, learned: "Store | None" = None,
+    calibration: Calibration | None = None,
+) -> Page:  # fmt: skip
     """The page of one or more `replay.Result`, in sequence as one drive.
 
     Args:

@@ -4,6 +4,7 @@ import select
 import time
 from collections import deque
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -11,12 +12,49 @@ from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
 from emb_daemon.wire.frames import FRAME, row_of
 
+if TYPE_CHECKING:
+    from can import Message
+
 #: Number of sent frames whose echo may still be outstanding; four corners send 16 in their busiest tick.
 _ECHOES = 256
 
 
+class Bus(Protocol):
+    """What the loop, the monitor and the workshop's servers call; `RawCanSocket` and `PythonCanBus` say more of each.
+
+    Attributes:
+        dropped, unsent: frames that the receiver had no room for, and that the bus did not accept.
+        down, full: the bus cannot be used now; the last drain may have left frames waiting.
+    """
+
+    dropped: int
+    unsent: int
+    down: bool
+    full: bool
+
+    def wait(self, timeout_s: float) -> bool: ...
+
+    def drain(self) -> np.ndarray: ...
+
+    def send(self, frames: np.ndarray) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class PythonCan(Protocol):
+    """What is called of a python-can bus."""
+
+    def fileno(self) -> int: ...
+
+    def recv(self, timeout_s: float, /) -> "Message | None": ...
+
+    def send(self, message: "Message", /) -> None: ...
+
+    def shutdown(self) -> None: ...
+
+
 class PythonCanBus:
-    """A bus that python-can drives, frame by frame; same interface as RawCanSocket.
+    """A bus that python-can drives, frame by frame.
 
     Args:
         ids: of the frames to receive, all of them 11 bits long; error frames are received too.
@@ -24,7 +62,7 @@ class PythonCanBus:
             to one just sent is taken for its echo.
     """
 
-    def __init__(self, bus, ids: list[int], echoes: bool = False):
+    def __init__(self, bus: PythonCan, ids: list[int], echoes: bool = False):
         self._bus = bus
         # python-can's own filters are not used: where it applies them in software, recv(0) returns None for a frame that
         # they leave out, as for an empty queue.
@@ -32,8 +70,10 @@ class PythonCanBus:
         self._early = deque()
         self._echoes = deque(maxlen=_ECHOES) if echoes else None
         self._frames = np.zeros(4096, FRAME)
-        self.dropped = self.unsent = 0
-        self.down = self.full = False
+        self.dropped: int = 0
+        self.unsent: int = 0
+        self.down: bool = False
+        self.full: bool = False
         try:
             self._fd = bus.fileno()
         except NotImplementedError:
@@ -94,19 +134,25 @@ class PythonCanBus:
         for frame in frames:
             data = int(frame["data"]).to_bytes(8, "little")
             message = can.Message(arbitration_id=int(frame["can_id"]), data=data, is_extended_id=False)
-            try:
-                self._bus.send(message)
-            except can.CanError:
-                self.unsent += 1
-                continue
-            if self._echoes is not None:
+            if self._hand_over(message) and self._echoes is not None:
                 self._echoes.append((message.arbitration_id, data))
+
+    def _hand_over(self, message: "Message") -> bool:
+        """Whether the bus has accepted a message; counted if not."""
+        import can
+
+        try:
+            self._bus.send(message)
+        except can.CanError:
+            self.unsent += 1
+            return False
+        return True
 
     def close(self) -> None:
         self._bus.shutdown()
 
 
-def open_bus(interface: str | None, channel: str | None, ids: list[int], **options):
+def open_bus(interface: str | None, channel: str | None, ids: list[int], **options: object) -> Bus:
     """Open the bus that the arguments, can.conf and the CAN_* variables name, receiving ``ids`` only.
 
     SocketCAN goes through `RawCanSocket`, everything else through python-can.
@@ -122,7 +168,7 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
     return PythonCanBus(_open(chosen), ids, echoes=chosen["interface"] == "udp_multicast")
 
 
-def open_python_can(options: dict):
+def open_python_can(options: dict[str, Any]) -> PythonCan:
     """python-can's own bus, unfiltered, by the options of `open_bus`; errors as there."""
     return _open(_choose_options(options))
 
@@ -137,7 +183,7 @@ def _choose_options(given: dict) -> dict:
         raise InputError(f"bus: {error}; name one with --interface and --channel") from None
 
 
-def _open(chosen: dict):
+def _open(chosen: dict[str, Any]) -> PythonCan:
     import can
 
     try:

@@ -23,6 +23,7 @@ from emb_daemon.estimator.records import ESTIMATE, STATE
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, Pipeline
+from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
 from emb_daemon.runtime.shared import SharedEstimates
@@ -131,15 +132,16 @@ class Daemon:
         ticks, missed: periods run, and periods in which the loop did not wake.
     """
 
-    def __init__(self, setup: Setup, bus, manager: ServiceManager | None = None, state: Path | None = None):
+    def __init__(self, setup: Setup, bus: Bus, manager: ServiceManager | None = None, state: Path | None = None):
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
         self._adaptation = Adaptation(setup.calibrations, Memory(state), _real_time, threaded=True) if state else None
         corners = tuple(setup.configuration.corners)
-        self.pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
+        self.pipeline: Pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self._shared: SharedEstimates | None = None
-        self.ticks = self.missed = 0
+        self.ticks: int = 0
+        self.missed: int = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)
         #: Ticks run and missed until the last decision about the watchdog; since then: corners estimated, and corners whose
         #: state is not a number.
@@ -204,7 +206,7 @@ class Daemon:
         arrivals, reported = self._arrivals.copy(), self._reported.copy()
         _scan(scratch.estimates, count, scratch.states, scratch.receptions, arrivals, reported)
         if self._adaptation:
-            self._adaptation.warm_up(scratch)
+            self._adaptation.warm_up(scratch.states[0], scratch.parameters[0])
         wait()
         self._warm_up_answers(scratch)
         self._bus.drain()

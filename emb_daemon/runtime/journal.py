@@ -9,7 +9,7 @@ import sys
 _JOURNAL = "/run/systemd/journal/socket"
 _PRIORITY = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 
-log = logging.getLogger("emb_daemon")
+log: logging.Logger = logging.getLogger("emb_daemon")
 
 
 class JournalHandler(logging.Handler):

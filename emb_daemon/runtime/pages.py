@@ -81,8 +81,9 @@ class Request:
     """A page requested at ``asked_ns``, the calibrations ``read`` for it by ``read_ns``, and who waits for the answer."""
 
     def __init__(self, page: Page):
-        self.page, self.asked_ns = page, time.monotonic_ns()
-        self.read: dict = {}
+        self.page = page
+        self.asked_ns: int = time.monotonic_ns()
+        self.read: dict[str, Calibration] = {}
         self.read_ns: int | None = None
         #: Why the page is refused; the check sets it to nothing if the page is good.
         self.fault = "could not be checked"

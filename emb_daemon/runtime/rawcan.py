@@ -12,6 +12,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -146,7 +147,7 @@ class RawCanSocket:
         full: the last drain took as much as it can; more may be waiting.
     """
 
-    def __init__(self, sock: socket.socket, stamped: bool = False, reopen=None):
+    def __init__(self, sock: socket.socket, stamped: bool = False, reopen: Callable[[], socket.socket] | None = None):
         self._socket, self._reopen = sock, reopen
         frame_bytes = _CAN_FRAME.itemsize if stamped else _CAN_FRAME_BYTES
         self._received = _Batch(frame_bytes, control=True)
@@ -157,9 +158,10 @@ class RawCanSocket:
         self._looked_ns = self._latest_ns = time.monotonic_ns()
         self._reopen_ns: int | None = None
         self._offset_ns = time.time_ns() - time.monotonic_ns()
-        self.dropped = 0
-        self.unsent = 0
-        self.down = self.full = False
+        self.dropped: int = 0
+        self.unsent: int = 0
+        self.down: bool = False
+        self.full: bool = False
         # Compile now, not when the first frame is waiting.
         self._take(0, self._looked_ns)
         _to_kernel(self._frames[:0], 0, self._sent.raw)

@@ -1,9 +1,9 @@
 """A bus that passes on only authentic frames and authenticates sent ones, and the counters that must survive a restart."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -12,6 +12,7 @@ from msgspec import Meta
 from emb_daemon.adapt import files
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.errors import InputError, Unavailable
+from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.journal import log
 from emb_daemon.wire.keys import cmac
 from emb_daemon.wire.secoc import LAST_TRIP, Link, Signer, Verifier
@@ -38,7 +39,7 @@ class FreshnessFile:
     """The freshness values of one state directory."""
 
     def __init__(self, folder: Path):
-        self.path = Path(folder) / "freshness.json"
+        self.path: Path = Path(folder) / "freshness.json"
 
     def load(self) -> Freshness:
         """The stored values; none without a file. A damaged file is set aside. Without values old messages are accepted."""
@@ -101,11 +102,12 @@ class Authentication:
         kept: Freshness,
         file: FreshnessFile | None = None,
     ):
-        self.keyless = [link for link in (*received, *sent) if link.name not in keys]
+        self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]
         macs = {link.name: cmac(keys[link.name]) for link in (*received, *sent) if link.name in keys}
         self._kept, self._file = kept, file
         self._verifier = Verifier(received, macs, kept.heard)
-        self.verify, self.sign = self._verifier.verify, Signer(sent, macs, kept.trip).sign
+        self.verify: Callable[[np.ndarray], np.ndarray] = self._verifier.verify
+        self.sign: Callable[[np.ndarray], np.ndarray] = Signer(sent, macs, kept.trip).sign
         self._writer: threading.Thread | None = None
 
     def stale(self) -> bool:
@@ -138,11 +140,11 @@ class SecuredBus:
     #: Number of frames between two checks of whether the counters must be stored.
     _FRAMES = 4096
 
-    def __init__(self, bus, authentication: Authentication):
+    def __init__(self, bus: Bus, authentication: Authentication):
         self._bus, self._authentication = bus, authentication
         self._heard = 0
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
 
     def drain(self) -> np.ndarray:
@@ -162,7 +164,7 @@ class SecuredBus:
         self._bus.close()
 
 
-def secure(bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]:
+def secure(bus: Bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]:
     """The daemon's end of an authenticated bus, and the corners of which a key is missing.
 
     Raises:

@@ -12,6 +12,7 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
+from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.layout import CORNERS
 
 #: Rows in the ring: two seconds of four corners at 250 Hz, enough for a reader of lowest priority.
@@ -57,7 +58,7 @@ class SharedEstimates:
         pipeline: whose rows and parameters are shared.
     """
 
-    def __init__(self, path: Path, pipeline):
+    def __init__(self, path: Path, pipeline: Pipeline):
         """Raises OSError if the file cannot be written."""
         content = np.zeros((), SHARED)
         content["layout"], content["parameters"] = LAYOUT_DIGEST, pipeline.parameters
@@ -110,8 +111,9 @@ class EstimatesReader:
     """
 
     def __init__(self, path: Path):
-        self.path, self.trouble = path, ""
-        self.parameters = np.zeros(len(CORNERS), PARAMETERS)
+        self.path = path
+        self.trouble: str = ""
+        self.parameters: np.ndarray = np.zeros(len(CORNERS), PARAMETERS)
         self._inode = self._taken = self._seen = 0
         self._memory: mmap.mmap | None = None
 

@@ -1,6 +1,11 @@
 """The frame record that every source and sink of CAN traffic shares."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from can import Message
 
 #: ``time_ns`` nanoseconds on the source's clock; ``can_id`` without flag bits; ``flags`` as below; ``data`` the eight
 #: payload bytes as a little-endian integer, zero beyond ``length``.
@@ -11,7 +16,7 @@ EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
 UNAUTHENTIC = 16
 
 
-def row_of(message, time_ns: int) -> tuple[int, int, int, int, int]:
+def row_of(message: "Message", time_ns: int) -> tuple[int, int, int, int, int]:
     """A python-can Message as a FRAME row; of CAN FD's payload the first eight bytes."""
     flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame
     flags |= ERROR * message.is_error_frame | FD * message.is_fd

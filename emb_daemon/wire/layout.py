@@ -6,14 +6,18 @@ signal is in which column.
 
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.jit import njit
+from emb_daemon.jit import Record, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.units import conversion
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
 
 CORNERS = ("FL", "FR", "RL", "RR")
 
@@ -83,7 +87,7 @@ LAYOUT = np.dtype(
 
 
 @njit
-def unpack(data, signal):
+def unpack(data: int, signal: Record) -> float:
     """Physical value of one signal (a SIGNAL record) in a little-endian payload."""
     raw = np.int64((np.uint64(data) >> np.uint64(signal.start)) & ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)))
     if signal.signed and raw >> (signal.length - 1):
@@ -92,7 +96,7 @@ def unpack(data, signal):
 
 
 @njit
-def pack(value, signal):
+def pack(value: float, signal: Record) -> int:
     """The bits of one signal, at their place in the payload; a value beyond the signal's range saturates, NaN is ``low``."""
     if not value > signal.low:
         value = signal.low
@@ -103,7 +107,7 @@ def pack(value, signal):
     return (np.uint64(raw) & mask) << np.uint64(signal.start)
 
 
-def signal_columns(database, message: str, names: tuple[str, ...]):
+def signal_columns(database: "Database", message: str, names: tuple[str, ...]) -> np.ndarray:
     """SIGNAL records of the named signals of a cantools message.
 
     Raises:
@@ -131,7 +135,7 @@ def signal_columns(database, message: str, names: tuple[str, ...]):
     return columns
 
 
-def load_database(path: Path, strict: bool = True):
+def load_database(path: Path, strict: bool = True) -> "Database":
     """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252).
 
     Args:

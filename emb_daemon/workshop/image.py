@@ -46,7 +46,7 @@ class Image:
     """
 
     def __init__(self, version: bytes):
-        self.parameters = np.zeros(len(CORNERS), PARAMETERS)
+        self.parameters: np.ndarray = np.zeros(len(CORNERS), PARAMETERS)
         self._pages = [bytes(_PAGE_BYTES)] * len(CORNERS)
         self._version = version
         places = [_place(index) for index in range(len(INPUTS) + len(OUTPUTS))]

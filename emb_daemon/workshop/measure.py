@@ -16,6 +16,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import Unavailable
+from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.pages import Answer, Page, PageClient, socket_path
 from emb_daemon.runtime.shared import EstimatesReader
 from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
@@ -56,10 +57,10 @@ class Udp:
             # Without this option an unconnected socket gets no error when the master has ended.
             self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
         self._socket.setblocking(False)
-        self.port = self._socket.getsockname()[1]
+        self.port: int = self._socket.getsockname()[1]
         self._master = None
         self._counter = 0
-        self.gone = False
+        self.gone: bool = False
 
     def wait(self, timeout_s: float) -> None:
         select.select([self._socket], [], [], timeout_s)
@@ -121,7 +122,7 @@ class Can:
     #: On a bus the end of a master cannot be detected.
     gone = False
 
-    def __init__(self, bus, request_id: int, response_id: int):
+    def __init__(self, bus: Bus, request_id: int, response_id: int):
         self._bus, self._request_id, self._response_id = bus, request_id, response_id
 
     def wait(self, timeout_s: float) -> None:
@@ -159,10 +160,12 @@ class Measurement:
     """
 
     def __init__(
-        self, estimates: Path, transport, version: bytes, name: bytes, file: bytes,
+        self, estimates: Path, transport: Udp | Can, version: bytes, name: bytes, file: bytes,
         calibrations: Mapping[str, Calibration] | None = None,
     ):  # fmt: skip
-        self.reader, self.transport, self._image = EstimatesReader(estimates), transport, Image(version)
+        self.reader: EstimatesReader = EstimatesReader(estimates)
+        self.transport = transport
+        self._image = Image(version)
         self._pages = PageClient(socket_path(estimates))
         segment = Segment(calibrations, self._ask, lambda: self.reader.on_page) if calibrations is not None else None
         self._slave = Slave(self._image, transport.layer, time.monotonic_ns, name, file, segment)

@@ -54,7 +54,8 @@ class Segment:
         self._files = struct.pack(f"<{len(values)}d", *values)
         self._working = self._taken = self._files
         self._used = FILES
-        self.shown, self.size = WORKING, len(self._files)
+        self.shown: int = WORKING
+        self.size: int = len(self._files)
 
     def read(self, address: int, size: int) -> bytes | None:
         """``size`` bytes of the shown page; None if not all of them can be read."""

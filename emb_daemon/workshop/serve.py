@@ -16,6 +16,7 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash, load_calibration
 from emb_daemon.errors import InputError
 from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.runtime.bus import Bus
 from emb_daemon.wire.contract import INIT, INVALID
 from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
 from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP
@@ -89,14 +90,15 @@ class Diagnostics:
         trouble: why the trouble codes could not be stored the last time; empty if they could.
     """
 
-    def __init__(self, bus, configuration: Path, state: Path, request_id: int, response_id: int):
+    def __init__(self, bus: Bus, configuration: Path, state: Path, request_id: int, response_id: int):
         """Raises InputErrors for a faulty configuration, OSError for a folder that cannot be written, ImportError without
         can-isotp."""
         import isotp
 
         self._bus, self._request_id = bus, request_id
-        self.trouble = ""
-        self.listener, self.memory = Listener(), TroubleMemory(state)
+        self.trouble: str = ""
+        self.listener: Listener = Listener()
+        self.memory: TroubleMemory = TroubleMemory(state)
         self._judged = [0] * len(CORNERS)
         self._server = Server(self.memory, data_of(configuration, state, self.listener.corners))
         self._requests: list = []

@@ -99,8 +99,9 @@ class TroubleMemory:
 
     def __init__(self, folder: Path):
         """Read the stored codes, and begin an operation cycle. Raises OSError if the folder cannot be written."""
-        self.path, self.warning = folder / FILE, ""
-        self.entries = {code: Entry() for code in _INDEX}
+        self.path: Path = folder / FILE
+        self.warning: str = ""
+        self.entries: dict[int, Entry] = {code: Entry() for code in _INDEX}
         self._row = [0] * CODES
         self._dirty_s: float | None = None
         try:
@@ -111,7 +112,7 @@ class TroubleMemory:
         except FileNotFoundError:
             pass
         except (ValueError, OSError) as error:
-            self.warning = f"{self.path}: {error}, {files.set_aside(self.path)}"
+            self.warning: str = f"{self.path}: {error}, {files.set_aside(self.path)}"
         for entry in self.entries.values():
             _begin_cycle(entry)
         self.save()

@@ -104,7 +104,7 @@ class Slave:
     ):  # fmt: skip
         self._memory, self._transport, self._clock, self._segment = memory, transport, clock, segment
         self._texts = {0: name, 1: name, 4: file}
-        self.connected = False
+        self.connected: bool = False
         self._reset()
         commands = READING if segment is None else READING | CALIBRATING
         self._commands = {command.code: command for command in commands.values()}

@@ -1,7 +1,7 @@
-"""What the other steps' models lack: the campaign's residual goes through the search that ``diagnose`` makes.
+"""What the other steps' models lack: the search of ``diagnose`` on the campaign's residuals.
 
-Known effects first, then terms of the grammar. What is accepted stands in the calibration; what is left is said, and is in
-sigma.
+Effects of the catalogue first, then terms of the grammar. What is accepted goes into the calibration; what remains is
+reported, and enlarges sigma.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ from emb_daemon.offline import Log
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
 
-#: Share of the motor's largest speed from which a clamp shows lag and inertia as random motion does.
+#: Share of the motor's largest speed from which a clamp shows lag and inertia as well as random motion.
 _FAST = 0.5
 
 
@@ -41,9 +41,10 @@ class AttributionStep(Step):
         calibration: with what was accepted.
         diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
         hot: errors of the stiffness path on the logs that heat the pads.
-        hot_current: current that stays unexplained there.
+        hot_current: current that is unexplained there.
         fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
-        undecided: shares of the force by which what was found might be another, by key of the noise that is to hold them.
+        undecided: relative force by which alternatives to what was found differ from it, by the key of ``noise`` that must
+            cover it.
     """
 
     calibration: Calibration
@@ -54,9 +55,9 @@ class AttributionStep(Step):
     undecided: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, fold: Fold) -> Calibration:
-        """What is known of a fold's pads without their random logs: found effects, and the torque path, by other pads' logs.
+        """What is known of a fold's pads without their random logs: found effects and torque path, from other pads' logs.
 
-        A found effect of the stiffness path goes with the curves and dynamics that were fitted beside it."""
+        A found effect of the stiffness path is used with the curves and dynamics that were fitted with it."""
         if self.diagnosis is None:
             return moved(self.calibration, fold.values)
         selection, values = self.diagnosis.selection, dict(fold.values)
@@ -83,10 +84,10 @@ def _others(bench: Bench, gone: Sequence[bool]) -> np.ndarray:
 
 
 def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, progress: Progress) -> AttributionStep:
-    """Effects and terms that curves, random logs and ``hot`` ones, which heat the pads, prove beside ``known``.
+    """Effects and terms that curves, random logs and ``hot`` logs, which heat the pads, prove in addition to ``known``.
 
-    Nothing where no log clamps fast: slow motion leaves inertia and relaxation to the datasheet, and a search that may move
-    them all would find what they are not."""
+    Nothing if no log clamps fast: slow motion does not show inertia and relaxation, so that a search would attribute their
+    errors to something else."""
     fast = _fastest(hot) > _FAST * known.motor.maximum_speed_rad_per_s
     if not fast and not any(pads.random for pads in stiffness.pads):
         return _unsearched(hot, known)
@@ -112,8 +113,8 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
 
 
 def _contact(selection: Selection, known: Calibration, drives: int) -> Contact:
-    """The contact as known, and as unsure as the fit of what was found leaves it: by how much it moves that of logs from
-    number ``drives`` on, which fitted no curve and start from what is known."""
+    """The contact as known, with the uncertainty that the fit of what was found leaves: how far it moves the contact angle of
+    logs from number ``drives`` on, which fitted no curve."""
     clearances = [value for c, value in selection.applied().items() if c.name == CLEARANCE and c.log >= drives]
     off = [clearance - known.contact.clearance_rad for clearance in clearances]
     sigma = np.hypot(known.contact.clearance_sigma_rad, rmse(np.array(off)) if off else 0.0)
@@ -121,7 +122,7 @@ def _contact(selection: Selection, known: Calibration, drives: int) -> Contact:
 
 
 def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
-    """What ``known`` leaves stays unexplained."""
+    """The step without a search: nothing is added to ``known``."""
     if not hot:
         return AttributionStep(calibration=known)
     bench = Bench(hot, known, own_data=True)
@@ -142,7 +143,7 @@ def _fastest(logs: Sequence[Log]) -> float:
 
 
 def words(step: AttributionStep) -> str:
-    """What was found beside the thesis's models and the stiffness step's effects, and what is left."""
+    """Sentences: what was found in addition to the thesis's models and the stiffness step's effects, and what remains."""
     if step.diagnosis is None:
         return "The campaign has no fast motion, or is too short, to tell what its models lack."
     return verdict(step.diagnosis)

@@ -8,7 +8,7 @@ from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Samples over which one contact angle is estimated: ten seconds, in which it hardly wanders.
+#: Samples over which one contact angle is estimated: ten seconds, in which it hardly moves.
 _ROWS = 2500
 #: Step of the derivative by the clearance, rad.
 _STEP = 1e-3
@@ -17,7 +17,7 @@ _STEP = 1e-3
 def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> Step:
     """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it.
 
-    A log that began in contact shows no clearance; where all did, it is the datasheet's, of which half may be missing.
+    A log that begins in contact shows no clearance; if all do, it is the datasheet's, with half of it as standard deviation.
 
     Args:
         count_rad: the resolver's smallest step.
@@ -44,9 +44,9 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
 
 
 def _walk(stiffness: StiffnessStep) -> float:
-    """Root of the contact angle's wandering per second, rad: between tens of seconds of the fitted logs.
+    """Random walk of the contact angle, rad per root of a second, from estimates ten seconds apart in the fitted logs.
 
-    The scatter of each estimate is in it, so that it errs to the safe side.
+    It contains the scatter of the estimates, and is therefore rather too large.
     """
     squares, seconds = 0.0, 0.0
     fit = stiffness.fit

@@ -11,7 +11,7 @@ from emb_daemon.report.page import Section
 
 #: Density of grey cast iron (EN-GJL-250), kg/m^3, for the disc's volume.
 _CAST_IRON = 7200.0
-#: Disc temperatures over ambient that a cooling rate rests on, K.
+#: Disc temperatures above ambient from which a cooling rate is computed, K.
 _LEAST_OVER_AMBIENT_K = 15.0
 #: Biot number up to which a body may be taken as lumped (Incropera, Fundamentals of Heat and Mass Transfer, ch. 5).
 _LUMPED = 0.1
@@ -20,7 +20,7 @@ _POINTS = Style("#1d2430", mode="markers")
 
 @dataclass(frozen=True)
 class CoolingLaw:
-    """b_d = ``rest`` + ``per_speed`` omega in 1/s, and the rates of the logs that it is drawn through, shape (n,).
+    """b_d = ``rest`` + ``per_speed`` omega in 1/s, and the logs' rates from which it is fitted, shape (n,).
 
     Attributes:
         biot: Biot number of the disc at each rate.

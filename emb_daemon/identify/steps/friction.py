@@ -14,25 +14,25 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import Panel, Style, Trace, xy_figure
 from emb_daemon.report.page import Section
 
-#: Rows with less force or speed say more of the sensors' noise than of friction.
+#: Rows with less force or speed are dominated by the sensors' noise.
 _LEAST_FORCE_N = 500.0
 _LEAST_SPEED_RAD_PER_S = 1.0
-#: Rows before and after that must brake as well, so that none averages over an edge.
+#: Number of rows before and after that must brake as well, so that no row averages over an edge.
 _MARGIN = 2
-#: Time over which rows are averaged: noise of the force would pass for a friction that falls with force.
+#: Time over which rows are averaged: noise of the force looks like a friction coefficient that falls with force.
 _AVERAGE_S = 1.0
 _LEAST_ROWS = 30
-#: What a second's coefficient is worth, errors lasting for longer than that, and what is expected of its dependence on force
-#: (1/N), speed (s/rad) and temperature (1/K): a log that varies one of them little says nothing of it.
+#: Standard deviation of one second's coefficient, whose errors last longer than that, and prior standard deviations of its
+#: dependence on force (1/N), speed (s/rad) and temperature (1/K), for logs in which one of them hardly varies.
 _ROW_SIGMA = 0.01
 _EXPECTED_SLOPES = (1e-5, 3e-3, 1e-3)
-#: Bend with temperature that is expected, 1/K^2.
+#: Prior standard deviation of the curvature with temperature, 1/K².
 _EXPECTED_BEND = 5e-6
 #: Pieces of the data that are left out in turn.
 _PIECES = 8
-#: By how much an added term must lower the error on pieces left out.
+#: Relative amount by which a further term must lower the error on pieces left out.
 _WORTH_IT = 0.98
-#: The table goes on this far beyond the largest force, speed and temperature that were measured.
+#: The table extends beyond the largest force, speed and temperature that were measured by this factor.
 _BEYOND = 1.25
 _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
 _DOTS = Style("rgba(11,92,173,0.35)", mode="markers", size=3.5)
@@ -44,11 +44,11 @@ class FrictionFit:
 
     Attributes:
         values: the table by the calibration's keys. Its grid runs evenly from standstill, zero force and the coldest surface
-            to a quarter beyond the largest values measured; what lies outside of the data follows the smooth model, held
+            to a quarter beyond the largest values measured; outside of the data it follows the smooth model, limited to values
             between a third of its value at the mean of the data and 1.
         equation: the smooth model, for the report.
         sigma: standard deviation of the coefficient at a typical grid point inside the data, pieces of data left out in turn.
-        force_N, speed_rad_per_s, temperature_C, measured, model: of each row that was fitted.
+        force_N, speed_rad_per_s, temperature_C, measured, model: of each fitted row.
         rms: of measured minus model, weighted by force.
     """
 
@@ -83,7 +83,7 @@ def _rows(r: Recording, parameters: np.ndarray) -> np.ndarray:
 
 
 class _Surface:
-    """Coefficient as a polynomial of force, speed and temperature, each measured from its mean in its own spread."""
+    """Coefficient as a polynomial of force, speed and temperature, each normalised by its mean and spread."""
 
     def __init__(self, force, speed, temperature, coefficient):
         self.columns, self.coefficient = np.array([force, speed, temperature]), coefficient
@@ -105,7 +105,7 @@ class _Surface:
         return np.stack([np.ones_like(u[0]), *u] + ([u[2] ** 2 - 1.0] if bent else []), axis=-1)
 
     def _solve(self, use, bent):
-        """Weighted least squares; each term but the first pulled to zero by what is expected of it."""
+        """Weighted least squares, with a prior of mean zero for each term but the first."""
         bend = [_EXPECTED_BEND * self.width[2] ** 2] if bent else []
         expected = np.array([1e3, *(_EXPECTED_SLOPES * self.width), *bend])
         weight = self.weight[use] / _ROW_SIGMA
@@ -152,11 +152,11 @@ class _Surface:
 def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> FrictionFit:
     """Friction coefficient from brake torque, clamp force and the modelled surface temperature (mean of both pads).
 
-    The friction power of a recording stands for torque times speed.
+    The friction power of a recording is torque times speed.
 
-    A smooth model tabulated, because a table filled from data has empty corners: linear in force, speed and temperature, and
-    bent in temperature where pieces of data left out in turn say so. Rows are weighted by force, the torque sensor's noise
-    being constant.
+    A smooth model is tabulated, because a table filled from data would have empty corners: linear in force, speed and
+    temperature, and quadratic in temperature if that lowers the error on pieces of data left out in turn. Rows are weighted by
+    force, because the torque sensor's noise is constant.
 
     Args:
         recordings: those with `Recording.dense`.
@@ -184,7 +184,7 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
 
 
 def constant_friction(coefficient: float) -> FrictionTable:
-    """A table that holds one coefficient, for when no log tells more."""
+    """A table of one constant coefficient, if no log shows more."""
     return FrictionTable(
         force_N=tuple(np.linspace(0.0, 3e4, FORCE_GRID).tolist()),
         disc_speed_rad_per_s=tuple(np.linspace(0.0, 50.0, SPEED_GRID).tolist()),

@@ -1,7 +1,7 @@
-"""Pads and disc out of logs with thermocouples: the estimator's own heat chain, its parameters by least squares.
+"""Pads and disc from logs with thermocouples: least squares over the parameters of the estimator's heat chain.
 
 Thesis 8.1 tunes conductivity and heat shares by hand on one log, 8.2 takes the disc's cooling from others; here one fit
-takes both from all logs, because the pads lend heat to the disc and take it back.
+determines both from all logs, because pads and disc exchange heat.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ from emb_daemon.offline.fit import Block, Free, fit
 #: residual is worth a twelfth of an independent one, which this standard deviation makes it.
 _RESIDUAL_EVERY_S = 5.0
 _RESIDUAL_SIGMA_K = 1.0
-#: Pads that rise by less tell nothing.
+#: Least rise of the pads' temperature, K, from which they are identified.
 _LEAST_RISE_K = 30.0
-#: Fewer logs than this are cut into so many episodes each.
+#: With fewer logs than this, each is cut into so many episodes.
 _FEW_LOGS, _PIECES = 4, 6
-#: Positive values are sought within this factor of where they start; pads take no more than this share of the heat each.
+#: Factor from its start within which a positive value is searched; largest share of the heat that one pad takes.
 _REACH = float(np.exp(4.0))
 _MOST_HEAT_SHARE = 0.49
-#: A value of which its prior tells more than this share was hardly told by the logs.
+#: A value with more than this share of its information from the prior counts as not shown by the logs.
 _UNEXCITED = 0.25
 #: Standard deviation of pad temperatures that no thermocouple has confirmed, K.
 _UNCONFIRMED_K = 50.0
@@ -45,8 +45,8 @@ class _Unknown:
     high: float = np.inf
 
 
-#: What is fitted, by key. Datasheet values are told to 15 %, taken for two standard deviations; the rest is
-#: hardly known before.
+#: What is fitted, by key. Datasheet values have tolerances of 15 %, taken as two standard deviations; the others are hardly
+#: known before.
 UNKNOWNS = {
     "thermal.pad.conductivity_W_per_mK": _Unknown(0.075),
     "thermal.pad.conductivity_rise_per_K": _Unknown(1.0, scale=1e-3, low=-1e-3, high=4e-3),
@@ -70,7 +70,7 @@ class HeatFit:
 
     Attributes:
         values, sigmas: by key (`UNKNOWNS`).
-        unexcited: keys of values that the logs hardly moved from where they started.
+        unexcited: keys of values that the logs do not show.
     """
 
     values: dict[str, float]
@@ -79,7 +79,8 @@ class HeatFit:
 
 
 def nominal_thermal(sheet: Datasheet) -> Thermal:
-    """The datasheet's values, and for what no datasheet states the usual size: where fits start, and what stays without logs.
+    """The datasheet's values, and usual values of what no datasheet states: starting values of fits, and final values without
+    logs.
 
     Conductances of pads on a disc: Limpert, Brake Design and Safety, 3rd ed., ch. 3; a released pad sits some 0.1 mm of
     air away (k / gap = 260 W/(m^2 K)). Free convection of a disc is 5 to 15 W/(m^2 K). Organic pads take some five per cent
@@ -119,7 +120,7 @@ def thermal_parameters(calibration: Calibration) -> np.ndarray:
 
 
 def check_excitation(r: Recording) -> None:
-    """Raises InputError unless friction heats the pads enough to tell how heat flows in them."""
+    """Raises InputError unless friction heats the pads enough to show how heat flows in them."""
     rise = np.nanmax(r.measured[:8]) - np.nanmin(r.measured[:8, 0]) if np.isfinite(r.measured[:8]).any() else 0.0
     if rise < _LEAST_RISE_K or r.power.max(initial=0.0) <= 0.0:
         raise InputError(f"{r.name}: pads rise by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
@@ -128,8 +129,8 @@ def check_excitation(r: Recording) -> None:
 def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
     """Pads and disc from recordings that heat and cool them.
 
-    Residuals are strongly correlated and the equations are not quite the rig's, so that a whole log is one episode, or, of
-    fewer than four logs, one sixth of each.
+    Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
+    than four logs, one sixth of each.
     """
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
     blocks = [_block(r, start, pieces) for r in recordings]

@@ -1,4 +1,4 @@
-"""Each pad thickness from the others: what the models are worth on logs that fitted nothing."""
+"""Each pad thickness predicted from the others: errors of the models on logs that were not fitted."""
 
 from dataclasses import dataclass, field, replace
 
@@ -33,7 +33,7 @@ class Fold(Step):
     unexplained: list[Unexplained] = field(repr=False)
 
     def under(self, calibration: Calibration) -> "Fold":
-        """The same with what another calibration, its pads mounted, leaves."""
+        """The same with the errors of another calibration, which has these pads."""
         found = replace(self.torque, values={key: value_of(calibration, key) for key in KEYS})
         clearance = value_of(calibration, CLEARANCE)
         return replace(

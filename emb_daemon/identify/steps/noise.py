@@ -1,7 +1,7 @@
-"""Noise levels of both paths as the filter needs them, from data that did not fit the models.
+"""Noise levels of both paths as the filter needs them, from data that were not fitted.
 
-The daemon's standard deviation is judged against a reference instrument, so that it has to contain that instrument's noise:
-what is held out contains it too.
+The daemon's standard deviation is judged against a reference instrument and must therefore contain that instrument's noise, as
+errors on held-out data do.
 """
 
 from collections.abc import Mapping
@@ -35,9 +35,9 @@ from emb_daemon.wire.contract import CYCLE_S
 NOTHING: Mapping[str, float] = MappingProxyType({})
 #: One minus the squared friction state below which a gear slides.
 _SLID = 0.1
-#: Relative error of a curve beyond what was measured from which that is told: the usual relative noise of the path.
+#: Relative error of an extrapolated curve from which a note is written: the usual relative noise of the path.
 _TOLD = 0.01
-#: Samples of a stretch of which noise is asked where there are any so long.
+#: Length of the stretches, in samples, from which noise is identified, if there are any that long.
 _LONG = 50
 #: Resolver movement that still counts as standing, rad.
 _STANDING = 2.5e-3
@@ -58,9 +58,9 @@ def identify(
 
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
-        hot: errors that the whole model leaves on logs of hot pads; where they are more than what cold ones show, they count.
-        hot_current: current that it leaves unexplained there; the same.
-        undecided: shares of the force by which a model might be another, by key.
+        hot: errors of the whole model on logs with hot pads; used where they are larger than those of cold pads.
+        hot_current: current that is unexplained there; likewise.
+        undecided: relative force by which alternative models differ, by key.
         fastest_rad_per_s: speed of the motor in the hardest clamp of the ``hot`` logs.
     """
     logs = [log for pads in stiffness.pads for log in pads.logs]
@@ -108,7 +108,7 @@ def identify(
             "needed: a slow clamp to the largest force"
         )
     levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
-    # The daemon is not told how worn its gear is.
+    # The daemon does not know how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
     values = {f"noise.{name}": value for name, value in levels.items()}
     values |= {key: float(np.hypot(values[key], share)) for key, share in undecided.items()}
@@ -116,15 +116,15 @@ def identify(
 
 
 def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s: float) -> float:
-    """Relative force error of a lag in a clamp as hard as the motor can, beyond what clamps of this speed, whose errors are
-    known, show of it."""
+    """Relative force error of the uncertain lag in the fastest clamp that the motor can make, beyond that in the fastest
+    recorded clamp, which the known errors contain."""
     travel = max(curve.travel_rad for curve in stiffness.fit.curves)
     unseen = max(campaign.datasheet.actuator.max_motor_speed_rad_per_s - fastest_rad_per_s, 0.0)
     return USUAL_RELAXATION_S * unseen / travel
 
 
 def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
-    """Relative error, at the brake's largest force, of curves that were not measured as far as that."""
+    """Relative error, at the brake's largest force, of curves that were not measured up to it."""
     worst = 0.0
     for curve in stiffness.fit.curves:
         if rising_force(curve.coefficients) < rated_N:
@@ -152,7 +152,7 @@ def speed_noise(logs: list[Log]) -> float | None:
 @njit
 def _innovation_cost(residual, variance, decay, difference):
     """Mean negative log likelihood (without constants) of first-order noise plus the difference of successive values of white
-    noise, by its Kalman filter. ``variance`` of the one, ``difference`` of the other."""
+    noise, by its Kalman filter. ``variance`` of the first-order noise, ``difference`` of the white one."""
     white = 0.5 * difference
     state, spread, cost = 0.0, variance, 0.0
     # White noise at the sample before, which this difference has too, and its covariance with the state.
@@ -175,8 +175,8 @@ def current_noise(residuals: list[np.ndarray], difference_A: float) -> tuple[flo
 
     Args:
         residuals: unexplained current, gap-free stretches.
-        difference_A: standard deviation of what the speed's noise makes of it beside, as inertia times a difference of two
-            speeds: each speed's noise comes twice, with opposite signs, and is not white.
+        difference_A: standard deviation of the further part that the speed's noise causes through inertia times a difference
+            of two speeds; each speed's noise enters twice with opposite signs, so that this part is not white.
     """
     from scipy.optimize import minimize
 
@@ -194,11 +194,11 @@ def current_noise(residuals: list[np.ndarray], difference_A: float) -> tuple[flo
 
 
 def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float) -> tuple[float, float]:
-    """First-order noise (standard deviation in A, correlation time in s) that has the density of a current's noise and of
-    what stays unexplained for a manoeuvre.
+    """First-order noise (standard deviation in A, correlation time in s) with the spectral density, at low frequency, of the
+    current's noise and of the error that lasts for a manoeuvre together.
 
-    Likelihood asks a thousand samples a second, most of which tell of the noise alone. What stays for a second the filter
-    would take for an error of the contact angle."""
+    The likelihood is dominated by fast noise. The filter would attribute an error that lasts for a second to the contact
+    angle."""
     lasts = CYCLE_S * EPISODE
     means = _means(residuals)
     if not len(means):
@@ -210,13 +210,13 @@ def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float)
 
 
 def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> list[Unexplained]:
-    """The ``hot`` logs that leave more current for a manoeuvre and longer than any that is ``held_out``."""
+    """The ``hot`` logs with more unexplained current over a manoeuvre and longer than any of ``held_out``."""
     most = max((rmse(means) for left in held_out if len(means := _means(_without_gaps(left, left.current_A)))), default=np.inf)
     return [left for left in hot if len(means := _means(_without_gaps(left, left.current_A))) and rmse(means) > most]
 
 
 def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: float) -> float:
-    """Relative error of the torque that lasts for a manoeuvre, on the log that shows most."""
+    """Relative error of the torque that lasts for a manoeuvre, the largest of all logs."""
     shares = []
     for left in held_out:
         torque = left.found.values[TORQUE_CONSTANT] * left.current_A
@@ -227,22 +227,22 @@ def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: flo
 
 
 def _without_gaps(left: Unexplained, values: np.ndarray) -> list[np.ndarray]:
-    """``values``, one for each row, of neighbouring cycles."""
+    """Stretches of ``values``, one for each of ``rows``, in neighbouring cycles."""
     return np.split(values, np.flatnonzero(np.diff(left.rows) != 1) + 1)
 
 
 def _means(series: list[np.ndarray]) -> np.ndarray:
-    """Of what is as long as a manoeuvre."""
+    """Means over manoeuvres."""
     return np.array([s[row : row + EPISODE].mean() for s in series for row in range(0, len(s) - EPISODE + 1, EPISODE)])
 
 
 def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: float) -> dict[str, float]:
-    """Fields of ``noise`` that belong to the torque path, from what fits leave on logs that they did not see."""
+    """Fields of ``noise`` that belong to the torque path, from what fits leave unexplained on logs that were not fitted."""
     series, turning, excess, gains = [], [], [], []
     first = held_out[0].found
     constant = first.values[TORQUE_CONSTANT]
     if not any(len(left.rows) for left in held_out):
-        # No current was measured: the fit's own prior, and friction that may be as large as what it rubs against.
+        # No current was measured: the fit's prior, and friction that may be as large as its load.
         relative = np.hypot(first.sigmas[TORQUE_CONSTANT] / constant, first.sigmas[LOAD_FRICTION] / gear_gain)
         return {
             "current_A": UNKNOWN_CURRENT_A,
@@ -262,11 +262,11 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         turning.append((sliding * (values[OFFSET_FRICTION] + values[LOAD_FRICTION] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))
         load = (gear_gain + values[LOAD_FRICTION] * mean) * force
-        # Slope of torque error over explained torque: what a wrong torque constant or friction leaves for the whole log.
+        # Slope of torque error over explained torque: the error of torque constant and friction, constant over the log.
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
-    # Short stretches tell little, and are all there is of a friction that takes most of a log to turn over.
+    # Short stretches show little, but a friction that takes most of a log to turn over leaves no longer ones.
     series = [s for s in series if len(s) > _LONG] or series
     sigma, time = _with_what_lasts(series, *current_noise(series, difference))
     return {

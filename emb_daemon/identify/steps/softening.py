@@ -24,11 +24,11 @@ _LEAST_BURST_S = 2.0
 _LEAST_RANGE_N = 1000.0
 #: Bursts of a log from which its softening is known, and kelvins that the pads must differ by between them.
 _LEAST_BURSTS, _LEAST_RISE_K = 6, 30.0
-#: The history term must lower the residual on bursts left out by this much.
+#: Relative amount by which the history term must lower the residual on bursts left out.
 _WORTH_IT = 0.95
 #: Step of the derivative by the contact angle, rad.
 _STEP_RAD = 0.01
-#: Residuals within a tenth of a second count once: samples of full rate in it.
+#: Number of samples that count as one: residuals within a tenth of a second are correlated.
 _TOGETHER = 25.0
 #: Where the calibration keeps the law and the temperature that it counts from.
 _LAW = tuple(f"thermal.softening.{name}" for name in ("per_K", "history_per_K", "history_time_s"))
@@ -41,12 +41,12 @@ class SofteningFit:
     """Softening, per burst where shapes are (bursts,).
 
     Attributes:
-        values: by the calibration's keys; fitted on every other burst from the first.
-        sigmas: likewise, bursts left out in turn, and the residual's own part.
+        values: by the calibration's keys; fitted to every other burst from the first.
+        sigmas: likewise: from bursts left out in turn, and from the residual.
         factor, factor_sigma: measured stiffness factor.
         modelled: factor by the first-order history.
-        shift_rad: contact shift, were it free.
-        ours_N: RMSE of force over the bursts that fitted nothing.
+        shift_rad: contact shift, if that is fitted too.
+        ours_N: RMSE of force over the bursts that were not fitted.
         uncorrected_N: the same with cold stiffness throughout.
     """
 
@@ -62,7 +62,7 @@ class SofteningFit:
     uncorrected_N: float
 
     def figures(self) -> dict[str, float]:
-        """Force on bursts that fitted nothing."""
+        """RMSE of force on bursts that were not fitted."""
         name = "pad_cooling: force, bursts left out"
         return {f"{name}, kN": 1e-3 * self.ours_N, f"{name}, cold stiffness, kN": 1e-3 * self.uncorrected_N}
 
@@ -76,7 +76,7 @@ class SofteningFit:
 
 @dataclass(frozen=True)
 class Bursts:
-    """Bursts of clamps beside the stiffness path of cold pads.
+    """Bursts of clamps, and the stiffness path of cold pads over them.
 
     Attributes:
         rows: of the log, one slice per burst.
@@ -129,7 +129,7 @@ def find_bursts(log: Log) -> list[slice]:
 
 
 def _cold_curve(samples: np.ndarray, reference: np.ndarray, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-    """(clearance, coefficients) that suit the cold burst with the dynamics given: the force is linear in coefficients."""
+    """(clearance, coefficients) fitted to the cold burst with given dynamics; the force is linear in the coefficients."""
     unit = parameters.copy()
     known = np.isfinite(reference)
     expected = float(parameters["clearance"][0])
@@ -178,7 +178,7 @@ def cold_bursts(log: Log, heat: Recording, calibration: Calibration) -> Bursts:
 
 
 def _factors(bursts: Bursts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(stiffness factor, its standard deviation, contact shift in rad if that were free as well) of each burst."""
+    """(stiffness factor, its standard deviation, contact shift in rad if that is fitted as well) of each burst."""
     factor, sigma, shift = np.empty((3, len(bursts.rows)))
     for index, rows in enumerate(bursts.rows):
         samples, force = bursts.log.samples[rows], bursts.force_N(index)
@@ -226,7 +226,7 @@ class _Law:
         return np.array([*solve(time_constant)[0], time_constant])
 
     def sigmas(self, x: np.ndarray, rows: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-        """From fits without one burst each, ``left_out`` (bursts, 3), which few leave unsure, and the residual's own part."""
+        """From fits without one burst each, ``left_out`` (bursts, 3), of which there are few, and from the residual."""
         variance = np.diag(left_out_covariance(left_out))
         steps = 1e-3 * np.maximum(np.abs(x), [1e-4, 1e-4, 1.0])
         slopes = np.array([(self.losses(x + step) - self.losses(x - step))[rows] for step in np.diag(steps)]).T / (2.0 * steps)
@@ -240,7 +240,7 @@ def fit_softening(log: Log, heat: Recording, calibration: Calibration) -> Soften
     """Softening from a log with bursts of clamps on pads that heat up and cool down.
 
     The curve's scale is taken from the first, cold burst; then each burst has a stiffness factor, and these are explained by
-    the mean pad temperature of the heat model and its history. Bursts 0, 2, 4, ... fit, the others judge.
+    the mean pad temperature of the heat model and its history. Bursts 0, 2, 4, ... are fitted, the others validate.
 
     Args:
         heat: the same log.

@@ -1,4 +1,4 @@
-"""Characteristic curves and dynamics of all pads at once, and which effects the random logs ask for."""
+"""Characteristic curves and dynamics of all pads at once, and the effects that the random logs show."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -29,17 +29,17 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import Panel, Style, Trace, shades, xy_figure
 from emb_daemon.report.page import Page, Section
 
-#: Relaxation of an ordinary brake, s, and as much its standard deviation where no log shows it: between pads whose force
-#: follows at once and those that need the time of a hard application.
+#: Relaxation time of an ordinary brake, s, and also its standard deviation if no log shows it: between pads whose force
+#: follows at once and those that need as long as a hard application takes.
 USUAL_RELAXATION_S = 0.03
-#: A curve that turns over below the brake's largest force is taken up to this share of where it does.
+#: A curve with a maximum below the brake's largest force is used up to this share of that maximum.
 _RISING = 0.999
-#: Held-out error may be this much above the best of all combinations before an effect that lowers it is taken in.
+#: Factor on the least held-out error of all combinations up to which a combination with fewer effects is preferred.
 _WORTH = 1.02
-#: Standard deviations by which an effect's amplitude must stand clear of zero.
+#: Least amplitude of an effect, in its standard deviations.
 _CLEAR = 3.0
 _DELAY_TITLE = "reference later than resolver (not in the calibration)"
-#: Many measured points behind a line.
+#: Style of many measured points behind a line.
 _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
 
 
@@ -48,9 +48,9 @@ class Candidate:
     """One combination of effects in the choice of structure, fitted on the first halves of the random logs.
 
     Attributes:
-        held_out: (error of the stiffness path, reference force) in N on what did not fit, one pair per log; slow logs, which
-            fit whole, count where no random log is.
-        clear: every amplitude stands clear of zero.
+        held_out: (error of the stiffness path, reference force) in N on what was not fitted, one pair per log; slow logs,
+            which are fitted whole, if there is no random log.
+        clear: every amplitude is significant.
     """
 
     effects: tuple[Effect, ...]
@@ -70,8 +70,8 @@ class StiffnessStep(Step):
     Attributes:
         pads: the logs.
         fit: over all pads at once.
-        candidates: structures that were compared.
-        chosen: the one that was taken.
+        candidates: combinations that were compared.
+        chosen: one of them.
         separate: fits of each pair of pads alone, where it has random logs.
         reached_N: largest force of the logs.
     """
@@ -134,8 +134,8 @@ def _step(
 
 
 def _quasistatic(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
-    """Curves alone: a slow clamp does not tell a lag from a loop. The dynamics keep what is usual, as uncertain as it is
-    large."""
+    """Curves alone, because a slow clamp does not distinguish lag and hysteresis. The dynamics keep usual values, with
+    standard deviations of the same size."""
     start = moved(starting_point(pads, nominal, ()), {RELAXATION: USUAL_RELAXATION_S})
     fit = fit_dynamics(pads, start, fixed=True)
     chosen = Candidate((), fit, errors_unseen(pads, fit), clear=True)
@@ -156,7 +156,7 @@ def _further(chosen: Candidate) -> list[Effect]:
 
 
 def _choose(candidates: list[Candidate]) -> Candidate:
-    """Effects are compared in all combinations: one alone can gain nothing that pays with the other beside it."""
+    """Effects are compared in all combinations, because one may help only together with another."""
     usable = [candidate for candidate in candidates if candidate.clear]
     best = min(candidate.held_out_rmse for candidate in usable)
     return min(

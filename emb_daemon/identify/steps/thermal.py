@@ -1,4 +1,4 @@
-"""Heat: pads, disc, friction and softening out of a rig's thermal logs, and how well temperatures are known."""
+"""Heat: pads, disc, friction and softening from a rig's thermal logs, and the accuracy of temperatures."""
 
 from dataclasses import dataclass, field, replace
 
@@ -33,7 +33,7 @@ _NEEDED = {
 
 @dataclass(frozen=True)
 class Temperatures:
-    """One log's temperatures beside its thermocouples, every half second.
+    """One log's modelled temperatures and its thermocouples, every half second.
 
     Attributes:
         measured, known, unknown: shape (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with
@@ -54,7 +54,7 @@ class ThermalStep(Step):
         fitted, unseen: recordings that fitted, and logs that validate, by name.
         hot: logs that fitted in which the brake works as in service: force over heat.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-        figures: RMSE on logs that fitted nothing, by name with unit, once `validate`d.
+        figures: RMSE on logs that were not fitted, by name with unit, once `validate`d.
         achieved_K: the worst of these temperatures; None without one.
         residuals: the same for what was fitted.
     """
@@ -73,7 +73,7 @@ class ThermalStep(Step):
 
 
 def _attempt(campaign: Campaign, action, *arguments):
-    """The result, or None after a word about what was wrong with a log, so that the others go on."""
+    """The result; None if a log is faulty, which is reported, so that the others are still used."""
     try:
         return action(*arguments)
     except InputError as error:
@@ -125,7 +125,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
 
 
 def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
-    """The step with what a calibration achieves."""
+    """The step with the accuracy of a calibration."""
     if step.heat is None:
         return step
     temperatures, figures, residuals = _validate(campaign, step.fitted, step.unseen, calibration)
@@ -140,7 +140,7 @@ def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) ->
 
 
 def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
-    """Logs that may fit and logs that validate, by name; those of a thermal rig that are not named become faults."""
+    """Logs to fit and logs to validate, by name; logs that a thermal rig should have and that are not named become faults."""
     part, fit, unseen = campaign.file.thermal, {}, {}
     for name, into in (("tune", fit), ("heat_flux_map", fit), ("pad_cooling", fit), ("validate", unseen)) if part else ():
         if getattr(part, name) is None:

@@ -13,7 +13,7 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import Panel, Style, Trace, shades, xy_figure
 from emb_daemon.report.page import Page
 
-#: Part of a brake's compliance that is its pads', RMS where any from none to all is as likely.
+#: Share of a brake's compliance that is its pads': RMS of a uniform distribution from 0 to 1.
 _PADS_PART = 1.0 / np.sqrt(3.0)
 _NEED_CURVE = "slow clamp and release from the released position to a tenth of the rated force or more"
 
@@ -33,9 +33,9 @@ class ThicknessStep(Step):
     def interpolation_error(self, thickness_mm: float) -> float:
         """Relative force error that interpolation adds at a thickness.
 
-        A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which leaving out each inner
-        thickness shows. A single curve is taken for any pads, and errs by as much as the pads' part of the compliance grows
-        with them.
+        A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which is found by leaving out each
+        inner thickness. A single curve is used for all thicknesses; its error is the change of the pads' part of the
+        compliance.
         """
         thicknesses = np.array([curve.thickness_mm for curve in self.curves])
         if len(thicknesses) == 1:

@@ -1,6 +1,6 @@
 """Torque path: torque constant, lumped inertia and friction from current, motion and the reference force.
 
-Thesis 2.4 and 4.2, T_m = gamma F + J dw/dt + (mu F + eta) s, turned round so that the noisy current is what is explained:
+Thesis 2.4 and 4.2, T_m = gamma F + J dw/dt + (mu F + eta) s, solved for the noisy current:
 
     iq = (gamma / K_m) F + (J / K_m) dw/dt + (eta / K_m) s + (mu / K_m) s F
 
@@ -35,7 +35,7 @@ from emb_daemon.report.figures import MODEL, REFERENCE, Panel, Trace, time_figur
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Parameters in the order of every covariance, with their least value that is physical.
+#: Parameters in the order of every covariance, with their least physical value.
 KEYS = {TORQUE_CONSTANT: 0.0, INERTIA: 0.0, OFFSET_FRICTION: 0.0, LOAD_FRICTION: 0.0, PRESLIDING_ANGLE: 1e-6}
 #: Variance of the friction state up to which it counts as known.
 _KNOWN = 0.01
@@ -45,7 +45,7 @@ _STEP = 1e-2
 #: deviation of its logarithm (rolling elements slide after micrometres to tens of them: Armstrong-Helouvry et al., Automatica
 #: 30(7), 1994, sec. 2.1, over a screw's micrometres per hundredth of a radian).
 _USUAL_PRESLIDING, _PRESLIDING_SPREAD = 0.03, 1.0
-#: To how much a current is known before a log has shown it, A.
+#: Standard deviation of a current before a log has shown it, A.
 UNKNOWN_CURRENT_A = 1.0
 _NEED_TRAINING = "clamp and release with the reference force, at full frame rate"
 
@@ -70,16 +70,16 @@ class TorqueFit:
 
     @property
     def rms_A(self) -> float:
-        """Of the current that stays unexplained; NaN where none was measured."""
+        """RMS of the unexplained current; NaN if none was measured."""
         left = np.concatenate([residual for _, residual in self.residuals.values()])
         return rmse(left) if len(left) else float("nan")
 
     def physical(self) -> dict[str, float]:
-        """Values for a calibration; what noise pushed below what is physical stands at its least."""
+        """Values for a calibration; those that noise moved below the physical limit are set to it."""
         return {key: max(self.values[key], least) for key, least in KEYS.items()}
 
     def friction(self) -> dict[str, float]:
-        """Those of them that wear changes."""
+        """The values that wear changes."""
         return {
             key: value for key, value in self.physical().items() if key in (OFFSET_FRICTION, LOAD_FRICTION, PRESLIDING_ANGLE)
         }
@@ -90,8 +90,8 @@ class TorqueStep(Step):
     """Motor and friction.
 
     Attributes:
-        fit: over all logs of the campaign's pads, and of drives where no pads were moved at random.
-        logs: those.
+        fit: over all random logs of the campaign's pads, or over drives if there are none.
+        logs: those that were fitted.
         gears: (training log, fit) for each state of wear of the gear.
     """
 
@@ -106,12 +106,12 @@ class TorqueStep(Step):
 
 
 def identify(campaign: Campaign, pads: list[Pads], nominal: Calibration) -> TorqueStep:
-    """Torque path from all logs with motor current, and each gear's from its training log; without any current, what the
-    datasheet says, with standard deviations as wide as that leaves them."""
+    """Torque path from all logs with motor current, and each gear's from its training log; without any current, the
+    datasheet's values, with their wide standard deviations."""
     sheet = campaign.datasheet
     logs = [log for own in pads for log in own.logs]
     if not any(own.random for own in pads):
-        # Slow motion alone tells friction at one speed from nothing.
+        # Slow motion alone shows friction at one speed only.
         driven = (campaign.load(pair.fit, "integrated.fit", NEED_INTEGRATED) for pair in campaign.file.integrated)
         logs += [log for log in driven if log is not None]
     logs = [log for log in logs if log.samples["has_current"].any()]
@@ -144,7 +144,7 @@ class _Regression:
         self.log, self.calibration = log, calibration
         self.rows = r = rows[full_rate & known]
         self.force = 0.5 * (log.force_N[r] + log.force_N[r - 1])
-        # What the reduction carries, as force on a constant gear.
+        # Load of the reduction, as force on a constant gear.
         motor = calibration.motor
         turned, slope = all_through_gear(motor.gear(), 0.5 * (angle[r] + angle[r - 1]) - angle[0])
         spring = motor.release_spring_N_per_m * motor.gear_gain_m_per_rad * np.maximum(turned, 0.0)
@@ -155,7 +155,7 @@ class _Regression:
 
     def matrices(self, presliding_angle: float):
         """Regressors (n, 4) and instruments (n, 4) by the estimator's own model, and rows where the friction state is known;
-        in others it is the state's mean, none where nothing is known."""
+        in others it is the state's mean, zero if nothing is known."""
         parameters = to_parameters(moved(self.calibration, {PRESLIDING_ANGLE: presliding_angle}))
         paths = run_paths(self.log.samples, parameters)[self.rows]
         s = paths["friction_mean"]
@@ -166,10 +166,10 @@ class _Regression:
 
 
 def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> TorqueFit:
-    """Instrumental-variable regression with the presliding angle sought in one dimension.
+    """Instrumental-variable regression, and a one-dimensional search for the presliding angle.
 
-    Of the calibration only the gear counts. The datasheet's torque constant and inertia are priors; its resolver count is what
-    no turning over is known better than. What logs do not excite keeps a wide prior, and a sigma that says so.
+    Of the calibration only the gear is used. The datasheet's torque constant and inertia are priors; the presliding angle is
+    not known better than its resolver count. What logs do not excite keeps a wide prior, and a large sigma.
     """
     parts = [_Regression(log, calibration) for log in logs]
     nominal, precision = _wide_prior(sheet)
@@ -184,19 +184,19 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
         return solution, matrices, residuals
 
     def cost(logarithm):
-        # Over all rows: a state that is unknown explains nothing, and large angles, which leave most of them unknown, would
-        # else be rewarded for the rows that they leave out.
+        # Over all rows: large angles leave the friction state of most rows unknown, and must not be rewarded for leaving them
+        # out.
         left_over = np.concatenate(solve(np.exp(logarithm))[2])
         return float(left_over @ left_over + precision[4, 4] * (logarithm - np.log(_USUAL_PRESLIDING)) ** 2)
 
-    # Below a resolver count the angle says nothing.
+    # Angles below a resolver count cannot be identified.
     presliding = float(np.exp(valley(cost, np.log(np.geomspace(1e-3, 1.0, 13)), xatol=1e-3)))
     solution, matrices, residuals = solve(presliding)
     residuals = [residual[use] for residual, (_, _, use) in zip(residuals, matrices, strict=True)]
     covariance = _covariance(parts, matrices, residuals, solution, presliding, precision)
     physical, covariance = _physical(solution, presliding, covariance, sheet)
     physical, covariance = _with_priors(physical, covariance, sheet)
-    # What is known of the others moves it along a slope that holds near it alone.
+    # The priors of the others move it along a slope that is valid only nearby.
     physical[4] = np.clip(physical[4], 0.5 * presliding, 2.0 * presliding)
     left_over = {
         str(part.log.path): (part.rows[use], residual)
@@ -207,8 +207,7 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
 
 def _wide_prior(sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (4,) by the datasheet, and inverse covariance (5, 5) of them and the presliding angle's logarithm for a
-    current known to `UNKNOWN_CURRENT_A`: torque constant and inertia to a third, friction no larger than what it rubs
-    against."""
+    current known to `UNKNOWN_CURRENT_A`: torque constant and inertia to a third, friction up to its load."""
     actuator = sheet.actuator
     constant, gear = actuator.motor_torque_constant_Nm_per_A, actuator.gear_gain_m_per_rad
     nominal = np.array([gear, actuator.lumped_inertia_kg_m2, 0.0, 0.0]) / constant
@@ -238,13 +237,13 @@ def _physical(solution, presliding, covariance, sheet: Datasheet) -> tuple[np.nd
     change = np.diag([-constant / solution[0], constant, constant, constant, presliding])
     change[1:4, 0] = -solution[1:] * constant / solution[0]
     covariance = change @ covariance @ change.T
-    # The play against flicker and the reading's own step shift each reversal by about a count.
+    # The play that suppresses flicker, and the resolver's step, shift each reversal by about a count.
     covariance[4, 4] += (2.0 * sheet.resolver.count_rad) ** 2
     return np.array([constant, *(solution[1:] * constant), presliding]), covariance
 
 
 def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.ndarray]:
-    """Values and covariance after the datasheet's torque constant and inertia, which its tolerances say how far to believe."""
+    """Values and covariance combined with the datasheet's torque constant and inertia, by its tolerances."""
     stated = np.array([sheet.stated(key) for key in (TORQUE_CONSTANT, INERTIA)])
     sigma = stated[:, 0] * stated[:, 1] / 2.0
     seen = np.eye(2, len(KEYS))
@@ -254,13 +253,13 @@ def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.n
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What a fit leaves on a log that it need not have seen, one entry per cycle.
+    """Unexplained current of a fit on any log, one entry per cycle.
 
     Attributes:
         rows: of the log.
-        current_A: left unexplained.
+        current_A: unexplained.
         friction_mean: friction state, -1 to 1.
-        force_N: mean force that the reduction carries: with the release spring's, times the gear's slope over its mean.
+        force_N: mean load of the reduction: clamp force and release spring, times the gear's slope over its mean.
     """
 
     found: TorqueFit
