@@ -7,7 +7,7 @@ from pathlib import Path
 
 #: Help text of LOG.
 LOG_HELP = (
-    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .txt, .tsv, .parquet, .mat, .npz "
+    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also tables (.csv, .xlsx, .parquet, .mat, .h5, .tdms, .json, …) "
     "and measurements (.mf4)"
 )
 
