@@ -166,6 +166,17 @@ def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measure
     assert free == pytest.approx(10.0 * measured) and untold == measured
 
 
+@pytest.mark.parametrize("validated", [False, True])
+def test_what_a_free_motor_draws_is_not_explained_by_itself(validated):
+    """Friction that changes by itself is nothing that the torque constant, falling with the current, would explain; and a
+    motor on a bench has no disc over whose temperature it would."""
+    stated, _, fit, judge = _on_a_dynamometer(scatter=0.9, load=0.0)
+    found = diagnose([fit], stated, [judge] if validated else [])
+    assert not found.selection.accepted
+    assert found.calibration.friction.offset_Nm > 0.5 * stated.friction.offset_Nm
+    assert "a load that is measured" in found.selection.candidates["torque_saturation"].reason
+
+
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
     stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
     found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A

@@ -345,8 +345,11 @@ def _rms(residual: np.ndarray) -> float:
 
 
 def undecided(selection: Selection) -> dict[str, float]:
-    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it."""
+    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it;
+    none of a motor that turns free, whose force is nothing."""
     size, result = selection.screening.force_N, {}
+    if size <= 0.0:
+        return result
     for candidate in map(selection.candidates.__getitem__, selection.accepted):
         key = f"noise.{candidate.channel}_relative"
         if candidate.channel in ("stiffness", "torque") and candidate.undecided_N > 0.0:

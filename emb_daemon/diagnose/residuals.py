@@ -165,6 +165,8 @@ class Bench:
         self.middle = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
+        #: Whether the load is known to be nothing: then the current itself is all that is explained.
+        self.turns_free = self.has_reference and not self.clamps and not np.any(self.load_N)
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
         offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
