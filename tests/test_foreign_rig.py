@@ -1,10 +1,12 @@
 """A rig that nobody here built, through every command that reads its logs: see `foreignkit`."""
 
 import json
+import zipfile
 from pathlib import Path
 
 import foreignkit
 import numpy as np
+import pyarrow.feather
 import pyarrow.parquet
 import pytest
 from scipy.io import savemat
@@ -369,6 +371,100 @@ def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
 
 
+def _write_workbook(path: Path, sheets: dict[str, list]) -> None:
+    """The least that is a workbook."""
+    main = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+    relations = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
+    package = "http://schemas.openxmlformats.org/package/2006/relationships"
+
+    def cell(value) -> str:
+        return f'<c t="str"><v>{value}</v></c>' if isinstance(value, str) else f"<c><v>{value!r}</v></c>"
+
+    listed = "".join(f'<sheet name="{name}" sheetId="{n}" r:id="r{n}"/>' for n, name in enumerate(sheets, 1))
+    where = "".join(
+        f'<Relationship Id="r{n}" Type="{relations}/worksheet" Target="worksheets/{n}.xml"/>'
+        for n in range(1, len(sheets) + 1)
+    )
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("[Content_Types].xml", f'<Types xmlns="{package.replace("relationships", "content-types")}"/>')
+        root = f'<Relationship Id="r1" Type="{relations}/officeDocument" Target="xl/workbook.xml"/>'
+        file.writestr("_rels/.rels", f'<Relationships xmlns="{package}">{root}</Relationships>')
+        file.writestr(
+            "xl/workbook.xml", f'<workbook xmlns="{main}" xmlns:r="{relations}"><sheets>{listed}</sheets></workbook>'
+        )
+        file.writestr("xl/_rels/workbook.xml.rels", f'<Relationships xmlns="{package}">{where}</Relationships>')
+        for n, rows in enumerate(sheets.values(), 1):
+            text = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+            file.writestr(f"xl/worksheets/{n}.xml", f'<worksheet xmlns="{main}"><sheetData>{text}</sheetData></worksheet>')
+
+
+def _as_file(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """A table in the format of the path's ending, as its tools write it."""
+    if path.suffix == ".feather":
+        pyarrow.feather.write_feather(pyarrow.table(columns), path)
+    elif path.suffix in (".h5", ".mat"):
+        h5py = pytest.importorskip("h5py", reason="NOT RUN: the formats extra is not installed")
+        with h5py.File(path, "w", userblock_size=512 if path.suffix == ".mat" else 0) as file:
+            for name, values in columns.items():
+                # MATLAB's vectors are matrices of one row.
+                file[f"log/{name}"] = values[None]
+        if path.suffix == ".mat":
+            with path.open("r+b") as file:
+                file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    elif path.suffix == ".xlsx":
+        pytest.importorskip("python_calamine", reason="NOT RUN: the formats extra is not installed")
+        rows = [
+            ["my test bench"],
+            list(columns),
+            ["s", "m"],
+            *zip(*(values.tolist() for values in columns.values()), strict=True),
+        ]
+        _write_workbook(path, {"notes": [["of Monday"]], "data": rows})
+    elif path.suffix == ".tdms":
+        nptdms = pytest.importorskip("nptdms", reason="NOT RUN: the formats extra is not installed")
+        with nptdms.TdmsWriter(path) as file:
+            file.write_segment([nptdms.ChannelObject("log", name, values) for name, values in columns.items()])
+    elif path.suffix == ".json":
+        path.write_text(json.dumps({"rig": "A", "log": {name: values.tolist() for name, values in columns.items()}}))
+    elif path.suffix == ".jsonl":
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        lines = [json.dumps({"log": dict(zip(columns, row, strict=True))}) for row in rows]
+        path.write_text("\n".join([*lines, lines[0][:20]]))
+    else:
+        np.save(path, np.column_stack(list(columns.values())))
+    return path
+
+
+@pytest.mark.parametrize("ending", [".xlsx", ".h5", ".mat", ".tdms", ".json", ".jsonl", ".feather", ".npy"])
+def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
+    """The format goes by how the file begins where that tells it, not by its name."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    mapping = foreignkit.COLUMNS
+    for place, name in enumerate(columns, 1):
+        theirs = {".npy": f"column {place}", ".feather": name, ".xlsx": name}.get(ending, f"log.{name}")
+        mapping = mapping.replace(f"signal: {name}", f"signal: {theirs}")
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    path = _as_file(tmp_path / f"b{ending}", columns)
+    if ending not in (".json", ".jsonl"):
+        path = path.rename(tmp_path / "b.txt")
+    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    assert ("its last line is cut off" in capsys.readouterr().err) == (ending == ".jsonl")
+
+
+def test_stamps_of_json_lines_may_be_dates(tmp_path):
+    rows = [{"at": f"2026-03-01T12:00:{second:02d}.500+01:00", "plate": 20.0 + second} for second in range(60)]
+    (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: at}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: plate, unit: degC}\n"
+    )
+    log = load_log(tmp_path / "a.jsonl", read=Mapping(tmp_path / "m.yaml").read)
+    assert log.time_ns[-1] - log.time_ns[0] == pytest.approx(59e9, abs=2e9)
+    assert log.samples["inner_backplate"][-1] == pytest.approx(79.0, abs=1.1)
+
+
 class _Hostile:
     def __init__(self, path: Path):
         self.path = path
@@ -423,14 +519,25 @@ def test_variables_that_are_no_table_are_refused(tmp_path):
         path = _written(tmp_path / "a.npz", faulty)
         with pytest.raises(InputError, match=expected):
             load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
-    for content, ending in ((b"no archive", ".npz"), (b"PK\x03\x04", ".npz"), (b"MATLAB 5.0", ".mat"), (bytes(200), ".mat")):
+    for content, ending in (
+        (b"no archive", ".npz"),
+        (b"PK\x03\x04", ".npz"),
+        (b"PK\x03\x04", ".xlsx"),
+        (b"\xd0\xcf\x11\xe0", ".xls"),
+        (b"MATLAB 5.0", ".mat"),
+        (bytes(200), ".mat"),
+        (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400), ".mat"),
+        (b"\x89HDF" + bytes(200), ".h5"),
+        (b"TDSm" + bytes(200), ".tdms"),
+        (b"\x93NUMPY" + bytes(20), ".npy"),
+        (b"ARROW1" + bytes(200), ".feather"),
+        (b'{"angle_rad": [1, 2', ".json"),
+        (b'{"a": 1}\nx\n{"a": 2}', ".jsonl"),
+    ):
         path = tmp_path / f"b{ending}"
         path.write_bytes(content)
         with pytest.raises(InputError, match="not readable"):
             load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
-    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
-    with pytest.raises(InputError, match=r"MATLAB 7\.3 \(HDF5\); expected one saved with -v7"):
-        load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
 
 
 def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):

@@ -18,7 +18,7 @@ from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import resample
 from emb_daemon.offline import load_log
 from emb_daemon.wire.contract import reason_words
@@ -164,6 +164,37 @@ def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measure
         priors += [c.prior for c in Model.of(bench).values if c.name == TORQUE_CONSTANT]
     free, measured, untold = priors
     assert free == pytest.approx(10.0 * measured) and untold == measured
+
+
+@pytest.mark.parametrize("validated", [False, True])
+def test_what_a_free_motor_draws_is_not_explained_by_itself(validated):
+    """Friction that changes by itself is nothing that the torque constant, falling with the current, would explain; and a
+    motor on a bench has no disc over whose temperature it would."""
+    stated, _, fit, judge = _on_a_dynamometer(scatter=0.9, load=0.0)
+    found = diagnose([fit], stated, [judge] if validated else [])
+    assert not found.selection.accepted
+    assert found.calibration.friction.offset_Nm > 0.5 * stated.friction.offset_Nm
+    assert "a load that is measured" in found.selection.candidates["torque_saturation"].reason
+
+
+def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
+    """At its own shaft a robot's joint has a thousand times the viscous friction of a brake's motor: its own current and speed
+    say how much may be. What is found is a calibration like any other, but not of a brake."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    values = {"motor.torque_constant_Nm_per_A": 1.0, "motor.inertia_kg_m2": 1e-3, "friction.load_m_per_rad": 0.0}
+    stated = moved(stated, values | {"friction.offset_Nm": 0.2})
+    random, time_s = np.random.default_rng(5), 0.004 * np.arange(12000)
+    speed = np.repeat(random.uniform(3.0, 20.0, 12), 1000) * np.sin(2.0 * np.pi * time_s / 1.0)
+    torque = 0.2 * np.sign(speed) + 0.15 * speed + 1e-3 * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
+    columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": torque, "force_N": 0.0 * time_s}
+    found = diagnose([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], stated).calibration
+    assert found.effects["viscous_friction"]["viscous_Nms_per_rad"] == pytest.approx(0.15, rel=0.1)
+    save_calibration(found, tmp_path / "found.yaml")
+    assert load_calibration(tmp_path / "found.yaml").effects == found.effects
+    with pytest.raises(InputErrors, match=r"viscous_Nms_per_rad: 0\.1\d* outside"):
+        moved(found, {"contact.clearance_rad": 2.0}, checked=True)
 
 
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():

@@ -328,6 +328,30 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
     assert said in told and ("scale: -1" in told) == bool(said)
 
 
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1.0, []),
+        (
+            1e-3,
+            [
+                "MotorSpeed covers 7.3 steps",
+                "CurrentQ covers 8 steps of our message, and rounding hides what it says: `scale`",
+            ],
+        ),
+    ],
+)
+def test_what_our_messages_would_round_away_is_said(tmp_path, capsys, factor, said):
+    """A robot's joint, at its own shaft, takes minutes for a turn; its motor does not. Nor is a motor that stands too slow."""
+    time_s = 0.004 * np.arange(20000)
+    speed = 73.0 * factor * np.sin(0.1 * time_s)
+    columns = {"time_s": time_s, "angle_rad": -730.0 * factor * np.cos(0.1 * time_s), "speed_rad_per_s": speed}
+    columns |= {"current_A": 40.0 * factor * np.sign(speed), "force_N": 0.0 * time_s, "plate_C": 22.0 + 0.0 * time_s}
+    _read(tmp_path, columns, foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}"))
+    told = capsys.readouterr().err
+    assert all(line in told for line in said) and ("covers" in told) == bool(said), told
+
+
 def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):
     """The last count of its encoder goes to and fro."""
     rng, count = np.random.default_rng(1), 800

@@ -22,7 +22,7 @@ LOCKS = {
     "requirements-box.lock": (("", "workshop"), ()),
     "requirements-ahead.lock": (("", "workshop"), ("numba", "llvmlite")),
     "requirements-secoc.lock": (("secoc",), ()),
-    "requirements-image.lock": (("", "offline", "mf4", "fleet"), ()),
+    "requirements-image.lock": (("", "offline", "mf4", "formats", "fleet"), ()),
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 

@@ -108,7 +108,8 @@ def parameter(calibration: Calibration, key: str) -> Parameter:
     parts = _parts(key)
     if parts[0] == "effects":
         entry = _EFFECTS[parts[1]][parts[2]]
-        return Parameter(key, value, _STEP * (abs(entry.prior) or 1.0), False, entry.low, entry.high, entry.unit)
+        low, high = entry.bounds(calibration.contact.is_in_reach)
+        return Parameter(key, value, _STEP * (abs(entry.prior) or 1.0), False, low, high, entry.unit)
     low, high, usual = _bounds(tuple(part for part in parts if isinstance(part, str)))
     if key.endswith("coefficients[0]"):
         low = math.nextafter(0.0, math.inf)  # Force rises from contact.

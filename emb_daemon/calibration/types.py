@@ -418,10 +418,10 @@ class Calibration(Struct, kw_only=True):
             for key, value in values.items():
                 if key not in bounds:
                     faults.append(f"effects.{name}.{key}: unknown parameter; expected {', '.join(bounds)}")
-                elif not bounds[key].low <= value <= bounds[key].high:
-                    faults.append(
-                        f"effects.{name}.{key}: {value} outside [{bounds[key].low}, {bounds[key].high}] {bounds[key].unit}"
-                    )
+                    continue
+                low, high = bounds[key].bounds(self.contact.is_in_reach)
+                if not low <= value <= high:
+                    faults.append(f"effects.{name}.{key}: {value} outside [{low}, {high}] {bounds[key].unit}")
             if missing := bounds.keys() - values.keys():
                 faults.append(f"effects.{name}: missing {', '.join(sorted(missing))}")
         faults += faults_of(self.terms)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 #: Help text of LOG.
 LOG_HELP = (
-    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also .csv, .txt, .tsv, .parquet, .mat, .npz "
+    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also tables (.csv, .xlsx, .parquet, .mat, .h5, .tdms, .json, …) "
     "and measurements (.mf4)"
 )
 

@@ -6,6 +6,7 @@ nor hide one, so every candidate is tested with all of its channel's base coordi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -68,6 +69,7 @@ class Coordinate:
 
 
 Values = Mapping[Coordinate, float]
+NOTHING: Mapping[str, float] = MappingProxyType({})
 
 #: Base parameters, the channel that shows them, and how well they are known: standard deviation over their size.
 _BASE = (
@@ -179,8 +181,11 @@ def _friction(calibration: Calibration) -> list[Coordinate]:
     return result
 
 
-def effect_coordinates(calibration: Calibration, effect: Effect, channel: str) -> dict[str, Coordinate]:
-    """By parameter; an effect that is off starts at zero, its shapes too, until one is chosen."""
+def effect_coordinates(
+    calibration: Calibration, effect: Effect, channel: str, reach: Mapping[str, float] = NOTHING
+) -> dict[str, Coordinate]:
+    """By parameter; an effect that is off starts at zero, its shapes too, until one is chosen. ``reach``: the largest that a
+    machine which is no brake can have (`Bench.reach`), by unit."""
     on = calibration.effects.get(effect.name, {})
     result = {}
     for p in effect.parameters:
@@ -192,10 +197,10 @@ def effect_coordinates(calibration: Calibration, effect: Effect, channel: str) -
             prior = max(abs(start) or p.prior, _SHAPE)
         elif start:
             prior = abs(start)
-        moves = (Move(known.key, 1.0, p.low, p.high),)
-        result[p.name] = Coordinate(
-            known.key, channel, start, step, prior, moves, p.low, p.high, p.unit, effect.name, p.name
-        )  # fmt: skip
+        wider = reach.get(p.unit, p.high) / p.high
+        low, high = p.low * wider, p.high * wider
+        moves = (Move(known.key, 1.0, low, high),)
+        result[p.name] = Coordinate(known.key, channel, start, step, prior, moves, low, high, p.unit, effect.name, p.name)
     return result
 
 
@@ -220,7 +225,7 @@ def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, f
     for order, cosine, sine, (low, high) in _HARMONICS:
         if order in found:
             found[cosine], found[sine] = _turn(found.get(cosine, 0.0), found.get(sine, 0.0), found[order] * middle)
-            limits[cosine] = limits[sine] = low, high
+            limits[cosine] = limits[sine] = limits.get(cosine, (low, high))
     return {key: min(max(value, limits[key][0]), limits[key][1]) for key, value in found.items()}
 
 

@@ -18,6 +18,7 @@ from emb_daemon.calibration.types import Calibration, Provenance, Source
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
+from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
@@ -283,7 +284,9 @@ def _tradeoffs(model: Model, effect: Effect, own: Sequence[Coordinate]) -> str:
 
 
 def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
-    """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together."""
+    """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together:
+    what left-out episodes lose without it, everything else free. The estimator itself runs without it, since a line drawn
+    from where a far fit ended does not lead back."""
     model, calibration = selection.model, selection.model.bench.calibration
     base = [c for c in selection.applied() if not c.effect]
     groups: dict[str, list[Coordinate]] = {}
@@ -291,8 +294,11 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
         groups.setdefault(c.name.partition("[")[0].removesuffix(".over_force").removesuffix(".over_speed"), []).append(c)
     result = {}
     for group in groups.values():
-        evidence = model.evidence_against({c: c.start for c in group})
-        gain = model.rms(evidence.gain, group[0].channel)
+        channel = group[0].channel
+        own = model.own(channel)
+        rest = [c for c in own if c not in group]
+        without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
+        gain = model.rms(_left_out(model, channel, rest, without) - _left_out(model, channel, own), channel)
         for c in group:
             size = next((move.weight for move in c.moves if move.key == c.name), 1.0)
             sigma = c.sigma_of(model.values[c], model.fits[c.channel].sigmas.get(c, 0.0)) * abs(size)
@@ -305,6 +311,12 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
             result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel)
     return result
+
+
+def _left_out(model: Model, channel: str, free: Sequence[Coordinate], residual: np.ndarray | None = None) -> float:
+    """Squared error of the channel's residual, or another, over left-out episodes, some coordinates refitted."""
+    moments = model.moments(channel, [model.columns[c] for c in free], residual)
+    return float(leave_out(moments, model.penalty(free, channel)).left_out.sum())
 
 
 # -- what is left -----------------------------------------------------------------------------------------------------
@@ -346,8 +358,11 @@ def _rms(residual: np.ndarray) -> float:
 
 
 def undecided(selection: Selection) -> dict[str, float]:
-    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it."""
+    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it;
+    none of a motor that turns free, whose force is nothing."""
     size, result = selection.screening.force_N, {}
+    if size <= 0.0:
+        return result
     for candidate in map(selection.candidates.__getitem__, selection.accepted):
         key = f"noise.{candidate.channel}_relative"
         if candidate.channel in ("stiffness", "torque") and candidate.undecided_N > 0.0:

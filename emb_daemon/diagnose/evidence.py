@@ -86,7 +86,9 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     products = moments.products
     columns = products.shape[1] - 1
     total = products.sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(total)[:columns], 1e-300))
+    # Of a column that is nothing throughout a prior alone speaks.
+    size = np.diag(total)[:columns]
+    scale = np.sqrt(np.where(size > 0.0, size, 1.0))
     ridge = np.diag(penalty / scale**2 + 1e-10)
     outer = np.outer(scale, scale)
 

@@ -56,7 +56,7 @@ class Model:
         for effect in REGISTRY:
             on, channel = bench.calibration.effects.get(effect.name, {}), bench.channel_of(effect.channel)
             if channel and any(on.get(p.name, 0.0) for p in effect.amplitudes):
-                coordinates += effect_coordinates(bench.calibration, effect, channel).values()
+                coordinates += effect_coordinates(bench.calibration, effect, channel, bench.reach).values()
         start = about_middle({c: c.start for c in coordinates}, bench.middle)
         return cls(bench, start, *bench.run(start), centre=start)
 

@@ -16,7 +16,8 @@ from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_p
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import Bench, Probe
-from emb_daemon.diagnose.selection import LASTING
+from emb_daemon.diagnose.selection import LASTING, NOT_OF_A_FREE_MOTOR
+from emb_daemon.diagnose.signals import OF_A_BRAKE
 from emb_daemon.diagnose.unexplained import sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import PARAMETERS, PORTS, SIGNALS, evaluate
@@ -118,10 +119,17 @@ class Search:
         self.channel = channel
         self.signals = signals
         self.random: np.random.Generator = np.random.default_rng(0)
-        self.covered: dict[str, tuple[float, float]] = _covered(np.concatenate(signals))
+        covered = _covered(np.concatenate(signals))
+        self.covered: dict[str, tuple[float, float]] = {
+            name: reach for name, reach in covered.items() if model.bench.clamps or name not in OF_A_BRAKE
+        }
         self.ports: tuple[str, ...] = tuple(
-            port for port in PORTS if port in FORMED and model.bench.channel_of(HOOKS[port].channel) == channel
-        )  # fmt: skip
+            port
+            for port in PORTS
+            if port in FORMED
+            and model.bench.channel_of(HOOKS[port].channel) == channel
+            and not (port == NOT_OF_A_FREE_MOTOR and model.bench.turns_free)
+        )
         self.sensitivities: dict[str, np.ndarray] = {port: _sensitivity(model, channel, port) for port in self.ports}
         self.screen: Screen = Screen(model, channel, LASTING[channel])
 

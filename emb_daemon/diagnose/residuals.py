@@ -9,6 +9,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
+from emb_daemon.effects.base import OF_THE_MOTOR
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.logs.columns import nearest
@@ -167,6 +169,8 @@ class Bench:
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows: bool = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
+        #: Whether the load is known to be nothing: then the current itself is all that is explained.
+        self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
         offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
@@ -178,6 +182,19 @@ class Bench:
             channel: np.concatenate(by_temperature) if channel == "temperature" else self.sample_episode
             for channel in self.channels
         }
+
+    @cached_property
+    def reach(self) -> dict[str, float]:
+        """Of a machine that clamps nothing the most that its effects may be, by unit: a current as large as the largest of
+        these logs, all the torque that makes, at any speed or at the largest, and the whole torque constant lost at it."""
+        if self.clamps or not self.has_current:
+            return {}
+        samples = np.concatenate([trial.log.samples for trial in self.trials])
+        current = float(np.abs(samples["current_q"][samples["has_current"]]).max())
+        torque = current * self.calibration.motor.torque_constant_Nm_per_A
+        speed = float(np.abs(samples["speed"]).max())
+        found = {"A": current, "N·m": torque, "N·m·s/rad": torque / max(speed, 1e-9), "1/A²": 1.0 / max(current, 1e-9) ** 2}
+        return {unit: found[unit] for unit in OF_THE_MOTOR}
 
     @property
     def load_N(self) -> np.ndarray:

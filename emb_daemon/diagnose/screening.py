@@ -107,7 +107,7 @@ class Screening:
         channels = {effect.name: bench.channel_of(effect.channel) for effect in REGISTRY}
         #: Coordinates by parameter, of each effect that is off.
         self.coordinates: dict[str, dict[str, Coordinate]] = {
-            effect.name: effect_coordinates(bench.calibration, effect, channels[effect.name])
+            effect.name: effect_coordinates(bench.calibration, effect, channels[effect.name], bench.reach)
             for effect in REGISTRY
             if channels[effect.name] and not model.of_effect(effect.name)
         }

@@ -35,6 +35,9 @@ _CARRIED = 2.0
 #: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
 #: noise states (`noise.presliding`); on simulated brakes with nothing hidden it alone brought false terms of 70 to 120 N.
 LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32}
+#: Port at which nothing is looked for of a motor that turns free: a constant that falls with the current would explain any
+#: current, friction's above all.
+NOT_OF_A_FREE_MOTOR = "torque_constant"
 #: Why a term goes that a calibration may not hold.
 TOO_LARGE = "fitted with everything else it is more than its port may bear"
 
@@ -197,6 +200,8 @@ def _why_not_asked(effect: Effect, model: Model) -> str:
         return f"one more element beside {effect.beside}, which is not there"
     if effect.bare and model.bench.clamps:
         return "looked for where nothing is clamped: elsewhere friction and curve look the same"
+    if effect.hook == NOT_OF_A_FREE_MOTOR and model.bench.turns_free:
+        return "a motor that turns free does not tell it: its current is all there is to explain; a load that is measured"
     return ""
 
 

@@ -13,12 +13,13 @@ from emb_daemon.wire.contract import CYCLE_S
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
 
-#: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not.
+#: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not, in words for
+#: any machine where one without a brake has the signal.
 MANOEUVRES = {
-    "motor_angle": "slow strokes on pads of another thickness: the same angles at other forces",
+    "motor_angle": "slow strokes through the same angles at other forces (of a brake: on pads of another thickness)",
     "travel": "slow strokes to several forces, on pads of another thickness too",
     "motor_speed": "strokes at several constant speeds",
-    "motor_acceleration": "free strokes in the clearance at several accelerations",
+    "motor_acceleration": "strokes without load at several accelerations",
     "clamp_force": "holds at several forces, each reached from below and from above",
     "force_rate": "strokes to one force at several speeds",
     "current": "holds at several forces with a cold motor, each reached from below and from above",
@@ -36,10 +37,16 @@ MANOEUVRES = {
     "time_clamped": "holds of several lengths at one force, at standstill",
     "time_since_last_clamp": "equal clamps after pauses of several lengths, at standstill",
 }
+#: What only a brake has.
+OF_A_BRAKE = (
+    "travel", "surface_temperature", "pad_temperature", "disc_temperature", "disc_speed", "disc_angle", "brake_torque",
+    "friction_power", "energy", "time_clamped", "time_since_last_clamp",
+)  # fmt: skip
 
 
 def signals(bench: Bench) -> dict[str, np.ndarray]:
-    """Measured and estimated signals at every sample of all logs, under the names of the report."""
+    """Measured and estimated signals at every sample of all logs, under the names of the report; those of a brake are nothing
+    where nothing is clamped."""
     columns: dict[str, list[np.ndarray]] = {}
     for trial in bench.trials:
         samples = trial.log.samples
@@ -71,7 +78,8 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
             "energy": np.cumsum(power * dt),
         }
         for name, column in here.items():
-            columns.setdefault(name, []).append(column)
+            there = bench.clamps or name not in OF_A_BRAKE
+            columns.setdefault(name, []).append(column if there else np.zeros(len(time)))
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 

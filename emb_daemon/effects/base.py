@@ -70,9 +70,13 @@ HOOKS = {
 }  # fmt: skip
 
 
+#: Units in which the catalogue's bounds are those of a brake's motor. Other machines are of any size.
+OF_THE_MOTOR = ("A", "N·m", "N·m·s/rad", "1/A²")
+
+
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect. ``low`` and ``high`` bound it; ``prior`` is the size expected from physics.
+    """One parameter of an effect. ``low`` and ``high`` bound it in a brake; ``prior`` is the size expected from physics.
 
     The term is linear, or nearly so, in its amplitudes and vanishes with them. A parameter with ``starts`` shapes the
     term instead (a time constant, an order) and has no effect while the amplitudes are zero; the starts cover its range.
@@ -91,6 +95,12 @@ class Parameter:
     starts: tuple[float, ...] = ()
     drawn: tuple[float, float] | None = None
     group: str = ""
+
+    def bounds(self, clamps: bool) -> tuple[float, float]:
+        """What a calibration may hold, of an actuator that ``clamps`` or of any other machine."""
+        if clamps or self.unit not in OF_THE_MOTOR:
+            return self.low, self.high
+        return (-np.inf if self.low < 0.0 else self.low), np.inf
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ EFFECT = Effect(
     equation="T_m → T_m − c cos nθ − d sin nθ",
     source="Islam, Mir, Sebastian, IEEE Trans. Industry Applications 40(3), 2004",
     signal="motor_angle",
-    manoeuvre="slow strokes in the clearance: cogging stays, gear ripple vanishes without load",
+    manoeuvre="slow strokes without load: cogging stays, gear ripple vanishes without load",
     placebos=(Placebo("order between two whole numbers", order=_between_teeth),),
     harmonic=Harmonic("order_per_turn", "cosine_Nm", "sine_Nm", whole=True),
 )

@@ -18,5 +18,5 @@ EFFECT = Effect(
     equation="I → I + I₀",
     source="Hall sensors: offset 0.5 to 1 % of range",
     signal="current",
-    manoeuvre="slow strokes both ways in the clearance: an offset keeps its sign, friction changes it",
+    manoeuvre="slow strokes both ways without load: an offset keeps its sign, friction changes it",
 )

@@ -29,6 +29,6 @@ EFFECT = Effect(
     equation="K_m → K_m (1 − σ I²)",
     source="saturation of the quadrature axis: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 5",
     signal="current",
-    manoeuvre="strokes to low and to the largest force at the same speed, both ways",
+    manoeuvre="strokes at low and at the largest force at the same speed, both ways",
     bare=True,
 )

@@ -6,6 +6,7 @@ reported.
 
 import numpy as np
 
+from emb_daemon.logs.columns import shipped_database
 from emb_daemon.logs.resample import Series, Signals
 
 #: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
@@ -36,6 +37,8 @@ _LEAST_COUNTS = 256
 _ABOUT = 0.1
 #: Least step where a value wraps around, as a share of its range, and least number of such steps.
 _ANEW, _LEAST_JUMPS = 0.5, 3
+#: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
+_LEAST_COVERED, _TURNS = 10.0, 50.0
 
 
 def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
@@ -56,6 +59,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _find_too_fast(angle)
+        lines += _find_rounded(corner, angle, current)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     # A motor with constant load clamps nothing.
     is_free = isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
@@ -86,6 +90,25 @@ def _find_too_fast(angle: Series) -> list[str]:
     else:
         what = "are its values counts of an encoder, or is the unit of time wrong?"
     return [f"MotorAngle changes by {fastest:.4g} rad/s ({fastest * 30.0 / np.pi:.3g} rpm), which no motor does: {what}"]
+
+
+def _find_rounded(corner: str, angle: Series, current: Series | None) -> list[str]:
+    """A line on a motion, or the current for it, that is too small for the steps of our messages."""
+
+    def covered(message: str, signal: str, values: np.ndarray) -> float:
+        step = shipped_database("dbc/emb.dbc").get_message_by_name(message.format(corner)).get_signal_by_name(signal).scale
+        return float(np.ptp(np.quantile(values, (0.01, 0.99))) / step)
+
+    if covered("EMB_{}_Resolver", "MotorAngle", angle.values) < _TURNS:
+        return []
+    lines, lost = [], "steps of our message, and rounding hides what it says"
+    speed = covered("EMB_{}_Resolver", "MotorSpeed", angle.derivative().values)
+    if speed < _LEAST_COVERED:
+        how = "of what turns behind a gear state the motor's, angle and speed alike by the gear's ratio as `scale`"
+        lines.append(f"MotorSpeed covers {speed:.2g} {lost}: {how}")
+    if current is not None and 0.0 < (steps := covered("EMB_{}_Current", "CurrentQ", current.values)) < _LEAST_COVERED:
+        lines.append(f"CurrentQ covers {steps:.2g} {lost}: `scale` it up, and the torque constant down")
+    return lines
 
 
 def _are_whole(values: np.ndarray) -> bool:

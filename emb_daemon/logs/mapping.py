@@ -108,7 +108,7 @@ class MappingFile(Struct, kw_only=True):
     dbc: str | None = None
     #: Instead of `dbc`, of a rig with several buses: by a name of yours.
     buses: dict[str, Bus] = field(default_factory=dict)
-    #: Of a table (.csv, .txt, .tsv, .dat, .parquet, .mat, .npz); channels of a measurement have times of their own.
+    #: Of a table or of arrays; channels of an MDF measurement have times of their own.
     time: Time | None = None
     #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
     signals: dict[str, Mapped]

@@ -57,9 +57,9 @@ def ending_of_content(content: bytes) -> str:
     return next((ending for beginning, ending in _BEGINNINGS.items() if content.startswith(beginning)), "")
 
 
-def needs_extra(path: Path, error: ImportError) -> InputError:
+def needs_extra(path: Path, error: ImportError, extra: str = "mf4") -> InputError:
     """The error for a format of which a library is not installed."""
-    return InputError(f"{path}: this format needs an extra: pip install emb_daemon[mf4] ({error})")
+    return InputError(f"{path}: this format needs an extra: pip install emb_daemon[{extra}] ({error})")
 
 
 def read_file(path: Path) -> bytes:

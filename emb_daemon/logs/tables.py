@@ -1,5 +1,6 @@
 """Columns of tables and channels of measurements: logs that hold signals instead of CAN frames."""
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -22,10 +23,11 @@ if TYPE_CHECKING:
     from emb_daemon.logs.mapping import Time
 
 _MEASUREMENTS = (".mf4", ".mdf", ".dat")
-_TEXTS = (".csv", ".txt", ".tsv", ".dat")
-_TABLES = (*_TEXTS, ".parquet", *arrays.ENDINGS)
-#: Endings of logs of frames alone; all others may be a table's. How workbooks and HDF5 begin, which are not read.
-_FRAMES, _BINARY = (".blf", ".asc", ".trc"), (b"PK\x03\x04", b"\x89HDF", b"\xd0\xcf\x11\xe0")
+_TABLES = (".csv", ".txt", ".tsv", ".dat", ".xlsx", ".xls", ".ods", ".parquet", ".feather", *arrays.ENDINGS)
+#: Endings of logs of frames alone; all others may be a table's.
+_FRAMES = (".blf", ".asc", ".trc")
+#: How columnar files and workbooks begin.
+_PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
@@ -74,7 +76,7 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
     if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):
         return _channels(path, content, names), digest
-    if begins or ending in _FRAMES or (ending not in arrays.ENDINGS and content.startswith(_BINARY)):
+    if begins or ending in _FRAMES:
         tables, measurements = ", ".join(_TABLES), ", ".join(_MEASUREMENTS)
         raise InputError(f"{path}: expected a table ({tables}) or a measurement ({measurements}): no dbc")
     if time is None:
@@ -130,12 +132,18 @@ def _other_unit(largest_s: float, time) -> str:
 def _table(path: Path, content: bytes, ending: str, names: list[str]):
     """The table in a file (pyarrow.Table), with ``names`` as its columns."""
     import pyarrow
+    import pyarrow.feather
     import pyarrow.parquet
 
-    if ending in arrays.ENDINGS:
-        return _of_arrays(path, arrays.read_arrays(path, content, ending), names)
+    if format := arrays.array_ending(content, ending):
+        return _of_arrays(path, arrays.read_arrays(path, content, format), names)
     try:
-        table = pyarrow.parquet.read_table(io.BytesIO(content)) if ending == ".parquet" else _text_table(path, content, names)
+        if ending == ".parquet" or content.startswith(_PARQUET):
+            table = pyarrow.parquet.read_table(io.BytesIO(content))
+        elif content.startswith(_FEATHER):
+            table = pyarrow.feather.read_table(io.BytesIO(content))
+        else:
+            table = _text_table(path, _of_workbook(path, content, names), names)
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
     found = {name: _place(name, table.column_names) for name in names}
@@ -147,7 +155,26 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
     return pyarrow.table({name: table.column(place) for name, place in found.items()})
 
 
-def _of_arrays(path: Path, found: dict[str, np.ndarray], names: list[str]):
+def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
+    """The sheet of a workbook that has most of the names, as a text; any other content as it is."""
+    if not content.startswith(_WORKBOOKS):
+        return content
+    try:
+        from python_calamine import CalamineError, CalamineWorkbook
+    except ImportError as error:
+        raise needs_extra(path, error, "formats") from None
+    try:
+        book = CalamineWorkbook.from_filelike(io.BytesIO(content))
+        sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
+    except CalamineError as error:
+        raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
+    rows = max(sheets, key=lambda rows: len({*names} & {cell for row in rows[:_PREAMBLE] for cell in row}), default=[])
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    return text.getvalue().encode()
+
+
+def _of_arrays(path: Path, found: dict[str, np.ndarray | list], names: list[str]):
     import pyarrow
 
     for name in names:
@@ -157,7 +184,19 @@ def _of_arrays(path: Path, found: dict[str, np.ndarray], names: list[str]):
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise InputError(f"{path}: variables of one length expected, found {told}")
-    return pyarrow.table({name: found[name] for name in names})
+    return pyarrow.table({name: _column(found[name]) for name in names})
+
+
+def _column(values: np.ndarray | list):
+    """A column (pyarrow.Array); texts are times where all are such as ISO 8601 has."""
+    import pyarrow
+
+    column = pyarrow.array(values)
+    if pyarrow.types.is_string(column.type):
+        for zone in ("UTC", None):
+            with contextlib.suppress(pyarrow.ArrowInvalid):
+                return column.cast(pyarrow.timestamp("ns", zone))
+    return column
 
 
 def _place(name: str, names: list[str]) -> int | None:
