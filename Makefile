@@ -27,7 +27,7 @@ wheel: $(READY)
 	rm -rf dist
 	$(VENV)/bin/python -m hatchling build
 
-# The daemon for a box with Debian of this machine's release, without a compiler; DEB_MACHINE=aarch64 for another kind.
+# The daemon for boxes with Debian of this machine's release, without a compiler; DEB_MACHINE="x86_64 aarch64" for both kinds.
 DEB_MACHINE ?= $(shell uname -m)
 deb: wheel
 	$(VENV)/bin/python packaging/make_deb.py dist/*.whl --machine $(DEB_MACHINE)

@@ -1,7 +1,7 @@
 """Makes the Debian package: the daemon in an environment of its own under /opt/emb_daemon, its kernels compiled ahead.
 
-    make deb                        for this machine, in dist
-    make deb DEB_MACHINE=aarch64    for another
+    make deb                                  for this machine, in dist
+    make deb DEB_MACHINE="x86_64 aarch64"     for several, compiling once
 
 Needs dpkg-deb, a linker for the machine (`emb-daemon compile` says which), and the wheel in dist. The package runs with the
 Python of the Debian release that it was made on: compiled wheels are for one version of it.
@@ -16,6 +16,7 @@ import zipfile
 from pathlib import Path
 
 from emb_daemon.ahead.library import read_manifest, source_digest
+from emb_daemon.cli.main import main as emb_daemon
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Architecture, and pip's names of the oldest libc that wheels are taken for: Debian 11 has 2.31.
@@ -118,22 +119,28 @@ def pack(root: Path, version: str, architecture: str, python: str, folder: Path)
     return package
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="The Debian package, in dist.")
-    parser.add_argument("wheel", type=Path, help="of the project")
-    parser.add_argument("--machine", choices=MACHINES, default="x86_64")
-    arguments = parser.parse_args()
-    python, version = system_python(), arguments.wheel.name.split("-")[1]
+def make(wheel: Path, machine: str, python: str) -> Path:
+    """The package for a machine, beside the wheel."""
     with tempfile.TemporaryDirectory() as name:
         root, kernels = Path(name, "root"), Path(name, "kernels.so")
-        compile_ = [sys.executable, "-m", "emb_daemon.cli.main", "compile", "--target", arguments.machine, "--output", kernels]
-        subprocess.run(compile_, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
-        fetch_packages(site_of(root, python), arguments.machine, python)
-        lay_out(root, arguments.wheel, kernels, python)
+        # In this process: what is compiled for one machine is only emitted anew for the next.
+        if emb_daemon(["compile", "--target", machine, "--output", str(kernels)]):
+            sys.exit(1)
+        fetch_packages(site_of(root, python), machine, python)
+        lay_out(root, wheel, kernels, python)
         if read_manifest(kernels).sources != source_digest(site_of(root, python) / "emb_daemon"):
-            sys.exit(f"{arguments.wheel}: of other sources than {ROOT}; make wheel")
+            sys.exit(f"{wheel}: of other sources than {ROOT}; make wheel")
         compile_bytecode(root)
-        print(pack(root, version, MACHINES[arguments.machine][0], python, arguments.wheel.parent))
+        return pack(root, wheel.name.split("-")[1], MACHINES[machine][0], python, wheel.parent)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Debian packages, in the wheel's folder.")
+    parser.add_argument("wheel", type=Path, help="of the project")
+    parser.add_argument("--machine", nargs="+", choices=MACHINES, default=["x86_64"])
+    arguments = parser.parse_args()
+    for machine in arguments.machine:
+        print(make(arguments.wheel, machine, system_python()))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The daemon's code path over recorded frames, with the kernels that this process has; and a process that has a library's.
 
-python tests/aheadkit.py FRAMES STATE OUTPUT
+python tests/aheadkit.py LOG STATE OUTPUT
 """
 
 import sys
@@ -58,8 +58,10 @@ def main() -> None:
     assert not library.load() and library.in_use()
     import numpy as np
 
-    frames, state, output = sys.argv[1:]
-    np.savez(output, **answered(np.load(frames), Path(state)))
+    from emb_daemon.logs.read import read_frames
+
+    log, state, output = sys.argv[1:]
+    np.savez(output, **answered(read_frames(log), Path(state)))
     print(library.description(), "; executable memory refused" if refused else "; this kernel cannot refuse executable memory")
 
 

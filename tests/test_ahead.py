@@ -19,6 +19,8 @@ from emb_daemon.ahead.signature import Array
 from emb_daemon.errors import Unavailable
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.jit import ENTRIES
+from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.write import write_frames
 from emb_daemon.plant.scenarios import city_drive
 from emb_daemon.runtime import bus, daemon
 
@@ -46,13 +48,14 @@ def frames(tmp_path_factory):
 
 
 def test_every_byte_is_as_from_numba(compiled, frames, tmp_path):
-    np.save(tmp_path / "frames.npy", frames)
-    command = [sys.executable, aheadkit.__file__, tmp_path / "frames.npy", tmp_path / "ahead", tmp_path / "ahead.npz"]
+    log = tmp_path / "drive.log"
+    write_frames(log, frames)
+    command = [sys.executable, aheadkit.__file__, log, tmp_path / "ahead", tmp_path / "ahead.npz"]
     environment = _environment(EMB_DAEMON_KERNELS=str(compiled / "kernels.so"))
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     print(done.stdout)
-    expected, found = aheadkit.answered(frames, tmp_path / "numba"), np.load(tmp_path / "ahead.npz")
+    expected, found = aheadkit.answered(read_frames(log), tmp_path / "numba"), np.load(tmp_path / "ahead.npz")
     assert expected["samples"] > 20_000 and "adaptation-FL.json" in expected, "the drive does not show much"
     assert list(expected) == list(found)
     for name in expected:

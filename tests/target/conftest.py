@@ -17,11 +17,13 @@ import pytest
 from bus_tools import CHANNEL, RIG, Recording
 
 # What .ci/target promises. A test that finds a promise broken fails; it is never skipped for that.
-PROMISED = {"native": {"can"}, "uml": {"can"}, "systemd": {"can", "systemd"}}
+PROMISED = {"native": {"can"}, "uml": {"can"}, "systemd": {"can", "systemd"}, "package": {"can", "package"}}
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "target(need): needs a real CAN interface ('can') or systemd ('systemd')")
+    config.addinivalue_line(
+        "markers", "target(need): needs a CAN interface ('can'), the service ('systemd') or the package ('package')"
+    )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

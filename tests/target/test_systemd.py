@@ -19,18 +19,29 @@ from pathlib import Path
 
 import pytest
 from bus_tools import CHANNEL, CLAMP_FORCE, RESOLVER, RIG, Recording, answers, playing, replayed, wait_for
+from service_tools import (
+    FORCES,
+    PERIOD_S,
+    UNIT,
+    active,
+    exposure,
+    journal,
+    journal_cursor,
+    journal_since,
+    main_pid,
+    prop,
+    systemctl,
+    wait_for_forces,
+)
 
 pytestmark = pytest.mark.target("systemd")
 
-UNIT = "emb-daemon.service"
 CONFIG = Path("/etc/emb_daemon/emb.yaml")
 CACHE, STATE = Path("/var/cache/emb_daemon"), Path("/var/lib/emb_daemon")
 LOG = RIG / "static" / "random_6p5mm.log.gz"
 CURRENT = 0x110
-FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
 STATUS = 0x220  # EMB_c_EstimatorStatus of the first corner
 DEADLINE_MISSED = 0x2000
-PERIOD_S = 0.004
 # Of broadcasts. The loop counts from wake to wake, and one that is held up between the two says so at the next.
 CLEARLY_MISSED_S = 4 * PERIOD_S
 STATUS_WITHIN_S = 0.3  # it comes every 0.1 s
@@ -39,24 +50,6 @@ PAIRING_S = 0.002
 COLD_START_S = 780  # all kernels compiled: 290 to 410 s seen, by what other guests left of the CPU
 WARM_START_S = 120  # 12 to 17 s seen, and more than 30
 MAXIMAL_EXPOSURE = 3.0
-
-
-def systemctl(*arguments: str, check: bool = True) -> str:
-    done = subprocess.run(["systemctl", *arguments], check=False, capture_output=True, text=True)
-    assert done.returncode == 0 or not check, f"systemctl {' '.join(arguments)}: {done.stderr}"
-    return done.stdout.strip()
-
-
-def prop(name: str) -> str:
-    return systemctl("show", UNIT, f"--property={name}", "--value")
-
-
-def main_pid() -> int:
-    return int(prop("MainPID"))
-
-
-def active() -> bool:
-    return prop("ActiveState") == "active"
 
 
 def wait_for_another(pid: int) -> float:
@@ -68,19 +61,6 @@ def wait_for_another(pid: int) -> float:
         return state["ActiveState"] == "active" and int(state["MainPID"]) not in (0, pid)
 
     return wait_for("another process is ready", ready, WARM_START_S, poll_s=0.5)
-
-
-def journal(*arguments: str) -> str:
-    command = ["journalctl", "--boot", "--no-pager", "--output=cat", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-def journal_since(cursor: str) -> str:
-    return journal(f"--after-cursor={cursor}")
-
-
-def journal_cursor() -> str:
-    return journal("--lines=0", "--show-cursor").rpartition("-- cursor: ")[2].strip()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -104,17 +84,6 @@ def inputs(service: None, rig_log: Path) -> Iterator[None]:
     """A vehicle on the bus, for as long as the test lasts."""
     with playing(rig_log, "-l", "i"):
         yield
-
-
-def wait_for_forces(record: Callable[..., Recording], timeout_s: float) -> float:
-    """Until clamp forces are on the bus, at their rate and not just one; how long that took."""
-
-    def broadcasting() -> bool:
-        with record(FORCES) as recording:
-            time.sleep(0.5)
-        return len(recording.frames) > 0.5 / PERIOD_S / 2
-
-    return wait_for("clamp forces are broadcast", broadcasting, timeout_s)
 
 
 # --- it starts, and as whom ------------------------------------------------------------------------------------------
@@ -145,12 +114,7 @@ def test_its_loop_and_nothing_else_is_real_time(service: None) -> None:
 
 
 def test_exposure_is_low() -> None:
-    command = ["systemd-analyze", "security", "--no-pager", UNIT]
-    report = subprocess.run(command, check=False, capture_output=True, text=True).stdout
-    exposure = re.search(r"Overall exposure level.*: (\d+\.\d+)", report)
-    assert exposure is not None, report
-    print(exposure[0])
-    assert float(exposure[1]) <= MAXIMAL_EXPOSURE, report
+    assert exposure() <= MAXIMAL_EXPOSURE
 
 
 def test_unit_has_no_fault_that_systemd_knows() -> None:
