@@ -115,7 +115,7 @@ def _write(frames, rows, signal, values, degraded):
         frame.data = protect(frame.can_id, payload, counter, status)
 
 
-def _alter(slot: int, column: int, change: Callable, degraded: bool = False) -> Callable:
+def alter(slot: int, column: int, change: Callable, degraded: bool = False) -> Callable:
     """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right.
 
     ``degraded``: the sender says so in its status.
@@ -131,7 +131,7 @@ def _alter(slot: int, column: int, change: Callable, degraded: bool = False) -> 
     return bus
 
 
-def _chain(*buses: Callable) -> Callable:
+def chain(*buses: Callable) -> Callable:
     def bus(frames, time_s):
         for one in buses:
             frames = one(frames, time_s)
@@ -140,11 +140,11 @@ def _chain(*buses: Callable) -> Callable:
     return bus
 
 
-def _during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
+def during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
     return lambda frames, time_s: bus(frames, time_s) if begin_s <= time_s < end_s else frames
 
 
-def _lose(*slots: int) -> Callable:
+def lose(*slots: int) -> Callable:
     """A bus that loses the messages of some slots."""
     ids = [_IDS[slot] for slot in slots]
     return lambda frames, _: frames[~np.isin(frames["can_id"], ids)]
@@ -159,7 +159,7 @@ def _hold(slot: int, column: int) -> Callable:
             kept.append(values[0])
         return kept[0] if kept else values
 
-    return _alter(slot, column, change)
+    return alter(slot, column, change)
 
 
 def _toggle(rng, slot: int, column: int, lsb: float) -> Callable:
@@ -171,38 +171,38 @@ def _toggle(rng, slot: int, column: int, lsb: float) -> Callable:
             kept.append(values[0])
         return kept[0] + lsb * rng.integers(-1, 2, len(values)) if kept else values
 
-    return _alter(slot, column, change)
+    return alter(slot, column, change)
 
 
 # Draws.
 
 
-def _draw_size(rng, low: float, high: float) -> float:
+def draw_size(rng, low: float, high: float) -> float:
     """Log-uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _draw_signed(rng, low: float, high: float) -> float:
-    return _draw_size(rng, low, high) * float(rng.choice((-1.0, 1.0)))
+def draw_signed(rng, low: float, high: float) -> float:
+    return draw_size(rng, low, high) * float(rng.choice((-1.0, 1.0)))
 
 
-def _pick_driving(rng, moments) -> float:
+def pick_driving(rng, moments) -> float:
     """A moment with the brake released, before parking."""
     return float(moments[rng.choice(("go_1", "go_2", "go_3"))] + rng.uniform(0.5, 2.5))
 
 
-def _pick_clamped(rng, moments) -> float:
+def pick_clamped(rng, moments) -> float:
     """A moment with the brake applied, before parking."""
     return float(moments[rng.choice(("hold_1", "stop_1", "drag_1", "stop_2", "reversals"))] + rng.uniform(0.8, 2.0))
 
 
-def _pick_sometime(rng, moments) -> float:
+def pick_sometime(rng, moments) -> float:
     """The start, or a moment of driving or braking, or just before the training."""
     choice = rng.integers(4)
-    return (0.0, _pick_driving(rng, moments), _pick_clamped(rng, moments), moments["park"] - 0.5)[choice]
+    return (0.0, pick_driving(rng, moments), pick_clamped(rng, moments), moments["park"] - 0.5)[choice]
 
 
-def _once(at_s: float, action: Callable) -> Callable:
+def once(at_s: float, action: Callable) -> Callable:
     """Does ``action(plants)`` once, at ``at_s``."""
     done = []
 
@@ -221,7 +221,7 @@ def _move(name: str, by: float) -> Callable:
     return action
 
 
-def _scale(by: float, *names: str) -> Callable:
+def scale(by: float, *names: str) -> Callable:
     def action(plants):
         for name in names:
             plants[name] *= by
@@ -229,7 +229,7 @@ def _scale(by: float, *names: str) -> Callable:
     return action
 
 
-def _effect(name: str, **values) -> Callable:
+def effect(name: str, **values) -> Callable:
     def action(plants):
         for key, value in values.items():
             plants["effects"][name][key] = value
@@ -237,7 +237,7 @@ def _effect(name: str, **values) -> Callable:
     return action
 
 
-def _move_contact(plants, um: float) -> None:
+def move_contact(plants, um: float) -> None:
     plants["contact_angle"] += 1e-6 * um / plants["gear_gain"]
 
 
@@ -268,18 +268,18 @@ def tolerance(rng, moments, size):
 
 @_family
 def contact_jump(rng, moments, size):
-    um, at = _draw_signed(rng, 10.0, 150.0), _pick_driving(rng, moments)
-    return Fault(f"{um:+.0f} um", at, car=_once(at, lambda plants: _move_contact(plants, um)))
+    um, at = draw_signed(rng, 10.0, 150.0), pick_driving(rng, moments)
+    return Fault(f"{um:+.0f} um", at, car=once(at, lambda plants: move_contact(plants, um)))
 
 
 @_family
 def contact_slow(rng, moments, size):
-    um, at, seconds = _draw_signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
+    um, at, seconds = draw_signed(rng, 10.0, 150.0), moments[rng.choice(("go_1", "park"))], 25.0
     state = [0.0]
 
     def car(car, time_s):
         share = min(max((time_s - at) / seconds, 0.0), 1.0)
-        _move_contact(car.plants, um * (share - state[0]))
+        move_contact(car.plants, um * (share - state[0]))
         state[0] = share
 
     return Fault(f"{um:+.0f} um over 25 s", at, car=car)
@@ -288,13 +288,13 @@ def contact_slow(rng, moments, size):
 @_family
 def knock_back(rng, moments, size):
     """Between stops the contact moves, as cornering and run-out push pads back."""
-    um, times = _draw_size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
+    um, times = draw_size(rng, 10.0, 100.0), sorted(moments[name] + 1.0 for name in moments if name.startswith("go"))
     state = [0, 0.0]
 
     def car(car, time_s):
         if state[0] < len(times) and time_s >= times[state[0]]:
             shift = um * rng.standard_normal()
-            _move_contact(car.plants, shift - state[1])
+            move_contact(car.plants, shift - state[1])
             state[:] = state[0] + 1, shift
 
     return Fault(f"{um:.0f} um standard deviation", times[0], car=car)
@@ -302,8 +302,8 @@ def knock_back(rng, moments, size):
 
 @_family
 def disc_growth(rng, moments, size):
-    growth = _draw_size(rng, 0.1, 0.5)
-    return Fault(f"{growth:.2f} um/K", brake=_effect("disc_thermal_expansion", growth_um_per_K=growth))
+    growth = draw_size(rng, 0.1, 0.5)
+    return Fault(f"{growth:.2f} um/K", brake=effect("disc_thermal_expansion", growth_um_per_K=growth))
 
 
 @_family
@@ -315,19 +315,19 @@ def pads_thickness(rng, moments, size):
 @_family
 def pads_compound(rng, moments, size):
     factor = float(rng.uniform(0.7, 1.3))
-    return Fault(f"curve x {factor:.2f}", brake=_scale(factor, "curve"))
+    return Fault(f"curve x {factor:.2f}", brake=scale(factor, "curve"))
 
 
 @_family
 def wear(rng, moments, size):
-    wear = _draw_size(rng, 10.0, 200.0)
-    return Fault(f"{wear:.0f} um/MJ", brake=_effect("pad_wear", wear_um_per_MJ=wear))
+    wear = draw_size(rng, 10.0, 200.0)
+    return Fault(f"{wear:.0f} um/MJ", brake=effect("pad_wear", wear_um_per_MJ=wear))
 
 
 @_family
 def thickness_variation(rng, moments, size):
-    um = _draw_size(rng, 5.0, 20.0)
-    return Fault(f"{um:.0f} um", brake=_effect("disc_thickness_variation", order_1_cosine_um=um, order_2_sine_um=0.3 * um))
+    um = draw_size(rng, 5.0, 20.0)
+    return Fault(f"{um:.0f} um", brake=effect("disc_thickness_variation", order_1_cosine_um=um, order_2_sine_um=0.3 * um))
 
 
 # Torque.
@@ -335,14 +335,14 @@ def thickness_variation(rng, moments, size):
 
 @_family
 def torque_constant(rng, moments, size):
-    factor, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
-    return Fault(f"x {factor:.3f}", at, car=_once(at, _scale(factor, "torque_constant")))
+    factor, at = 1.0 + draw_signed(rng, 0.02, 0.15), pick_sometime(rng, moments)
+    return Fault(f"x {factor:.3f}", at, car=once(at, scale(factor, "torque_constant")))
 
 
 @_family
 def torque_constant_fade(rng, moments, size):
     """Magnets lose 0.12 %/K as the motor's own current heats winding and housing, in minutes compressed to the drive's."""
-    heating = _draw_size(rng, 0.5, 3.0) / size.current**2
+    heating = draw_size(rng, 0.5, 3.0) / size.current**2
 
     def brake(plant):
         plant["magnet_heating"], plant["copper_per_K"] = heating, 0.0039
@@ -354,41 +354,41 @@ def torque_constant_fade(rng, moments, size):
 
 @_family
 def current_gain(rng, moments, size):
-    gain, at = 1.0 + _draw_signed(rng, 0.02, 0.15), _pick_sometime(rng, moments)
-    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
-    return Fault(f"x {gain:.3f}", at, bus=_during(change, at))
+    gain, at = 1.0 + draw_signed(rng, 0.02, 0.15), pick_sometime(rng, moments)
+    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
+    return Fault(f"x {gain:.3f}", at, bus=during(change, at))
 
 
 @_family
 def current_offset(rng, moments, size):
-    offset = size.current * _draw_signed(rng, 0.2, 3.0)
-    return Fault(f"{offset:+.2f} A", bus=_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
+    offset = size.current * draw_signed(rng, 0.2, 3.0)
+    return Fault(f"{offset:+.2f} A", bus=alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset))
 
 
 @_family
 def current_offset_later(rng, moments, size):
-    offset = size.current * _draw_signed(rng, 0.2, 3.0)
-    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
-    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
-    return Fault(f"{offset:+.2f} A", at, bus=_during(change, at))
+    offset = size.current * draw_signed(rng, 0.2, 3.0)
+    at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
+    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
+    return Fault(f"{offset:+.2f} A", at, bus=during(change, at))
 
 
 @_family
 def current_offset_drift(rng, moments, size):
-    rate, at = size.current * _draw_signed(rng, 0.005, 0.1), moments["go_1"]
-    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
-    return Fault(f"{rate:+.3f} A/s", at, bus=_during(change, at))
+    rate, at = size.current * draw_signed(rng, 0.005, 0.1), moments["go_1"]
+    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
+    return Fault(f"{rate:+.3f} A/s", at, bus=during(change, at))
 
 
 @_family
 def current_late(rng, moments, size):
-    return Fault("a third of a cycle", brake=_effect("current_delay", delay_s=0.004 / 3.0))
+    return Fault("a third of a cycle", brake=effect("current_delay", delay_s=0.004 / 3.0))
 
 
 @_family
 def angle_late(rng, moments, size):
     delay = float(rng.uniform(0.001, 0.009))
-    return Fault(f"{1e3 * delay:.1f} ms", brake=_effect("signal_delay", delay_s=delay))
+    return Fault(f"{1e3 * delay:.1f} ms", brake=effect("signal_delay", delay_s=delay))
 
 
 # Friction.
@@ -396,38 +396,38 @@ def angle_late(rng, moments, size):
 
 @_family
 def friction_scale(rng, moments, size):
-    factor, at = _draw_size(rng, 0.5, 2.0), _pick_sometime(rng, moments)
-    return Fault(f"x {factor:.2f}", at, car=_once(at, _scale(factor, "load_friction", "offset_friction")))
+    factor, at = draw_size(rng, 0.5, 2.0), pick_sometime(rng, moments)
+    return Fault(f"x {factor:.2f}", at, car=once(at, scale(factor, "load_friction", "offset_friction")))
 
 
 @_family
 def cold_grease(rng, moments, size):
-    ambient, grease = float(rng.uniform(-30.0, -10.0)), _draw_size(rng, 0.005, 0.03)
-    viscous = size.damping * _draw_size(rng, 1e-5, 1e-4)
-    action = _effect("cold_grease", per_K=grease, viscous_Nms_per_rad=viscous)
+    ambient, grease = float(rng.uniform(-30.0, -10.0)), draw_size(rng, 0.005, 0.03)
+    viscous = size.damping * draw_size(rng, 1e-5, 1e-4)
+    action = effect("cold_grease", per_K=grease, viscous_Nms_per_rad=viscous)
     return Fault(f"{ambient:.0f} degC, {100 * grease:.1f} %/K, {1e6 * viscous:.0f} uNms/rad", brake=action, ambient_C=ambient)
 
 
 @_family
 def stribeck(rng, moments, size):
-    rise, speed = float(rng.uniform(0.3, 1.0)), _draw_size(rng, 2.0, 15.0)
-    action = _effect("stribeck_friction", rise=rise, speed_rad_per_s=speed)
+    rise, speed = float(rng.uniform(0.3, 1.0)), draw_size(rng, 2.0, 15.0)
+    action = effect("stribeck_friction", rise=rise, speed_rad_per_s=speed)
     return Fault(f"+{100 * rise:.0f} % below {speed:.0f} rad/s", brake=action)
 
 
 @_family
 def viscous(rng, moments, size):
-    value = size.damping * _draw_size(rng, 1e-4, 1e-3)
-    return Fault(f"{1e6 * value:.0f} uNms/rad", brake=_effect("viscous_friction", viscous_Nms_per_rad=value))
+    value = size.damping * draw_size(rng, 1e-4, 1e-3)
+    return Fault(f"{1e6 * value:.0f} uNms/rad", brake=effect("viscous_friction", viscous_Nms_per_rad=value))
 
 
 @_family
 def gear_wear(rng, moments, size):
     """A gear that has run in or worn: friction, its presliding and play of another size."""
-    friction, play = float(rng.uniform(0.7, 1.4)), _draw_size(rng, 0.01, 0.15)
+    friction, play = float(rng.uniform(0.7, 1.4)), draw_size(rng, 0.01, 0.15)
 
     def brake(plant):
-        _scale(friction, "load_friction", "offset_friction", "presliding_angle")(plant)
+        scale(friction, "load_friction", "offset_friction", "presliding_angle")(plant)
         plant["effects"]["backlash"]["play_rad"] = play
 
     return Fault(f"friction x {friction:.2f}, play {play:.2f} rad", brake=brake)
@@ -435,24 +435,24 @@ def gear_wear(rng, moments, size):
 
 @_family
 def friction_asymmetry(rng, moments, size):
-    share = _draw_signed(rng, 0.05, 0.4)
-    return Fault(f"{100 * share:+.0f} %", brake=_effect("friction_asymmetry", asymmetry=share))
+    share = draw_signed(rng, 0.05, 0.4)
+    return Fault(f"{100 * share:+.0f} %", brake=effect("friction_asymmetry", asymmetry=share))
 
 
 # Resolver.
 
 
 def _freeze(rng, moments, speed: Callable) -> Fault:
-    at = _pick_driving(rng, moments) if rng.random() < 0.3 else _pick_clamped(rng, moments)
+    at = pick_driving(rng, moments) if rng.random() < 0.3 else pick_clamped(rng, moments)
     end = at + rng.uniform(2.0, 10.0) if rng.random() < 0.5 else np.inf
-    change = _chain(_hold(wire.RESOLVER, wire.MOTOR_ANGLE), speed)
+    change = chain(_hold(wire.RESOLVER, wire.MOTOR_ANGLE), speed)
     lasts = f"{end - at:.0f} s" if np.isfinite(end) else "for good"
-    return Fault(f"{lasts}", at, bus=_during(change, at, end))
+    return Fault(f"{lasts}", at, bus=during(change, at, end))
 
 
 @_family
 def resolver_frozen_speed_zero(rng, moments, size):
-    return _freeze(rng, moments, _alter(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
+    return _freeze(rng, moments, alter(wire.RESOLVER, wire.MOTOR_SPEED, lambda values, _: 0.0 * values))
 
 
 @_family
@@ -466,7 +466,7 @@ def resolver_frozen_speed_noise(rng, moments, size):
     def angle(values, _):
         return values + flicker * rng.standard_normal(len(values))
 
-    noise = _chain(_alter(wire.RESOLVER, wire.MOTOR_SPEED, speed), _alter(wire.RESOLVER, wire.MOTOR_ANGLE, angle))
+    noise = chain(alter(wire.RESOLVER, wire.MOTOR_SPEED, speed), alter(wire.RESOLVER, wire.MOTOR_ANGLE, angle))
     return _freeze(rng, moments, noise)
 
 
@@ -476,24 +476,24 @@ def resolver_frozen_last(rng, moments, size):
 
 
 def _angle_fault(size: str, at: float, change: Callable) -> Fault:
-    return Fault(size, at, bus=_during(_alter(wire.RESOLVER, wire.MOTOR_ANGLE, change), at))
+    return Fault(size, at, bus=during(alter(wire.RESOLVER, wire.MOTOR_ANGLE, change), at))
 
 
 @_family
 def resolver_jump(rng, moments, size):
-    jump, at = _draw_signed(rng, 0.2, 20.0), _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
+    jump, at = draw_signed(rng, 0.2, 20.0), pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
     return _angle_fault(f"{jump:+.2f} rad", at, lambda values, _: values + jump)
 
 
 @_family
 def resolver_drift(rng, moments, size):
-    rate, at = _draw_signed(rng, 0.01, 0.5), moments["go_1"]
+    rate, at = draw_signed(rng, 0.01, 0.5), moments["go_1"]
     return _angle_fault(f"{rate:+.3f} rad/s", at, lambda values, time_s: values + rate * (time_s - at))
 
 
 @_family
 def resolver_gain(rng, moments, size):
-    gain, first = 1.0 + _draw_signed(rng, 0.005, 0.1), []
+    gain, first = 1.0 + draw_signed(rng, 0.005, 0.1), []
 
     def change(values, _):
         if not first and len(values):
@@ -506,7 +506,7 @@ def resolver_gain(rng, moments, size):
 @_family
 def resolver_loses_counts(rng, moments, size):
     """A share of the travel in one direction is not counted."""
-    share, at = _draw_size(rng, 0.001, 0.05), moments["go_1"]
+    share, at = draw_size(rng, 0.001, 0.05), moments["go_1"]
     state = [np.nan, 0.0]
 
     def change(values, _):
@@ -523,7 +523,7 @@ def resolver_loses_counts(rng, moments, size):
 @_family
 def resolver_slips(rng, moments, size):
     """The rotor slips a little whenever the motor starts fast."""
-    slip, at, state = _draw_size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
+    slip, at, state = draw_size(rng, 0.02, 1.0), moments["go_1"], [np.nan, 0.0, False]
 
     def change(values, _):
         if not len(values):
@@ -543,28 +543,28 @@ def resolver_slips(rng, moments, size):
 
 @_family
 def current_frozen(rng, moments, size):
-    at = _pick_clamped(rng, moments)
-    return Fault("", at, bus=_during(_hold(wire.CURRENT, wire.CURRENT_Q), at))
+    at = pick_clamped(rng, moments)
+    return Fault("", at, bus=during(_hold(wire.CURRENT, wire.CURRENT_Q), at))
 
 
 @_family
 def current_zero(rng, moments, size):
-    at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
-    return Fault("", at, bus=_during(_alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
+    at = pick_clamped(rng, moments) if rng.random() < 0.5 else pick_driving(rng, moments)
+    return Fault("", at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
 
 
 @_family
 def current_lost(rng, moments, size):
-    at = _pick_clamped(rng, moments) if rng.random() < 0.5 else _pick_driving(rng, moments)
-    return Fault("", at, bus=_during(_lose(wire.CURRENT), at))
+    at = pick_clamped(rng, moments) if rng.random() < 0.5 else pick_driving(rng, moments)
+    return Fault("", at, bus=during(lose(wire.CURRENT), at))
 
 
 @_family
 def current_degraded(rng, moments, size):
     """The current sensor reads wrong and its sender's status says Degraded."""
-    gain, at = float(rng.uniform(0.3, 0.8)), _pick_driving(rng, moments)
-    change = _alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
-    return Fault(f"x {gain:.2f}", at, bus=_during(change, at))
+    gain, at = float(rng.uniform(0.3, 0.8)), pick_driving(rng, moments)
+    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
+    return Fault(f"x {gain:.2f}", at, bus=during(change, at))
 
 
 # Wheel and heat.
@@ -573,13 +573,13 @@ def current_degraded(rng, moments, size):
 @_family
 def wheel_speed_lost(rng, moments, size):
     at = moments["drag_1"] + 1.0
-    return Fault("", at, bus=_during(_lose(wire.WHEEL_SPEED), at))
+    return Fault("", at, bus=during(lose(wire.WHEEL_SPEED), at))
 
 
 @_family
 def wheel_speed_zero(rng, moments, size):
     at = moments["drag_1"] + 1.0
-    return Fault("", at, bus=_during(_alter(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
+    return Fault("", at, bus=during(alter(wire.WHEEL_SPEED, 0, lambda values, _: 0.0 * values), at))
 
 
 #: What brake and calibration both have of disc thickness variation where the wheel's phase is the question, um.
@@ -591,40 +591,40 @@ _KNOWN_VARIATION = {"disc_thickness_variation": _VARIATION}
 @_family
 def wheel_pulses_pause(rng, moments, size):
     at, seconds = moments["go_2"] + 1.0, float(rng.uniform(0.5, 8.0))
-    return Fault(f"{seconds:.1f} s", at, bus=_during(_lose(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
+    return Fault(f"{seconds:.1f} s", at, bus=during(lose(wire.WHEEL_PULSE), at, at + seconds), effects=_KNOWN_VARIATION)
 
 
 @_family
 def wheel_phase_restart(rng, moments, size):
     """The daemon restarts on a disc whose thickness variation it knows."""
-    at = _pick_driving(rng, moments)
+    at = pick_driving(rng, moments)
     return Fault("", at, restarts=((at, 0.5),), effects=_KNOWN_VARIATION)
 
 
 @_family
 def thermocouple_drifts(rng, moments, size):
-    rate, at, side = _draw_signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
-    change = _alter(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
-    return Fault(f"{rate:+.1f} K/s", at, bus=_during(change, at))
+    rate, at, side = draw_signed(rng, 0.2, 3.0), moments["go_1"], int(rng.integers(2))
+    change = alter(wire.THERMOCOUPLE, side, lambda values, time_s: values + rate * (time_s - at))
+    return Fault(f"{rate:+.1f} K/s", at, bus=during(change, at))
 
 
 @_family
 def thermocouple_stuck(rng, moments, size):
     at = moments["go_1"]
-    return Fault("both", at, bus=_during(_chain(_hold(wire.THERMOCOUPLE, 0), _hold(wire.THERMOCOUPLE, 1)), at))
+    return Fault("both", at, bus=during(chain(_hold(wire.THERMOCOUPLE, 0), _hold(wire.THERMOCOUPLE, 1)), at))
 
 
 @_family
 def thermocouple_stuck_noise(rng, moments, size):
     at = moments["go_1"]
-    change = _chain(_toggle(rng, wire.THERMOCOUPLE, 0, 0.1), _toggle(rng, wire.THERMOCOUPLE, 1, 0.1))
-    return Fault("both, one least count", at, bus=_during(change, at))
+    change = chain(_toggle(rng, wire.THERMOCOUPLE, 0, 0.1), _toggle(rng, wire.THERMOCOUPLE, 1, 0.1))
+    return Fault("both, one least count", at, bus=during(change, at))
 
 
 @_family
 def thermocouple_lost(rng, moments, size):
     at = moments["go_1"]
-    return Fault("", at, bus=_during(_lose(wire.THERMOCOUPLE), at))
+    return Fault("", at, bus=during(lose(wire.THERMOCOUPLE), at))
 
 
 @_family
@@ -645,7 +645,7 @@ def ambient_cold(rng, moments, size):
 
 @_family
 def start_clamped(rng, moments, size):
-    at = _pick_clamped(rng, moments)
+    at = pick_clamped(rng, moments)
     return Fault(f"at {at:.0f} s", at, power_on_s=at)
 
 
@@ -658,15 +658,15 @@ def start_latched(rng, moments, size):
 @_family
 def power_cycle(rng, moments, size):
     """Everything loses power for a second, and the resolver counts from another zero."""
-    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
+    at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
     shift = float(rng.uniform(-100.0, 100.0))
-    car = _once(at - 0.5, _move("released_angle", shift))
+    car = once(at - 0.5, _move("released_angle", shift))
     return Fault(f"zero {shift:+.0f} rad", at, car=car, restarts=((at, 1.0),))
 
 
 @_family
 def daemon_restart(rng, moments, size):
-    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
+    at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
     return Fault("", at, restarts=((at, 0.5),))
 
 
@@ -674,10 +674,10 @@ def daemon_restart(rng, moments, size):
 def bursts_lost(rng, moments, size):
     """Bursts of up to 100 ms, of one message or all, about two a second."""
     slots = [(wire.RESOLVER,), (wire.CURRENT,), tuple(_IDS)][rng.integers(3)]
-    share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], _lose(*slots)
+    share, at, drop = float(rng.uniform(0.05, 0.3)), moments["go_1"], lose(*slots)
     return Fault(
         f"{100 * share:.0f} % of {len(slots)} messages", at,
-        bus=_during(lambda frames, time_s: drop(frames, time_s) if rng.random() < share else frames, at),
+        bus=during(lambda frames, time_s: drop(frames, time_s) if rng.random() < share else frames, at),
     )  # fmt: skip
 
 
@@ -693,27 +693,27 @@ def _sensor_family(function: Callable) -> Callable:
 
 
 def _sensor_fault(size: str, at: float, change: Callable) -> Fault:
-    return Fault(size, at, bus=_during(_alter(wire.FORCE_SENSOR, wire.SENSOR_FORCE, change), at))
+    return Fault(size, at, bus=during(alter(wire.FORCE_SENSOR, wire.SENSOR_FORCE, change), at))
 
 
 @_sensor_family
 def sensor_stuck(rng, moments, size):
-    at = _pick_driving(rng, moments) if rng.random() < 0.5 else _pick_clamped(rng, moments)
-    return Fault("", at, bus=_during(_hold(wire.FORCE_SENSOR, wire.SENSOR_FORCE), at))
+    at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
+    return Fault("", at, bus=during(_hold(wire.FORCE_SENSOR, wire.SENSOR_FORCE), at))
 
 
 @_sensor_family
 def sensor_gain(rng, moments, size):
-    return _sensor_fault("x 0.80", _pick_driving(rng, moments), lambda values, _: 0.8 * values)
+    return _sensor_fault("x 0.80", pick_driving(rng, moments), lambda values, _: 0.8 * values)
 
 
 @_sensor_family
 def sensor_offset(rng, moments, size):
-    offset, at = size.force * _draw_signed(rng, 100.0, 1500.0), _pick_sometime(rng, moments)
+    offset, at = size.force * draw_signed(rng, 100.0, 1500.0), pick_sometime(rng, moments)
     return _sensor_fault(f"{offset:+.0f} N", at, lambda values, _: values + offset)
 
 
 @_sensor_family
 def sensor_drift(rng, moments, size):
-    rate, at = size.force * _draw_signed(rng, 2.0, 50.0), moments["go_1"]
+    rate, at = size.force * draw_signed(rng, 2.0, 50.0), moments["go_1"]
     return _sensor_fault(f"{rate:+.1f} N/s", at, lambda values, time_s: values + rate * (time_s - at))

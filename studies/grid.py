@@ -30,10 +30,13 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import LATCH
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
-from studies.faults import FAMILIES, LEARNED, NOMINAL, Fault, Size, size_of
+from studies import faults, unlisted
+from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 from studies.strangers import draw_stranger
 
+#: Faults that drives may have.
+FAMILIES = faults.FAMILIES | unlisted.FAMILIES
 #: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
 _PARK_S = 34.0
 #: Cycles of a stretch: training ends if the car does not hear the daemon for 25.

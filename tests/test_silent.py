@@ -14,7 +14,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RESULT_ACCEPTED, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies.faults import FAMILIES, Size, _alter, _lose, size_of
+from studies.faults import FAMILIES, Size, alter, lose, size_of
 from studies.grid import draw_drive, drive
 from studies.phases import first_flag_s, judge
 from studies.silent import main
@@ -125,7 +125,7 @@ def test_the_first_flag_is_the_first_after_the_onset(honest, told):
 def test_a_changed_signal_leaves_the_frame_whole(frames):
     """Counter, CRC and the frame's other signals stay right: the daemon cannot tell the change from a sensor's."""
     before = frames.copy()
-    bus = _alter(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + 3.0)
+    bus = alter(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + 3.0)
     after = bus(frames, 0.0)
     rows, signals = before["can_id"] == 0x100, default_layout()[0]["received"][wire.RESOLVER]
     assert rows.any()
@@ -140,7 +140,7 @@ def test_a_changed_signal_leaves_the_frame_whole(frames):
 
 
 def test_a_lost_message_is_lost_alone(frames):
-    left = _lose(wire.CURRENT)(frames, 0.0)
+    left = lose(wire.CURRENT)(frames, 0.0)
     assert set(np.unique(frames["can_id"])) - set(np.unique(left["can_id"])) == {0x110}
 
 
