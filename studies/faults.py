@@ -53,6 +53,11 @@ class Fault:
     restarts: tuple[tuple[float, float], ...] = ()
     latched_N: float = 0.0
 
+    @property
+    def is_in_frames(self) -> bool:
+        """Whether it acts on the frames alone, so that a log can have it."""
+        return self.brake is self.car is _nothing and not (self.effects or self.pads_mm or self.warm_C or self.restarts)
+
 
 class Size(NamedTuple):
     """Ratios of a brake to the shipped one, by which faults in newtons, amperes or N m s/rad are scaled."""
