@@ -21,7 +21,7 @@ from emb_daemon.ahead import library
 from emb_daemon.ahead.signature import Array, Entry, Function, Kind, name_in_c
 
 __all__ = [
-    "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Record", "Records", "compile_beside",
+    "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Integer", "Record", "Records", "compile_beside",
     "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit",
 ]  # fmt: skip
 
@@ -32,6 +32,8 @@ Records: TypeAlias = NDArray[np.void]
 Floats: TypeAlias = NDArray[np.float64]
 Booleans: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]
+#: Python's or numpy's, as payloads of frames are.
+Integer: TypeAlias = int | np.integer
 
 #: Entry points by name in C, for `emb_daemon.ahead.build`.
 ENTRIES: dict[str, Entry] = {}

@@ -22,7 +22,7 @@ class Array(NamedTuple):
 
 
 #: One element of a signature.
-Kind: TypeAlias = "Array | np.dtype | type[int] | type[float] | type[bool] | tuple[Kind, ...]"
+Kind: TypeAlias = "Array | np.dtype | type[int] | type[float] | type[bool] | tuple[object, ...]"
 
 
 class Entry(NamedTuple):

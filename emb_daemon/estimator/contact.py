@@ -1,4 +1,4 @@
-"""The contact angle of one corner: a resolver that lost its zero, and what torque says against what is believed."""
+"""The contact angle of one corner: a resolver that lost its zero, and torque that contradicts the believed angle."""
 
 from math import hypot, sqrt
 
@@ -28,43 +28,42 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
-#: Travel in one sample, rad, that the speed does not account for and that is no motion, beyond what a delay of this many
-#: seconds between both makes: 60 turns a second that nobody saw. And how well such a jump is known, rad.
+#: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
+#: this many seconds between both: 60 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: A motor stands below this speed; offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations
 #: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
 _STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
-#: From one standstill to the next angle and integrated speed must agree, whatever their delay. For that the motor has to stand
-#: for twice the longest delay of a resolver that a calibration may state, s.
+#: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
+#: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
-#: Of a standstill no more than this counts before the next way, s: the speed's offset makes a fifth of `_ZERO_RAD` in it.
+#: Longest part of a standstill that counts towards the next motion, s: in it the speed's offset adds a fifth of `_ZERO_RAD`.
 _STOOD_S = 1.0
-#: Share of the way by which the integral of the speeds may be off: a step of the acceleration a within a cycle T puts the
-#: trapezoid off by up to a T^2 / 8, and four of them on a way a t^2, sped up for t and slowed down for as long, by
-#: T^2 / (2 t^2) of it, t being 40 ms. On the simulated rig's logs no way strays by more than 0.35 of the limit.
+#: Relative error of the integrated speed: a step of the acceleration a within a cycle T puts the trapezoid off by up to a
+#: T²/8, and four of them on a travel a t², sped up for t and slowed down for as long, by T²/(2 t²) of it, t being 40 ms. On
+#: the simulated rig's logs no travel is off by more than 0.35 of the limit.
 _SPEED_SCALE = 0.005
-#: Standard deviations of the contact angle, rad: known again below, and unknown.
+#: Standard deviations of the contact angle, rad, below which it is known again, and of an unknown one.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
-#: Torque that a released brake may seem to need, share of what the largest force needs: the offset of an ordinary current
-#: sensor; time over which a start is looked at, for which a released motor stands, and after which
-#: it is off, s.
+#: Largest torque of a released brake, as a share of what the largest force needs: the offset of an ordinary current sensor;
+#: times over which a start is observed, for which a released motor must stand, and after which it must be off, s.
 _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
-#: Friction state from which the motor slides; share of the clearance that must be passed; and share of the largest force's
-#: torque that counts as none: a clamped brake would have gained more over that way; share of the Coulomb friction that an open
-#: brake may seem to need.
+#: Friction state from which the motor slides; share of the clearance that must be passed; share of the largest force's torque
+#: that counts as none, because a clamped brake would have gained more over that travel; share of the Coulomb friction that an
+#: open brake may need.
 _SLIDING, _PASSED, _FREE, _OPEN = 0.9, 0.3, 0.02, 0.5
-#: Share of the largest force that the torque must show at power-on for the brake to count as clamped.
+#: Force at power-on, as a share of the largest, from which the brake counts as clamped.
 _CLAMPED = 0.1
 
 
 @njit
 def follow_zero(s: Record, p: Record, m: Record) -> bool:
-    """Whether the resolver has another zero now, because its angle went where the speed says that the motor did not; then the
-    contact angle goes with it.
+    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed; the contact angle is
+    moved with it.
 
-    How far it went is known from the speed. Where the resolver had been repeating itself the motor may have turned on, and
-    what is no motion at all may be anything: then the contact angle becomes uncertain by as much. A resolver that loses counts
-    does so a little in each sample, which shows when the motor stands again; it will lose more, and is disbelieved.
+    The shift follows from the speed. If the resolver had been frozen the motor may have turned meanwhile, and an impossible
+    motion may have any cause; then the contact angle becomes uncertain by as much. A resolver that loses counts loses a few in
+    each sample, which shows when the motor stands again; it will lose more, and is not used.
     """
     jump = m.angle - s.angle
     frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
@@ -86,7 +85,7 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
             s.drifting_s = _DRIFTING_S
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
     if moved != 0.0 or not seen:
-        # Of a way that was not seen whole nothing can be said at its end.
+        # A motion that was not observed completely cannot be checked at its end.
         s.strayed = np.nan
     if moved != 0.0:
         _move_zero(s, p, moved, sigma)
@@ -109,7 +108,7 @@ def _drift(s, p, m, slip, turned):
         return s.drifted
     moved = 0.0
     if s.stood_s > _AT_REST_S:
-        # Only where a way has just ended: at the beginning of the next, a late speed has not yet seen what the angle has.
+        # Only at the end of a motion: at the beginning of the next one a late speed lags the angle.
         ended = s.stood_s - m.dt <= _AT_REST_S
         if ended and abs(s.strayed) > _unaccounted(p, s.turned_s) + _SPEED_SCALE * abs(s.turned):
             moved = s.strayed
@@ -120,7 +119,7 @@ def _drift(s, p, m, slip, turned):
 
 @njit
 def _move_zero(s, p, moved, sigma):
-    """Let every angle that is remembered be read from a zero ``moved`` rad further on, known with ``sigma`` rad."""
+    """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
     s.drifted = s.stood_s = 0.0
     s.angle += moved
     s.angle_before += moved
@@ -137,20 +136,20 @@ def _move_zero(s, p, moved, sigma):
 
 @njit
 def _unaccounted(p, seconds):
-    """Travel (rad) beyond the integrated speed of so many ``seconds`` that neither its noise nor its offset make."""
+    """Least travel (rad) beyond the integrated speed over ``seconds`` that neither its noise nor its offset explain."""
     return _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * seconds + _CERTAIN * p.speed_sigma * sqrt(CYCLE_S * seconds)
 
 
 @njit
 def seek_release(s: Record, p: Record, m: Record) -> None:
-    """Contact is unknown until the brake was seen released: nobody brakes, the park brake is off, the motor stands and needs
-    no torque. From there the clearance counts. A brake that is latched needs no current either."""
+    """Contact is unknown until the brake has been observed released: no brake request, park brake off, the motor standing
+    without torque. The clearance counts from there. A latched brake needs no current either."""
     released = m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
     s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
     if not s.seen and s.since_start_s < _SEEN_S and m.dt <= ONE_CYCLE_S:
-        # Until some samples have been averaged the torque of the first ones says little.
+        # The torque must be averaged over some samples.
         s.since_start_s += m.dt
         s.unknown = not released
         return
@@ -161,11 +160,11 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         place_contact(s, p, m.angle)
         s.unknown = False
         if not loose:
-            # Nobody holds a released brake for so long: what is measured flows in no motor.
+            # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
-        # A request may find the brake still open: a clamped one needs torque against which friction is small.
-        # Frames at a reduced rate tell no torque, and such logs begin with an open brake.
+        # At a request the brake may still be open: a clamped one needs more torque than friction. Frames at a reduced rate
+        # tell no torque, and such logs begin with an open brake.
         easy = torque < _OPEN * p.offset_friction or m.dt > ONE_CYCLE_S
         open_yet = m.has_status and m.park_brake == 0.0 and easy
         s.unknown = not (loose and released) and not open_yet
@@ -175,12 +174,12 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
 @njit
 def _passed_clearance(s, p, m):
     """Whether the motor has closed from where it started, or from where it has stood lower since, by a good part of the
-    clearance and no force opposed it: then it was released there, whatever was asked of it."""
+    clearance, and no force opposed it: then it was released there, whatever was requested."""
     if m.angle <= s.start_angle:
-        # What opposes it on a way back to there says nothing of the way from there.
+        # A torque while opening does not count against the closing motion.
         s.passed = s.opposing = 0.0
         if s.stood_s > _OFF_S:
-            # Where it only turned round, half open, nobody had released it.
+            # A reversal while half open is no released position.
             s.start_angle = m.angle
     elif s.friction_mean > _SLIDING and np.isfinite(s.balance):
         s.passed += 1.0
@@ -199,7 +198,7 @@ def place_contact(s: Record, p: Record, released: float) -> None:
     s.gear_zero = released
     angle, sigma = released + s.clearance, s.clearance_sigma
     x = turned(s, p, s.angle)[0] - angle
-    # Pads that have just opened still relax; but what was believed of a contact elsewhere is no force to relax from.
+    # Pads that have just opened still relax, but not from a force that was computed with a wrong contact angle.
     if abs(angle - s.contact_angle) < _KNOWN_RAD:
         s.past_contact = x
     else:
@@ -216,10 +215,10 @@ def place_contact(s: Record, p: Record, released: float) -> None:
 
 @njit
 def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: float, leverage: float) -> None:
-    """Whether the pads touch; and if the torque contradicts the believed contact angle, start that anew."""
+    """Detect whether the pads touch, and start the contact angle anew if the torque contradicts it."""
     c, x, contact_sigma = s.contact, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT])
     if p.clearance_sigma == 0.0:
-        # Held as exactly known, as diagnose does; no calibration file can say so.
+        # The contact angle is held, as in diagnose; no calibration file can state that.
         engaged(c, x, 0.0)
         return
     sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
@@ -237,7 +236,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
     unsure = hypot(offset_sigma, learned_sigma)
     found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, contact_sigma, offset, unsure)
-    # A change that explains the torque is not found a second time as a contact angle that is somewhere else.
+    # If a change explains the torque, the contact angle is not moved for the same reason.
     explained = likely_shift(s) != 0.0
     if explained:
         found = NOTHING
@@ -260,8 +259,8 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
 
 @njit
 def _believe_offset(s, offset, sigma):
-    """Forget what the filter took for an offset of the torque under a wrong belief: it is ``offset``, known with ``sigma``
-    (N m)."""
+    """Replace the torque's offset that was learned with a wrong contact angle: it is ``offset``, with standard deviation
+    ``sigma`` (N m)."""
     s.error[OFFSET] = offset
     for i in range(STATES):
         s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
@@ -275,7 +274,7 @@ def _start_clamped(s, p, m, torque, sigma, leverage):
     s.covariance[OFFSET, OFFSET] += torque * torque
     force = torque / leverage
     friction = (p.offset_friction + p.load_friction * force * s.gear_slope) * sqrt(s.friction_variance)
-    # The gear's slope is as unknown as the released position.
+    # With the released position the gear's slope is unknown, too.
     least, most = steepest(p.gear)
     s.covariance[GAIN, GAIN] += (0.5 * (most / least - 1.0)) ** 2
     forget_level(s.contact)
@@ -285,10 +284,10 @@ def _start_clamped(s, p, m, torque, sigma, leverage):
 
 @njit
 def _start_contact(s, p, m, force, sigma, leverage):
-    """Believe the contact angle that the clamp force ``force`` of standard deviation ``sigma`` (N) stands for, and no more.
+    """Set the contact angle to that of the clamp force ``force`` with standard deviation ``sigma`` (N).
 
-    The force was read from a torque of ``leverage`` m/rad whose offset it takes over: contact angle and offset err together,
-    until the clearance shows the offset.
+    The force was computed from a torque with ``leverage`` m/rad and contains its offset: the errors of contact angle and
+    offset are correlated until the clearance shows the offset.
     """
     travel = travel_at(min(force, p.maximum_force) / s.factor, p.curve) if force > 0.0 else 0.0
     if not np.isfinite(travel):

@@ -1,4 +1,4 @@
-"""Both paths made one: the filter over their errors, and whom to follow where they contradict each other."""
+"""Fusion of both paths: the filter over their errors, and the choice of a path where they contradict each other."""
 
 from math import exp, hypot, sqrt
 
@@ -89,23 +89,24 @@ from emb_daemon.models.plausibility import (
 )
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
-#: Motor torque over what the calibration's torque constant makes of the current, at least: half of what the monitor grants;
-#: and age of the torque path's last word, s, from which the force rests on stiffness alone: half of `SILENCE_S`.
+#: Least motor torque over current times the calibration's torque constant: half of the loss that the monitor allows; and time
+#: without torque, s, after which the force rests on stiffness alone: half of `SILENCE_S`.
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
-#: Share of the largest force by which an unproven jump must move the force to be told.
+#: Share of the largest force by which an unproven jump must move the force to be reported.
 _NOTED = 0.003
-#: Part of a sample by which current and angle may be apart in time, beside what the angle is late by: friction turns with it.
+#: Part of a sample by which current and angle may differ in time, in addition to the angle's delay, which changes friction
+#: with it.
 _LATE = 0.3
-#: Log odds that a change has only after more samples than a sensor's sudden fault takes to be told (at most 12.5 a sample, and
-#: five samples): from then on it may explain what the motor's sliding contradicts.
+#: Log odds that a change reaches only after more samples than it takes to find a sensor's sudden fault (at most 12.5 a sample,
+#: and five samples): from then on it may explain a contradiction by the sliding motor.
 _LONG_LIKELY = 62.5
-#: Standard deviation of an innovation, share of the largest force, beyond which it tells nothing.
+#: Standard deviation of an innovation, as a share of the largest force, above which it is not used.
 _TELLING = 0.1
-#: Cycles by which an angle is late from where it is told: one sampled in the cycle before, in a frame that waits for the next,
-#: is no fault.
+#: Cycles of delay from which a late angle is reported: sampling in the cycle before, in a frame that waits for the next, is no
+#: fault.
 _TOLD_CYCLES = 2.0
-#: Time for which what no model of the torque explains stays what it is, s: until a brake is as warm and as hard pressed as not
-#: before, which takes some stops.
+#: Time for which an unexplained error of the torque is constant, s: until temperature and force of the brake are others, which
+#: takes some stops.
 _LASTS_S = 10.0
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3
@@ -117,8 +118,8 @@ _CLEAR = 4.0
 def _clear_acceleration(s, m):
     """Acceleration (rad/s^2) from three angles where it is clear of their quantisation, else 0.
 
-    A gain error shows in what the motor torque must have been, and only a value that shares no noise with current and speed
-    may stand for it: regressed on itself, noise would look like a gain that is too small."""
+    A gain error is found by regression on the needed torque, which must not contain the noise of current and speed: otherwise
+    their noise would look like a gain that is too small."""
     if m.dt != CYCLE_S or s.dt_before != CYCLE_S:
         return 0.0
     acceleration = (m.angle - 2.0 * s.angle + s.angle_before) / (CYCLE_S * CYCLE_S)
@@ -136,12 +137,12 @@ def needed_torque(s: Record, p: Record, m: Record, mean_force: float, leverage: 
 
 @njit
 def _spread(s, p, m):
-    """Standard deviation (N) of what is fast in the stiffness path's error."""
+    """Standard deviation (N) of the fast part of the stiffness path's error."""
     relative = (p.stiffness_relative_sigma + p.thermal.softening * p.thermal.sigma) * s.force
     relative = hypot(relative, s.effects.terms.sigma)
     relative = hypot(relative, s.slope * effects.thickness_sigma(s.effects) / p.gear_gain)
     if s.late > 0.0 and m.dt > 0.0:
-        # A late angle is undone to first order: the second is what the motor gained in speed meanwhile.
+        # A late angle is corrected to first order; the second order is the change of speed meanwhile.
         relative = hypot(relative, 0.5 * s.late * s.late * s.slope * s.gear_slope * (m.speed - s.speed) / m.dt)
     return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
 
@@ -158,7 +159,7 @@ def _predict(s, p, m, spread, warmth, known):
     walked[OFFSET] += s.offset_walk * m.dt
     if s.offset_age_s > 0.0:
         s.offset_age_s += m.dt
-    # What has just become uncertain of the pads' heat is uncertain of the stiffness from now on.
+    # New uncertainty of the pads' temperature adds to that of the stiffness.
     walked[SCALE] += max(softening - s.softening, 0.0) * (softening + s.softening)
     s.softening = softening
     if known:
@@ -183,7 +184,7 @@ def _predict(s, p, m, spread, warmth, known):
 
 @njit
 def _moving_variance(s, p, m):
-    """Variance, (N m)^2, of one torque from noise of the speeds and from current and angle that are apart in time."""
+    """Variance, (N m)^2, of one torque from noise of the speeds and from the difference in time between current and angle."""
     unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
     apart = _LATE + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
@@ -193,7 +194,7 @@ def _moving_variance(s, p, m):
 
 @njit
 def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out):
-    """What each hypothesis learns of one torque, and how likely each makes it; fills torque sigma and innovation of ``out``.
+    """Update all hypotheses, and their odds, with one torque; fills torque sigma and innovation of ``out``.
 
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state, of a motor that turns
     and of one that stands."""
@@ -205,8 +206,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     lasting = p.torque_lasting_sigma * leverage * max(mean_force + s.spring_force, 0.0)
     white = moving + friction_torque * friction_torque * friction_variance + doubted * doubted + lasting * lasting
     out.torque_sigma = sqrt(white) / leverage
-    # At standstill the friction state's error stays what it is, and what a term outside its range is off by does: however many
-    # samples repeat them, they say it once. So does what no model explains, for some stops.
+    # At standstill the errors of the friction state, and of a term outside its range, are constant, so that many samples
+    # contain no more information than one. So is an error that no model explains, for some stops.
     white += ((friction_torque * s.friction_variance) ** 2 + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
     white += lasting * lasting * _LASTS_S / m.dt
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
@@ -263,14 +264,14 @@ def fuse(
     if np.isfinite(torque):
         trusted = s.plausibility.verdict == AGREE and not s.unknown
         if trusted != s.trusted:
-            # What the alternatives saw around a sensor's fault tells nothing of the brake.
+            # What the alternatives learned around a sensor's fault is not due to the brake.
             open_all(s, p)
             s.trusted = trusted
         mean_force = 0.5 * (force_before + s.force)
         turning_sigma, standing_sigma = _take_torque(
             s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out
         )
-        # At rest friction's error stays what it is: no noise, and no news.
+        # At rest friction's error is constant: neither noise nor new information.
         if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
         s.torque_age = 0.0 if trusted else s.torque_age + m.dt
@@ -284,15 +285,15 @@ def fuse(
         s.torque_age += m.dt
     s.current_before, s.had_current = m.current_q, m.has_current
     if s.plausibility.verdict == TORQUE_FROZEN:
-        # Nothing has jumped: until it was found out, a frozen current spoke for every jump.
+        # Nothing has jumped; a frozen current was evidence for every jump until it was found.
         open_again(s, p)
     out.force, out.sigma = mix(s, h, spread, warmth)
     if not known:
         out.force += uneven.applied(s.uneven)
         out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
-        # Of the way from the released position, by a resolver whose ways are off.
+        # Error of the travel from the released position by a resolver with a wrong gain.
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
-    # Not max(): of a number and what is none it may return the number, and a broken estimate would look like an open brake.
+    # Not max(), which may return the number if the other is NaN, so that a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
     out.contact_sigma = contact_sigma(s)
@@ -301,15 +302,15 @@ def fuse(
 
 @njit
 def _motor_torque(s, x):
-    """Motor torque (N m) by what a hypothesis with the errors ``x`` makes of the current."""
+    """Motor torque (N m) from the current, by a hypothesis with the errors ``x``."""
     gain = 1.0 + x[GAIN] + x[FADE] * s.winding + x[HOUSING] * s.housing
     return s.motor_torque * max(gain, _LEAST_GAIN) - x[OFFSET]
 
 
 @njit
 def _beside_force(s, p):
-    """Slope of the gear, and how far it may be off, share; force of the release spring, N, and how far that may be off: where
-    the angle is not known from the released position, they may be any that the brake has."""
+    """Slope of the gear, and how far it may be off, share; force of the release spring, N, and how far that may be off: if the
+    angle from the released position is not known, both are anywhere in the brake's range."""
     if s.unknown or s.plausibility.verdict == STIFFNESS_WRONG:
         least, most = steepest(p.gear)
         middle = 0.5 * (least + most)
@@ -363,7 +364,7 @@ def _least_beyond_friction(s, p, m, accelerating, spread):
 
 @njit
 def _facts_of_torque(s, p):
-    """Facts that change neither force nor sigma."""
+    """Facts of the torque path that change neither force nor sigma."""
     facts = 0
     if s.torque_age >= _OLD_S:
         facts |= TORQUE_OLD
@@ -382,7 +383,7 @@ def _facts_of_torque(s, p):
 
 @njit
 def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_sigma: float, out: Record) -> int:
-    """Where the paths contradict each other, go on with the one that can be right; returns the facts. ``turning_sigma`` and
+    """Where the paths contradict each other, use the one that is not implausible; returns the facts. ``turning_sigma`` and
     ``standing_sigma`` N m, as `fuse` returns them."""
     c = s.plausibility
     force, sigma, torque, gain, load, coulomb = _torque_alone(s, p, m)
@@ -410,11 +411,11 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
         if s.seen:
             out.force, out.sigma = force, hypot(sigma, latched)
         else:
-            # The first samples' torque is noise and nothing else.
+            # The torque of the first samples is only noise.
             out.sigma = hypot(sigma, max(latched, force))
         return facts | CONTACT_UNKNOWN | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if s.contact.lost:
-        # The contact angle was found wrong and explains what came before.
+        # The contact angle was found to be wrong, which explains the contradiction before.
         c.contradiction = 0.0
         facts |= CONTACT_LOST
     error = model_error(s.consistency) if out.force > 0.0 else 0.0

@@ -1,21 +1,22 @@
 """Hypotheses of one brake: it is as it was, or something has changed.
 
-Each is a Kalman filter over the errors of both paths. The first believes what it learned and only walks. The others are the
-first, opened again at every release and every while by what `unknown` says may jump in the stiffness path or in the torque
-path; the likeliest of those that were opened before; and a brake whose disc grows with heat, which shows slowly and is opened
-once. All explain the same torque; the ratios of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic
-processes, IEEE Trans. Automatic Control 10, 1965) say which holds, and the fused force is their mixture, so that an unproven
-change already counts in its standard deviation. A proven one becomes the first hypothesis.
+Each is a Kalman filter over the errors of both paths. The first keeps what it learned and drifts only slowly. The others are
+copies of the first, to whose covariance the possible jumps of the stiffness path or of the torque path (`unknown`) are added
+at every release and from time to time; the likeliest of the jumps opened before; and a brake whose disc grows with heat, which
+shows slowly and is opened once. All explain the same torque; the ratios of their likelihoods (Magill, Optimal adaptive
+estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10, 1965) say which holds, and the fused force is
+their mixture, so that an unproven change already counts in its standard deviation. A proven one becomes the first hypothesis.
 
-On the way to a force pads, torque constant and friction look alike, and the first hypothesis bends its friction to what other
-pads do. A jump opened anew after that begins with the bent friction: only one that was open before tells them apart when the
-motor turns round. So the likeliest is kept beside its successor, until the release and while anything speaks for it.
+While closing, changes of pads, torque constant and friction look alike, and the first hypothesis attributes other pads to
+friction. A jump that is opened after that starts with the wrong friction; only one that was open before can separate them when
+the motor reverses. So the likeliest jump is kept in addition to its successor, until the release and while there is evidence
+for it.
 
-The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. What it makes of the
-torque, the first mostly takes for a torque constant or a friction within their priors: both explain it, so nothing is ever
-proven, and the fused force does not follow it. Its distance from that counts in the standard deviation by its odds. So does
-what its disc may have grown by unseen: a drag heats a disc by tens of kelvin in seconds and hardly moves the motor. What once
-spoke for it is remembered: a first hypothesis that has bent motor and friction to what pads do contradicts it no more.
+The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. The first hypothesis
+can explain the same torque by a torque constant or a friction within their priors, so that neither is ever proven, and the
+fused force does not follow a drift. Its difference from the fused force counts in the standard deviation by its odds, and so
+does unobserved growth of its disc: a drag heats a disc by tens of kelvin in seconds and hardly moves the motor. Evidence for
+it is remembered, because a first hypothesis that has attributed the pads' change to motor and friction contradicts it no more.
 """
 
 from math import exp, log, sqrt
@@ -56,14 +57,14 @@ from emb_daemon.models.fusion import (
 )
 from emb_daemon.models.stiffness import characteristic_curve, mean_slope
 
-#: Logarithm of the odds that a brake has jumped since it was last looked at: once in four hundred stops. They cannot fall
-#: lower, or a later jump would have to make up for the past.
+#: Logarithm of the odds that a brake has jumped since the last stop: once in four hundred stops. They cannot fall lower,
+#: because a later jump would then need more evidence.
 PRIOR_ODDS = -6.0
-#: The same as jumps of the stiffness path in stops (a beta distribution's two parameters, their ratio the odds above). So few
-#: stops are soon outweighed by what is seen: run-out or play of the wheel bearing, which knock pads back once, do it again. Of
-#: six such brakes that `studies.silent grid` draws (--faults knock_back --seed 12) 16 phases fail without and 6 with it.
+#: The same as jumps of the stiffness path in stops (a beta distribution's two parameters, their ratio the odds above). A few
+#: observed jumps outweigh so few stops: run-out or play of the wheel bearing, which knock pads back once, do it again. Of six
+#: such brakes that `studies.silent grid` draws (--faults knock_back --seed 12) 16 phases fail without and 6 with it.
 _JUMPS_BEFORE, _STOPS_BEFORE = 0.04, 16.0
-#: The same of a brake that this estimator has never seen brake, neither now nor before a restart: one of 34 comes from a
+#: The same of a brake that this estimator has not observed braking, neither now nor before a restart: one of 34 comes from a
 #: workshop with other pads or another contact than its calibration's. Without it and what a proven jump keeps beside it
 #: (`_become_first`) `studies.silent grid --count 4 --pairs 24` has 63 and 101 failing phases with seed 11 and 12, with both 63
 #: and 98; of first strokes with pads 10 % softer 93 % of samples lie within two sigma without and 96 % with it.
@@ -72,23 +73,24 @@ _UNSEEN_ODDS = -3.5
 #: grid` draws (--count 4 --pairs 24 --seed 11) 151 fail without this hypothesis and 126 with it; on the rig's random logs 98
 #: to 99 % of samples instead of 97 then lie within two sigma, so the odds are no higher.
 _DRIFT_ODDS = -2.0
-#: Its log odds against the likeliest at most, as it can explain anything a little at a time: half as likely. As likely, 99.2 %
-#: of samples of the rig's random logs lie within two sigma.
+#: Its largest log odds against the likeliest hypothesis, because a drift can explain anything slowly: half as likely. As
+#: likely, 99.2 % of samples of the rig's random logs lie within two sigma.
 _DRIFT_MOST = -0.7
-#: Log odds at which an alternative is proven against the first hypothesis, and against the others; and what it must have
-#: gained over its prior to be waited for.
+#: Log odds at which an alternative is proven against the first hypothesis, and against the others; and increase over its prior
+#: from which a decision waits for it.
 _PROVEN, _CLEARLY, _SUSPECTED = 5.0, 3.0, 4.0
-#: Log odds that are as good as certainty.
+#: Log odds that count as certainty.
 CERTAIN_ODDS = 100.0
-#: Time after which an unproven jump is looked for anew, s, and how much likelier than its successor, as log odds, it must have
-#: become to be kept beside it: by more than noise makes it.
+#: Time after which an unproven jump is opened anew, s, and log odds over its successor from which the old one is kept too:
+#: more than noise causes.
 _OPENED_S, _KEPT = 1.0, 1.0
-#: Time, that in the clearance apart, after which the stronger of two proven alternatives is taken though they are alike, and a
-#: merely suspected one given up at the next release, s: some stops of ordinary driving.
+#: Time, without that in the clearance, after which the stronger of two similar proven alternatives is accepted, and a merely
+#: suspected one given up at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
-#: Variances of its own by which an offset must have moved for its walk to be another: 3 standard deviations, squared.
+#: Squared movement of an offset, in its variances, from which its walk is enlarged: 3 standard deviations.
 _SURELY = 9.0
-#: Standard deviations of the innovation beyond which a sample teaches nothing: sensors jump, what is learned walks.
+#: Standard deviations of the innovation beyond which a sample is not learned from: sensors jump, learned quantities change
+#: slowly.
 GATE = 5.0
 
 #: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
@@ -122,7 +124,7 @@ ALTERNATIVE = np.dtype(
 
 @njit
 def _least_odds(s, kind):
-    """Log odds below which those of a change cannot fall, or a later one would have to make up for the past."""
+    """Least log odds of a change; without a bound a later one would need more evidence."""
     if kind == DRIFT:
         return _DRIFT_ODDS
     if kind != STIFFNESS_JUMP or s.jumps == 0.0:
@@ -138,7 +140,7 @@ def _never_seen(s):
 
 @njit
 def _first_odds(s, kind):
-    """Log odds with which a change that is looked for from now on begins."""
+    """Initial log odds of a change that is opened now."""
     if kind == STIFFNESS_JUMP and _never_seen(s):
         return _UNSEEN_ODDS
     return _least_odds(s, kind)
@@ -160,7 +162,7 @@ def _open(s, p, kind):
     stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
     a.least, a.log_odds = _least_odds(s, kind), _first_odds(s, kind)
     if p.clearance_sigma == 0.0:
-        # A brake that is held as exactly known is no other.
+        # A brake that is held as exactly known has no change.
         a.log_odds = -np.inf
     a.shift = a.age_s = a.told = 0.0
     a.kind = kind
@@ -174,7 +176,7 @@ def _forget_kept(s):
 
 @njit
 def exists(a: Record) -> bool:
-    """Whether there is such a hypothesis: a kept jump may be none, and a brake that is known has none."""
+    """Whether there is such a hypothesis: there may be no kept jump, and a brake that is held as known has none."""
     return a.log_odds > -np.inf
 
 
@@ -186,7 +188,7 @@ def _open_jumps(s, p):
 
 @njit
 def open_again(s: Record, p: Record) -> None:
-    """Look for jumps from now on; what was seen before tells nothing of them."""
+    """Open all jumps anew, without earlier evidence."""
     _open_jumps(s, p)
     _forget_kept(s)
 
@@ -201,8 +203,8 @@ def _keep(s, a):
 
 @njit
 def _succeed(s, p, kind, released):
-    """Look for a jump of ``kind`` from now on. The one before is kept if it is clearly likelier than the kept one; after a
-    release only if anything speaks for it, for what nothing spoke for on the way to a force may on the way back."""
+    """Open a jump of ``kind`` anew. The one before is kept if it is clearly likelier than the kept one; after a release only
+    if there is evidence for it, because evidence that is missing while closing may come while opening."""
     a, kept = s.alternatives[kind], s.alternatives[KEPT_JUMP]
     if a.log_odds > kept.log_odds + _KEPT and (not released or a.log_odds > _first_odds(s, kind) + _KEPT):
         _keep(s, a)
@@ -211,21 +213,21 @@ def _succeed(s, p, kind, released):
 
 @njit
 def open_changes(s: Record, p: Record) -> None:
-    """All but a brake that drifts."""
+    """Open all changes except for drift anew."""
     open_again(s, p)
     _open(s, p, DISC_GROWTH)
 
 
 @njit
 def open_all(s: Record, p: Record) -> None:
-    """After a start, or when what was seen tells nothing."""
+    """Open all changes anew, after a start or without usable evidence."""
     open_changes(s, p)
     _open(s, p, DRIFT)
 
 
 @njit
 def open_others(s: Record, p: Record) -> None:
-    """When another hypothesis has become the first; beside a kept jump."""
+    """Open the others anew after a change of the first hypothesis, in addition to a kept jump."""
     _open_jumps(s, p)
     _open(s, p, DISC_GROWTH)
     _open(s, p, DRIFT)
@@ -233,8 +235,8 @@ def open_others(s: Record, p: Record) -> None:
 
 @njit
 def _become_first(s, a):
-    """``a`` is believed from now on. The likeliest jump of the other kind is kept beside it: the way back through the
-    clearance may still speak for that."""
+    """Make ``a`` the first hypothesis. The likeliest jump of the other kind is kept, because the release may still be evidence
+    for it."""
     kind, odds, shift = a.kind, a.log_odds, a.shift
     copy_errors(s.error, s.covariance, a.error, a.covariance)
     s.force += shift
@@ -276,8 +278,7 @@ def _likeliest_odds(s):
 
 @njit
 def _share_out(s):
-    """Probability of each change if nothing drifts, and of a drift, which can explain anything a little at a time: at most a
-    third."""
+    """Probability of each change if there is no drift, and of a drift, which can explain anything slowly: at most a third."""
     total = 1.0
     for kind in range(DRIFT):
         total += exp(s.alternatives[kind].log_odds)
@@ -289,15 +290,15 @@ def _share_out(s):
 
 @njit
 def drift_odds(s: Record) -> tuple[float, float]:
-    """Log odds between which those of a drift stay. Whatever is the likeliest, it may be a drift that makes it so: until that
-    is proven a share of it stays. What speaks for a drift is remembered as far as it would prove another change."""
+    """Bounds of a drift's log odds. Whatever is the likeliest may be caused by a drift, which therefore keeps a share until
+    another change is proven. Evidence for a drift is kept up to what would prove another change."""
     likeliest = _likeliest_odds(s)
     return likeliest + _DRIFT_ODDS, likeliest + _PROVEN
 
 
 @njit
 def likely_shift(s: Record) -> float:
-    """How far the change that is likelier than none moves the force, N; 0 if there is none."""
+    """Shift of the force, N, by a change that is likelier than none; 0 without one."""
     best, shift = 0.0, 0.0
     for kind in range(DRIFT):
         a = s.alternatives[kind]
@@ -308,13 +309,13 @@ def likely_shift(s: Record) -> float:
 
 @njit
 def _speaks(a):
-    """Whether what was seen speaks for an alternative: that it may happen is no sign that it has."""
+    """Whether there is evidence for an alternative, beyond its prior."""
     return a.log_odds > max(a.least, PRIOR_ODDS) + _SUSPECTED
 
 
 @njit
 def suspected(s: Record) -> bool:
-    """Whether an alternative is likely enough to be waited for."""
+    """Whether an alternative is so likely that decisions wait for it."""
     any_speaks = False
     for kind in range(DRIFT):
         any_speaks = any_speaks or _speaks(s.alternatives[kind])
@@ -323,8 +324,8 @@ def suspected(s: Record) -> bool:
 
 @njit
 def unproven(s: Record) -> float:
-    """How far apart a suspected change and what is without it hold the force, N: the largest of the difference times the
-    probability of the less likely. A change that is as good as certain is in the force, before a release proves it."""
+    """Largest difference in force, N, between a suspected change and none, times the probability of the less likely. A
+    practically certain change is part of the force before a release proves it."""
     most = 0.0
     for kind in range(DRIFT):
         a = s.alternatives[kind]
@@ -335,7 +336,7 @@ def unproven(s: Record) -> float:
 
 @njit
 def place(s: Record, a: Record, p: Record, factor: float, warmth: float) -> None:
-    """Where an alternative's contact angle, stiffness and growth put the force: its ``shift`` and ``slope``."""
+    """Set ``shift`` and ``slope`` of an alternative's force by its contact angle, stiffness and growth."""
     x = s.past_contact
     moved = a.error[GROWTH] * warmth - a.error[CONTACT]
     here, _ = characteristic_curve(x, p.curve)
@@ -343,7 +344,7 @@ def place(s: Record, a: Record, p: Record, factor: float, warmth: float) -> None
     sigma = sqrt(max(a.covariance[CONTACT, CONTACT], 0.0))
     if sigma > UNCERTAIN_CONTACT_RAD:
         slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
-    # The lag is left out of the difference: it settles within a fraction of the time that a jump takes to be proven.
+    # The difference neglects the lag, which settles much faster than a jump can be proven.
     scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))
     a.shift = max(scaled, 0.0) - s.force
     a.slope = factor * (1.0 + a.error[SCALE]) * slope
@@ -362,8 +363,8 @@ def to_torque(
     h: Floats, leverage: float, slope: float, friction_mean: float, force: float, speed: float, slow: float,
     accelerating: float, motor_torque: float, winding: float, housing: float,
 ) -> None:  # fmt: skip
-    """Make a sensitivity of the clamp force one of the torque that it leaves unexplained. ``slope`` of the gear; ``slow``,
-    ``accelerating`` and ``motor_torque`` N m: friction as far as it is slow, what inertia and what everything took."""
+    """Convert a sensitivity of the clamp force to that of the unexplained torque. ``slope`` of the gear; ``slow``,
+    ``accelerating`` and ``motor_torque`` N m: slow friction, torque of inertia, and total torque."""
     for i in (FAST, CONTACT, SCALE, GROWTH):
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
@@ -375,7 +376,7 @@ def to_torque(
 
 @njit
 def learned_torque(x: Floats, P: Floats, h: Floats) -> tuple[float, float]:
-    """Torque (N m) that what was learned of motor and friction explains, its offset apart, and its standard deviation."""
+    """Torque (N m) that the learned errors of motor and friction explain, without the offset, and its standard deviation."""
     total = variance = 0.0
     for i in _OF_THE_TORQUE:
         total += h[i] * x[i]
@@ -388,8 +389,8 @@ def learned_torque(x: Floats, P: Floats, h: Floats) -> tuple[float, float]:
 def learn(
     x: Floats, P: Floats, gain: Floats, h: Floats, unexplained: float, variance: float, trusted: bool
 ) -> tuple[float, float]:
-    """One hypothesis takes one torque; its own contact angle, stiffness and growth are in ``unexplained`` already. It learns
-    nothing from a torque that is not ``trusted``.
+    """Update one hypothesis with one torque; its own contact angle, stiffness and growth are in ``unexplained`` already. It
+    learns nothing from a torque that is not ``trusted``.
 
     Returns (innovation, its variance)."""
     innovation = unexplained
@@ -406,8 +407,8 @@ def learn(
 def weigh(
     a: Record, least: float, most: float, first: float, first_variance: float, second: float, second_variance: float
 ) -> None:
-    """Odds of an alternative after it and the first hypothesis have seen a torque; a sample far off counts as the gate's
-    edge. They stay between ``least`` and ``most``."""
+    """Update an alternative's odds after it and the first hypothesis were updated with a torque; a sample far off counts like
+    one at the gate. They stay between ``least`` and ``most``."""
     edge = GATE * GATE
     a.log_odds += 0.5 * (min(first * first / first_variance, edge) - min(second * second / second_variance, edge))
     a.log_odds += 0.5 * log(first_variance / second_variance)
@@ -416,7 +417,8 @@ def weigh(
 
 @njit
 def stay_finite(s: Record) -> None:
-    """Log odds count from the first hypothesis; beyond certainty against it, what tells the alternatives apart stays."""
+    """Limit log odds, which are relative to the first hypothesis, to certainty against it; differences between alternatives
+    are kept."""
     beyond = _strongest(s, DRIFT) - CERTAIN_ODDS
     if beyond > 0.0:
         for kind in range(ALTERNATIVES):
@@ -427,8 +429,8 @@ def stay_finite(s: Record) -> None:
 
 @njit
 def _follow_offset(s):
-    """The pads touch: the clearance has shown what there is of an offset. What it has moved by since the last stroke, beyond
-    what the filter made of it, it may do again."""
+    """When the pads touch, the clearance has shown the offset. If it has moved by more than the filter expected since the last
+    stroke, its walk is enlarged."""
     offset, known = s.error[OFFSET], s.covariance[OFFSET, OFFSET]
     if s.offset_age_s > 0.0:
         moved = offset - s.offset_before
@@ -441,8 +443,8 @@ def _follow_offset(s):
 def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
-    While the pads touch, contact, stiffness and an offset of the torque look alike; the way back through the clearance tells
-    them apart, so nothing is proven before. The mixture does not wait."""
+    While the pads touch, changes of contact, stiffness and torque offset look alike; the release separates them, so that
+    nothing is proven before. The mixture follows at once."""
     if s.contact.engaged:
         if not s.braked:
             _follow_offset(s)
@@ -454,7 +456,7 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
         s.alternatives[i].age_s += dt
     a = _likeliest(s)
     margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
-    # What is expected needs as much evidence as what is not: else one jump that was none would bring the next.
+    # Expected jumps need as much evidence as others, because otherwise one false jump would lead to the next.
     evidence = a.log_odds - max(a.least, PRIOR_ODDS) > _PROVEN - PRIOR_ODDS
     if released and evidence and a.log_odds > _PROVEN and a.log_odds - _strongest(s, a.kind) >= margin:
         if a.kind == STIFFNESS_JUMP:
@@ -508,7 +510,7 @@ def contact_sigma(s: Record) -> float:
 
 @njit
 def _unseen_growth(a):
-    """Variance, (rad/K)^2, of the growth of a disc whose contact angle is known: what strokes have shown of both together."""
+    """Variance, (rad/K)^2, of the disc's growth, conditional on the contact angle."""
     P = a.covariance
     if P[CONTACT, CONTACT] <= 0.0:
         return P[GROWTH, GROWTH]

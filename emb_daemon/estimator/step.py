@@ -43,11 +43,11 @@ from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
-#: Without a resolver sample for this long the last force is no estimate any more: the brake may have opened and closed, s.
+#: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
-#: Clamp force over the largest of the calibration that no brake makes.
+#: Factor on the calibration's largest force above which no clamp force is possible.
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
 _UNCERTAIN_RAD = 0.5
@@ -109,7 +109,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
     torque, leverage, friction_variance = torque_path(s, p, m)
     if moved_zero:
         torque = np.nan
-    # Over a gap the current of its last cycle and the mean acceleration say nothing of each other.
+    # Over a gap the current of its last cycle does not belong to the mean acceleration.
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown:
         watch_contact(s, p, m, force_before, torque, leverage)
     turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
@@ -138,7 +138,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
 
 @njit
 def _follow_age(s, p, m, moved_zero):
-    """How old the angle is beyond what the calibration knows."""
+    """Age of the angle beyond the calibration's."""
     if moved_zero or not 0.0 < m.dt <= ONE_CYCLE_S or s.drifting_s > 0.0 or frozen(s.plausibility):
         interrupt(s.lateness)
         return
@@ -171,7 +171,7 @@ def _look(s, p, m, facts, out):
         facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         facts |= BEYOND_RANGE
-    # A current that is frozen bounds nothing. Else current or estimate is wrong, and sigma reaches from one to the other.
+    # A frozen current gives no bounds. Otherwise current or estimate is wrong, and sigma covers the difference.
     if contradicts(s.monitor, out.force, out.sigma, m.dt) and not facts & CURRENT_IMPLAUSIBLE:
         facts |= BOUNDS_CONTRADICT
         low, high = s.monitor.low, s.monitor.high
@@ -190,9 +190,9 @@ def _look(s, p, m, facts, out):
 
 @njit
 def predict(s: Record, p: Record, age: float, out: Record) -> None:
-    """What can be said ``age`` seconds after the last sample: the last force, and how far it may have moved since.
+    """Prediction ``age`` seconds after the last sample: the last force, and how far it may have changed since.
 
-    After `SILENCE_S` nothing can: then the source is Invalid.
+    After `SILENCE_S` the source is Invalid.
     """
     out.mode = RUNNING if s.started else INIT
     out.source = PREDICTED if s.started and age <= SILENCE_S else INVALID

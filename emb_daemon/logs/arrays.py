@@ -22,14 +22,14 @@ def array_ending(content: bytes, ending: str) -> str:
     return found or (ending if ending in ENDINGS else "")
 
 
-def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray | list]:
+def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray | list[object]]:
     """Columns, n values each, by name: a variable with more than one value, `S.x` of the field of a structure or the dataset
     of a group, `X column 2` of a matrix, whose rows are its longer side. Of a bare array `column 2` is one.
 
     Raises:
         InputError: unreadable.
     """
-    columns: dict[str, np.ndarray | list] = {}
+    columns: dict[str, np.ndarray | list[object]] = {}
     try:
         for name, variable in _READERS[ending](path, content):
             _add(columns, name, variable)
@@ -111,7 +111,7 @@ _READERS = {
 }  # fmt: skip
 
 
-def _add(columns: dict[str, np.ndarray | list], name: str, variable) -> None:
+def _add(columns: dict[str, np.ndarray | list[object]], name: str, variable) -> None:
     if isinstance(variable, dict):
         for key, value in variable.items():
             _add(columns, _within(name, key), value)

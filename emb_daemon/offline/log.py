@@ -73,7 +73,7 @@ def load_log(path: str | Path, corner: str = "FL", read: Callable[[Path], np.nda
     Raises:
         InputError: unreadable, or no resolver sample of that corner in it.
     """
-    return log_of(read(path), corner, Path(path))
+    return log_of(read(Path(path)), corner, Path(path))
 
 
 def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:

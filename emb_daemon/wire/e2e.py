@@ -8,7 +8,7 @@ Source: AUTOSAR FO R22-11 PRS E2EProtocol, section 6.2; the house's wire contrac
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import Integer, njit
 
 COUNTER_MODULO = 15
 
@@ -27,7 +27,7 @@ _TABLE = _crc_table()
 
 
 @njit
-def crc(can_id: int, data: int) -> int:
+def crc(can_id: Integer, data: Integer) -> Integer:
     """CRC byte of a frame: ``can_id`` is the DataID, ``data`` the payload as an integer, whose CRC byte is ignored."""
     value = np.uint8(0)
     value = _TABLE[value ^ np.uint8(can_id & 0xFF)]
@@ -38,19 +38,19 @@ def crc(can_id: int, data: int) -> int:
 
 
 @njit
-def counter_of(data: int | NDArray[np.uint64]) -> int | NDArray[np.uint64]:
+def counter_of(data: Integer | NDArray[np.uint64]) -> Integer | NDArray[np.uint64]:
     """Counter of payloads, integers or uint64 arrays."""
     return (data >> np.uint64(8)) & np.uint64(0xF)
 
 
 @njit
-def status_of(data: int | NDArray[np.uint64]) -> int | NDArray[np.uint64]:
+def status_of(data: Integer | NDArray[np.uint64]) -> Integer | NDArray[np.uint64]:
     """Status of payloads, integers or uint64 arrays."""
     return (data >> np.uint64(12)) & np.uint64(0xF)
 
 
 @njit
-def protect(can_id: int, payload: int, counter: int, status: int) -> int:
+def protect(can_id: Integer, payload: Integer, counter: Integer, status: Integer) -> Integer:
     """``payload`` (bits 16 to 63 set) with Status, Counter and CRC filled in, as an unsigned 64-bit integer."""
     data = np.uint64(payload) | (np.uint64(counter) << np.uint64(8)) | (np.uint64(status) << np.uint64(12))
     return data | np.uint64(crc(can_id, data))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Integer, Record, njit
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.units import conversion
@@ -87,7 +87,7 @@ LAYOUT = np.dtype(
 
 
 @njit
-def unpack(data: int, signal: Record) -> float:
+def unpack(data: Integer, signal: Record) -> float:
     """Physical value of one signal (a SIGNAL record) in a little-endian payload."""
     raw = np.int64((np.uint64(data) >> np.uint64(signal.start)) & ((np.uint64(1) << np.uint64(signal.length)) - np.uint64(1)))
     if signal.signed and raw >> (signal.length - 1):
@@ -96,7 +96,7 @@ def unpack(data: int, signal: Record) -> float:
 
 
 @njit
-def pack(value: float, signal: Record) -> int:
+def pack(value: float, signal: Record) -> Integer:
     """The bits of one signal, at their place in the payload; a value beyond the signal's range saturates, NaN is ``low``."""
     if not value > signal.low:
         value = signal.low

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.jit import Record, Records, fields, njit
+from emb_daemon.jit import Integer, Record, Records, fields, njit
 from emb_daemon.wire.contract import STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, crc, status_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, UNAUTHENTIC
@@ -147,7 +147,7 @@ def _verdict(frame, slot, reception, layout):
 
 
 @njit
-def receive(frame: Record, receptions: Records, layout: Record) -> tuple[int, int]:
+def receive(frame: Record, receptions: Records, layout: Record) -> tuple[Integer, int]:
     """Check one FRAME record and, if it is accepted, store its signals.
 
     Returns (slot, verdict); the slot is negative for a frame that the daemon does not receive.
