@@ -29,7 +29,7 @@ from studies.faults import (
 
 FAMILIES: dict[str, Callable] = {}
 #: Amounts that drawn effects add where they change the force of a path by its own size.
-_WHOLE = {"stiffness": 1.0, "thickness": 175.0, "torque_constant": 1.0, "gear_friction": 6.0, "gear_gain": 1.0}
+WHOLE = {"stiffness": 1.0, "thickness": 175.0, "torque_constant": 1.0, "gear_friction": 6.0, "gear_gain": 1.0}
 #: Shares of the force that effects from no catalogue add where their signals are at their usual sizes: 75 N to 2 kN at 8 kN.
 _SHARES = (0.01, 0.25)
 #: What signals reach in a drive over the sizes that drawn effects take for usual, where it is not about the same.
@@ -48,7 +48,7 @@ def _family(function: Callable) -> Callable:
 
 def _foreign(rng) -> tuple[str, dict]:
     """A drawn effect of any signals at any port: its name and parameters."""
-    port = str(rng.choice(list(_WHOLE)))
+    port = str(rng.choice(list(WHOLE)))
     signal, other = (int(rng.integers(len(SIGNALS))) for _ in range(2))
     exponent, shape, both = (
         float(rng.uniform(0.4, 2.6)),
@@ -58,7 +58,7 @@ def _foreign(rng) -> tuple[str, dict]:
     reached = [_REACHED.get(SIGNALS[which], 1.0) for which in (signal, other)]
     most = (reached[0] ** exponent if shape == POWER else 1.0) * (reached[1] if both else 1.0)
     values = {
-        "size": _WHOLE[port] * draw_signed(rng, *_SHARES) / most,
+        "size": WHOLE[port] * draw_signed(rng, *_SHARES) / most,
         "signal": signal,
         "exponent": exponent,
         "shape": shape,
@@ -128,14 +128,14 @@ _SENSED = {
 def hysteresis(rng, moments, size):
     """Load spreads otherwise when the brake applies than when it releases."""
     share, angle, at = draw_size(rng, 0.01, 0.12), draw_size(rng, 0.5, 6.0), pick_sometime(rng, moments)
-    action = effect("stiffness_hysteresis", share=share, slip_angle_rad=angle)
+    action = effect("second_hysteresis", share=share, slip_angle_rad=angle)
     return Fault(f"{100 * share:.0f} %, {angle:.1f} rad", at, car=once(at, action))
 
 
 @_family
 def creep(rng, moments, size):
     share, seconds = draw_signed(rng, 0.01, 0.12), draw_size(rng, 0.3, 20.0)
-    name = "clamp_creep" if rng.random() < 0.5 else "second_relaxation"
+    name = "clamp_creep" if rng.random() < 0.5 else "third_relaxation"
     return Fault(f"{100 * share:+.0f} %, {seconds:.1f} s", brake=effect(name, share=share, time_constant_s=seconds))
 
 

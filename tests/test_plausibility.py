@@ -100,6 +100,34 @@ def test_dead_current_is_named_and_stiffness_goes_on(begin):
     assert np.sqrt(np.mean((estimates["force"] - force)[stuck] ** 2)) < 100.0
 
 
+def _limited(share):
+    def change(rows):
+        limit = share * np.abs(rows["current_q"]).max()
+        rows["current_q"] = np.clip(rows["current_q"], -limit, limit)
+
+    return change
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6, 0.8])
+def test_a_current_sensor_that_goes_no_further_is_not_believed_there(share):
+    """What it then shows is the least that flows. From its second stroke on it is known where that is: no sample of it is used,
+    and the force stays right."""
+    estimates, force = city.changed(_limited(share), seconds=40.0)
+    samples, _ = drive(0, 40.0)
+    limit = share * np.abs(samples["current_q"]).max()
+    clipped = np.flatnonzero(np.abs(samples["current_q"]) > limit)
+    later = clipped[clipped > clipped[0] + 250]
+    assert len(later) > 20 and np.all(estimates["source"][later] == r.STIFFNESS_ONLY)
+    assert _honest(estimates, force, slice(25, None))
+    assert np.sqrt(np.mean((estimates["force"] - force)[25:] ** 2)) < 100.0
+
+
+def test_a_healthy_current_has_no_limit():
+    """However often a motor is held where its current is the largest."""
+    samples, _ = drive(0, 40.0)
+    assert not np.any(estimated(samples)["reasons"] & r.STUCK)
+
+
 @pytest.mark.parametrize("offset_A", [-4.0, 4.0])
 def test_current_with_an_offset_is_detected(offset_A):
     """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second,
@@ -237,3 +265,17 @@ def test_stuck_resolver_and_no_current_leaves_nothing():
     dead = slice(CLAMPING + 60, CLAMPING + _LASTING)
     assert np.all(estimates["source"][dead] == r.INVALID) and np.all(estimates["mode"][dead] == r.FAULT)
     assert _recovered(estimates, force)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_speed_that_becomes_noisy_counts_as_such(seed):
+    """Eight times as noisy: a motor that stands shows it, and what inertia would then make of the torque is no news."""
+    noise = 8.0 * load_calibration(resource("config/calibration.yaml")).noise.speed_rad_per_s
+
+    def change(rows):
+        rows["speed"][RELEASED:] += noise * np.random.default_rng(seed).standard_normal(len(rows) - RELEASED)
+
+    estimates, force = city.changed(change, seed, 40.0)
+    error = np.abs(estimates["force"] - force)[25:]
+    assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][25:], 25.0)) < 0.01
+    assert np.sqrt(np.mean(error**2)) < 150.0

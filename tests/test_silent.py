@@ -14,8 +14,9 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RESULT_ACCEPTED, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies.faults import FAMILIES, Size, alter, lose, size_of
-from studies.grid import draw_drive, drive
+from studies import unlisted
+from studies.faults import Size, alter, lose, size_of
+from studies.grid import FAMILIES, draw_drive, drive
 from studies.phases import first_flag_s, judge
 from studies.silent import main
 
@@ -150,6 +151,29 @@ def test_every_family_draws_a_fault_within_the_drive(plant, name):
     for seed in range(5):
         fault = FAMILIES[name](np.random.default_rng(seed), moments, Size())
         assert 0.0 <= fault.onset_s <= moments["park"]
+
+
+@pytest.mark.parametrize("name", sorted(unlisted.FAMILIES))
+def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(plant, frames, name):
+    """Else E2E protection would refuse them, and nothing would be learned of the estimator."""
+    moments, known = draw_drive(plant, np.random.default_rng(1))[1], default_layout()[0]["slot"]
+    frames = frames[known[frames["can_id"]] >= 0]
+    for seed in range(5):
+        fault, time_s = unlisted.FAMILIES[name](np.random.default_rng(seed), moments, Size()), moments["park"]
+        for _ in range(20):
+            time_s += 0.08
+            for frame in fault.bus(frames.copy(), time_s):
+                assert crc(int(frame["can_id"]), frame["data"]) == int(frame["data"]) & 0xFF
+
+
+def test_effects_from_no_catalogue_enter_at_every_port(plant):
+    moments, ports = draw_drive(plant, np.random.default_rng(1))[1], set()
+    for seed in range(50):
+        changed = plant.copy()
+        unlisted.FAMILIES["foreign"](np.random.default_rng(seed), moments, Size()).brake(changed)
+        [port] = [port for port in unlisted.WHOLE if changed["effects"][f"drawn_{port}"]["size"] != 0.0]
+        ports.add(port)
+    assert ports == set(unlisted.WHOLE)
 
 
 def test_a_drive_comes_back_from_its_seed():

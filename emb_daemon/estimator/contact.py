@@ -79,7 +79,7 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
         moved, sigma = slip, _ZERO_RAD
     elif seen:
-        moved = _drift(s, p, m, slip, turned)
+        moved = _drift(s, m, slip, turned)
         if moved != 0.0:
             sigma = abs(moved)
             s.drifting_s = _DRIFTING_S
@@ -93,7 +93,7 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
 
 
 @njit
-def _drift(s, p, m, slip, turned):
+def _drift(s, m, slip, turned):
     """How far (rad) the zero has drifted by what shows at standstill or at the end of a way, else 0; ``slip`` and ``turned``
     rad are what this sample adds to the angle beside the speed, and by it."""
     s.strayed += slip
@@ -104,13 +104,13 @@ def _drift(s, p, m, slip, turned):
     else:
         s.drifted += slip
         s.stood_s += m.dt
-    if abs(s.drifted) > _unaccounted(p, s.stood_s):
+    if abs(s.drifted) > _unaccounted(s, s.stood_s):
         return s.drifted
     moved = 0.0
     if s.stood_s > _AT_REST_S:
         # Only at the end of a motion: at the beginning of the next one a late speed lags the angle.
         ended = s.stood_s - m.dt <= _AT_REST_S
-        if ended and abs(s.strayed) > _unaccounted(p, s.turned_s) + _SPEED_SCALE * abs(s.turned):
+        if ended and abs(s.strayed) > _unaccounted(s, s.turned_s) + _SPEED_SCALE * abs(s.turned):
             moved = s.strayed
         if ended or s.turned_s > _STOOD_S:
             s.strayed = s.turned = s.turned_s = 0.0
@@ -135,9 +135,9 @@ def _move_zero(s, p, moved, sigma):
 
 
 @njit
-def _unaccounted(p, seconds):
+def _unaccounted(s, seconds):
     """Least travel (rad) beyond the integrated speed over ``seconds`` that neither its noise nor its offset explain."""
-    return _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * seconds + _CERTAIN * p.speed_sigma * sqrt(CYCLE_S * seconds)
+    return _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * seconds + _CERTAIN * s.speed_sigma * sqrt(CYCLE_S * seconds)
 
 
 @njit
@@ -186,7 +186,7 @@ def _passed_clearance(s, p, m):
         s.opposing += (s.balance - s.opposing) / s.passed
     passed, _ = through_gear(p.gear, m.angle - s.start_angle)
     closed = s.clearance > 0.0 and passed > _PASSED * s.clearance
-    sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
+    sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
     free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force
     return closed and s.passed > 0.0 and sigma / sqrt(s.passed) < 0.3 * _FREE * p.gear_gain * p.maximum_force and free
 
@@ -221,7 +221,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
         # The contact angle is held, as in diagnose; no calibration file can state that.
         engaged(c, x, 0.0)
         return
-    sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * p.speed_sigma / CYCLE_S)
+    sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
     limit = threshold(current_share, p.current_correlation_time, CYCLE_S)
     mean_force = 0.5 * (force_before + s.force)
     predicted = leverage * mean_force

@@ -185,7 +185,7 @@ def _predict(s, p, m, spread, warmth, known):
 @njit
 def _moving_variance(s, p, m):
     """Variance, (N m)^2, of one torque from noise of the speeds and from the difference in time between current and angle."""
-    unknown_speed = p.speed_sigma if m.dt <= ONE_CYCLE_S else p.speed_sigma + abs(m.speed) + abs(s.speed)
+    unknown_speed = s.speed_sigma if m.dt <= ONE_CYCLE_S else s.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
     apart = _LATE + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
     late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
@@ -338,12 +338,19 @@ def _beyond_friction(s, p, m, x, force, accelerating, spread):
 
 @njit
 def _torque_alone(s, p, m):
-    """Clamp force and its standard deviation (N) by the torque alone if nothing has jumped, then that torque
-    (N m), the gear gain, load friction (m/rad) and offset friction (N m)."""
+    """Clamp force and its standard deviation (N) by the torque alone, then that torque if nothing has jumped (N m), the gear
+    gain, load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
     gain, load, coulomb = _gear(s, p, m, s.error, slope)
     torque = _motor_torque(s, s.error) - gain * spring
     force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
+    mean = square = 0.0
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        apart = (_motor_torque(s, a.error) - _motor_torque(s, s.error)) / gain
+        mean += a.share * apart
+        square += a.share * apart * apart
+    force, sigma = max(force + mean, 0.0), hypot(sigma, sqrt(max(square - mean * mean, 0.0)))
     sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))

@@ -129,6 +129,8 @@ STATE = np.dtype(
         ("gain", "f8", (STATES,)),
         ("current_before", "f8"),
         ("had_current", "?"),
+        # Noise of the speed, rad/s: mean square of a motor that stands, and the larger of that and the calibration's.
+        *fields("f8", "speed_square speed_sigma"),
         ("no_current_s", "f8"),
         ("trusted", "?"),
         *fields("f8", "contact_anchor scale growth growth_start"),

@@ -45,6 +45,8 @@ from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
+#: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
+_HELD, _NOISE_S = 25, 0.5
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
 #: Factor on the calibration's largest force above which no clamp force is possible.
@@ -59,7 +61,7 @@ _UNCERTAIN = 0.01
 def _start(s, p, m):
     s.started = True
     s.angle = s.slid_angle = m.angle
-    s.speed = m.speed
+    s.speed, s.speed_sigma = m.speed, p.speed_sigma
     if not s.resumed:
         s.clearance, s.clearance_sigma, s.scale = p.clearance, p.clearance_sigma, 1.0
         set_priors(s.covariance, p)
@@ -104,6 +106,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
             add_softening(s.covariance, p, rise, s.temperature_sigma)
             s.softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
         open_all(s, p)
+    _follow_noise(s, p, m)
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
     torque, leverage, friction_variance = torque_path(s, p, m)
@@ -144,6 +147,14 @@ def _follow_age(s, p, m, moved_zero):
         return
     follow(s.lateness, m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed, m.dt)
     s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
+
+
+@njit
+def _follow_noise(s, p, m):
+    """How noisy the speed is: a motor that stands has none."""
+    if s.plausibility.held > _HELD and m.angle == s.angle:
+        s.speed_square += min(m.dt / _NOISE_S, 1.0) * (s.speed * s.speed - s.speed_square)
+    s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
 
 
 @njit

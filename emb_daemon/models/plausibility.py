@@ -18,14 +18,16 @@ import numpy as np
 
 from emb_daemon.jit import Record, fields, njit
 
-#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
-#: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in
+#: which angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one. The angle has stood at
 #: ``held_angle`` (rad) for ``held`` samples; meanwhile the torque swung ``swings`` times, the last time upwards (``swing`` 1)
-#: or downwards (-1); ``held_low``, ``held_high``: its least and largest value since the last swing. ``due_acceleration``
-#: (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must have caused since.
+#: or downwards (-1); ``held_low``, ``held_high``: its least and largest value since the last swing. ``pinned``: samples in a
+#: row in which the current repeated to the bit while the motor turned; ``limit`` A: of either sign, as far as its sensor then
+#: goes, 0 if unknown. ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must
+#: have caused since the angle stands.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -35,7 +37,8 @@ PLAUSIBILITY = np.dtype(
         *fields("f8", "current frozen_s"),
         ("averaged", "?"),
         *fields("f8", "torque_mean torque_variance held_angle held_low held_high due_acceleration due_speed due_angle"),
-        *fields("i8", "held swing swings"),
+        *fields("i8", "held swing swings pinned"),
+        ("limit", "f8"),
     ],
     align=True,
 )
@@ -67,6 +70,9 @@ _CERTAIN = 6.0
 #: Change below which an angle counts as standing, rad: three counts of a resolver of 12 bit; and factor on the share of
 #: friction that may turn over within it, over the calibration's.
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
+#: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
+#: repetition in five, once in 600; then that one value is disbelieved until the current has exceeded it.
+_PINNED = 4
 #: Angle that the torque must have turned the motor by, rad, to contradict an angle that stands: eight times what is computed
 #: from rest for a motor that in truth came from one side and went back there. Torque beyond friction, in standard deviations,
 #: that noise may cause: one sample of 700 has more, and three in a row are needed.
@@ -106,6 +112,7 @@ def watch(
         c.idle = c.idle + 1 if m.current_q == c.current else 0
         c.current_flickered += c.idle == 0
         c.current = m.current_q
+        _look_for_limit(c, m.current_q, travel)
     was = c.verdict
     if was == STIFFNESS_WRONG:
         c.frozen_s += m.dt
@@ -125,7 +132,8 @@ def watch(
         c.frozen_s = c.still * m.dt
         c.alike = 0
         return c.verdict
-    if c.idle >= _FROZEN and c.current_flickered >= _FLICKERED and c.still < _FROZEN:
+    repeated = c.idle >= _FROZEN and c.current_flickered >= _FLICKERED and c.still < _FROZEN
+    if repeated or (m.has_current and 0.0 < c.limit == abs(m.current_q)):
         c.verdict = TORQUE_FROZEN
     elif not disagree:
         c.verdict = AGREE
@@ -136,6 +144,16 @@ def watch(
     else:
         c.verdict = UNDECIDED
     return c.verdict
+
+
+@njit
+def _look_for_limit(c, current, travel):
+    """Notice whether the ``current`` (A) is as far as its sensor goes: then that much flows, or more."""
+    c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
+    if c.pinned >= _PINNED and c.current_flickered >= _FLICKERED:
+        c.limit = abs(current)
+    elif abs(current) > c.limit:
+        c.limit = 0.0
 
 
 @njit
