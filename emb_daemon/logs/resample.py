@@ -410,13 +410,23 @@ def _grid(stretches: list[tuple[int, int]], cycle_ns: int) -> tuple[np.ndarray, 
     return origin + cycles * cycle_ns, cycles
 
 
+def _slow(message, signals: Signals, ticks: dict, stretches: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a slow message, and their numbers: its cycles, or where motors stand and nothing of it was measured more often,
+    the motors' samples. A week's log of plates that cool would be sixty million frames."""
+    samples = np.unique(np.concatenate([times for times, _ in ticks.values()]))
+    measured = min((source.period_ns for source in signals.values() if isinstance(source, Series)), default=_STANDING_NS)
+    if len(samples) > 1 and min(measured, np.median(np.diff(samples))) >= _STANDING_NS:
+        return samples, np.arange(len(samples))
+    return _grid(stretches, cycle_ns(message))
+
+
 def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tuple[int, int]]) -> np.ndarray:
     corner, kind = (*message.name.split("_"), "")[1:3]
     if corner in ticks and kind in ("Resolver", "Current", "ForceSensor", "Force"):
         times, cycles = ticks[corner]
         columns = {key: _fast(key, source, times) for key, source in signals.items()}
     else:
-        times, cycles = _grid(stretches, cycle_ns(message))
+        times, cycles = _slow(message, signals, ticks, stretches)
         columns = {
             key: source.held(times, cycle_ns(message)) if isinstance(source, Series) else source
             for key, source in signals.items()
