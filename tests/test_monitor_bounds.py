@@ -19,6 +19,7 @@ from emb_daemon.estimator.monitor import (
     contradicts,
 )
 from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.models.gear import most_of_spring
 
 _DT = 0.004
 CLOSING, OPENING, HOLDING = 10.0, -10.0, 0.0
@@ -269,3 +270,21 @@ def test_friction_that_effects_add_widens_the_bounds_and_friction_that_they_take
     assert more[0] < plain[0] and more[1] > plain[1]
     held = 1.5 * MOST_FRICTION * (p["offset_friction"] + p["load_friction"] * more[0])
     assert more[0] * slope + held + OFFSET_SHARE * slope * p["maximum_force"] == pytest.approx(LEAST_GAIN * torque, rel=1e-3)
+
+
+def test_of_what_the_motor_shows_a_release_spring_may_take_its_most(p):
+    sprung = p.copy()
+    sprung["spring"] = 1.0
+    sprung["spring"] = 0.05 * p["maximum_force"] / most_of_spring(sprung)
+    low, high = Watched(p).hold(1.0, CLOSING)
+    with_spring = Watched(sprung).hold(1.0, CLOSING)
+    assert with_spring == (pytest.approx(low - 0.05 * p["maximum_force"]), high)
+
+
+def test_each_bound_takes_the_gear_at_the_slope_that_is_worst_for_it(p):
+    uneven = p.copy()
+    uneven["gear"]["step"] = 1.0
+    uneven["gear"]["slope"] = np.linspace(0.8, 1.25, len(p["gear"]["slope"]))
+    (low, high), (least, most) = Watched(p).hold(0.4, CLOSING), Watched(uneven).hold(0.4, CLOSING)
+    assert high / 0.8 < p["maximum_force"] and low > 0.0
+    assert (least, most) == (pytest.approx(low / 1.25), pytest.approx(high / 0.8))

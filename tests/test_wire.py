@@ -149,6 +149,22 @@ def test_pack_is_that_of_cantools_inside_the_range(data):
     assert not int(payload) & ~mask and not (theirs ^ empty) & ~mask
 
 
+def test_one_count_beyond_its_range_a_number_is_refused():
+    tried = 0
+    for name in _RECEIVED:
+        message = wirekit.database().get_message_by_name(name)
+        signals = [signal for signal in message.signals if signal.name not in ("CRC", "Counter", "Status")]
+        lowest = {signal.name: signal.minimum for signal in signals}
+        for signal in signals:
+            data = int(frame(name, **lowest | {signal.name: signal.maximum})["data"][0]) & ~0xFFFF
+            if (data >> signal.start & (1 << signal.length) - 1) + 1 < 1 << signal.length - signal.is_signed:
+                beyond = protect(message.frame_id, np.uint64(data + (1 << signal.start)), 0, 0)
+                sent = record(0, message.frame_id, int(beyond).to_bytes(8, "little"))
+                assert _receive(sent, new_reception())[1] == BAD_RANGE, signal.name
+                tried += 1
+    assert tried
+
+
 @given(st.sampled_from(_NAMES), st.sampled_from([np.inf, -np.inf, np.nan, 1e300, -1e300]))
 def test_what_does_not_fit_saturates(name, value):
     signals = [s.name for s in wirekit.database().get_message_by_name(name).signals]
