@@ -63,6 +63,19 @@ _FAMILY = {
     "gear_gain": ("clamp_force", "brake_torque", "disc_temperature"),
 }
 _EXPONENTS, _LAGS_S = (0.4, 2.6), (1.0, 20.0)
+#: The same of the heat balance, whose lags are its own, and sizes (K RMS of the temperatures).
+_HEAT_FAMILY = {
+    "disc_cooling": ("disc_speed", "disc_temperature"),
+    "contact_conductance": ("clamp_force", "surface_temperature", "disc_speed"),
+    "gap_conductance": ("disc_speed", "disc_temperature"),
+    "pad_conductivity": ("clamp_force", "pad_temperature"),
+    "heat_share": ("disc_speed", "surface_temperature", "friction_power", "clamp_force"),
+    "disc_heat": ("disc_speed",),
+}
+SIZES_K = (8.0, 16.0)
+#: ... but at the signals' usual sizes at most so much: twice a factor, half as much again of a material's, and what pads that
+#: drag make (W).
+_MOST = {"drawn_pad_conductivity": 0.5, "drawn_disc_heat": 600.0}
 #: Stops of a campaign for what no catalogue holds: as many as a rig's six minutes have; others have ten.
 _STOPS = {"foreign": 25, "drawn": 25}
 #: Sizes (N RMS on the effect's own path) of the power curve.
@@ -115,6 +128,7 @@ class Trial:
             where not exactly those were found.
         seconds: of CPU, for diagnose alone.
         left: by path; none in files of earlier versions.
+        kelvin: RMS of the temperatures' residual on the validation log, before and after.
     """
 
     seed: int
@@ -129,6 +143,7 @@ class Trial:
     seconds: float = 0.0
     left: dict[str, Rest] = field(default_factory=dict)
     changed: tuple[str, ...] = ()
+    kelvin: tuple[float, float] | None = None
 
     @property
     def false_findings(self) -> set[str]:
@@ -137,7 +152,7 @@ class Trial:
 
     def _is_drawn(self, found: str) -> bool:
         """Whether a term says what a drawn effect is: its port over one of its signals, or both."""
-        if self.kind != "drawn" or not found.startswith("term:"):
+        if self.kind not in ("drawn", "heat") or not found.startswith("term:"):
             return False
         [(name, values)] = self.hidden.items()
         _, port, *signals = _without_number(found).split(":")
@@ -149,7 +164,7 @@ class Trial:
         """Whether exactly what was hidden was found; for a foreign effect, a term of the right signal at the right port."""
         if self.kind == "changed":
             return not self.found and set(self.changed) == set(self.hidden)
-        if self.kind == "drawn":
+        if self.kind in ("drawn", "heat"):
             return bool(self.found) and all(map(self._is_drawn, self.found))
         if self.kind == "foreign":
             return len(self.found) == 1 and set(self.found) <= _SAME[next(iter(self.hidden))]
@@ -171,6 +186,17 @@ def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:
         schedule += rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.0), rng.uniform(6.0, 8.0))
     schedule += rig_drag(rng.uniform(2500.0, 5000.0), rng.uniform(20.0, 40.0), 20.0 * longer)
     return schedule + random_angle(plant, 10.0 * longer, rng) + rest(0.5)
+
+
+def heat_campaign(plant: np.void, rng: np.random.Generator) -> Schedule:
+    """Training, then drags, stops and a turning disc that cools: six minutes."""
+    schedule = training(plant, 21.0)
+    for _ in range(4):
+        schedule += rig_drag(rng.uniform(1500.0, 5000.0), rng.uniform(15.0, 45.0), 30.0)
+        schedule += rest(rng.uniform(20.0, 50.0), wheel_speed=rng.uniform(0.0, 50.0))
+        for _ in range(3):
+            schedule += rig_stop(rng.uniform(3000.0, 15000.0), rng.uniform(20.0, 60.0), 3.0, 7.0)
+    return schedule + rest(10.0)
 
 
 def draw(name: str, rng: np.random.Generator) -> dict[str, float]:
@@ -195,12 +221,12 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
     return values | amplitudes
 
 
-def draw_foreign(rng: np.random.Generator) -> dict[str, dict[str, float]]:
+def draw_foreign(rng: np.random.Generator, family: Mapping[str, tuple[str, ...]] = _FAMILY) -> dict[str, dict[str, float]]:
     """An effect that nobody thought of, of size one."""
-    port = list(_FAMILY)[rng.integers(len(_FAMILY))]
-    signal = rng.choice(_FAMILY[port])
-    other = rng.choice(_FAMILY[port]) if rng.uniform() < 1.0 / 3.0 else None
-    lag = float(np.exp(rng.uniform(*np.log(_LAGS_S)))) if rng.uniform() < 1.0 / 3.0 else 0.0
+    port = list(family)[rng.integers(len(family))]
+    signal = rng.choice(family[port])
+    other = rng.choice(family[port]) if rng.uniform() < 1.0 / 3.0 else None
+    lag = float(np.exp(rng.uniform(*np.log(_LAGS_S)))) if rng.uniform() < 1.0 / 3.0 and family is _FAMILY else 0.0
     values = {"size": 1.0, "signal": float(SIGNALS.index(signal)), "exponent": float(rng.uniform(*_EXPONENTS))}
     values |= {"shape": float(rng.choice([POWER, POWER, SATURATION, ONSET]))}
     values |= {"other": float(SIGNALS.index(other)) if other else -1.0, "lag_s": lag}
@@ -208,9 +234,11 @@ def draw_foreign(rng: np.random.Generator) -> dict[str, dict[str, float]]:
 
 
 def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, size: float, seed: int) -> dict:
-    """A drawn effect scaled until it adds ``size`` N RMS, in quadrature, to its path's residual."""
+    """A drawn effect scaled until it adds ``size`` (N or K RMS), in quadrature, to its path's residual."""
     [(name, values)] = hidden.items()
     channel = "stiffness" if name in ("drawn_stiffness", "drawn_thickness") else "torque"
+    if name.removeprefix("drawn_") in _HEAT_FAMILY:
+        channel = "temperature"
     values = values | {"size": 0.0}
 
     def residual(values) -> float:
@@ -220,10 +248,12 @@ def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, s
         return rmse(Bench([log_of(simulate_log(plant, schedule, seed=seed)[0])], start).residuals({})[channel])
 
     floor = residual(values)
-    tried = 10.0 if name == "drawn_thickness" else 0.05
+    tried = {"drawn_thickness": 10.0, "drawn_disc_heat": 100.0}.get(name, 0.05)
     for _ in range(3):
-        added = np.sqrt(max(residual(values | {"size": tried}) ** 2 - floor**2, 1.0))
+        added = np.sqrt(max(residual(values | {"size": tried}) ** 2 - floor**2, 1e-3 * size**2))
         tried *= float(np.clip(size / added, 0.1, 10.0))
+        if channel == "temperature":
+            tried = min(tried, _MOST.get(name, 1.0))
     return {name: values | {"size": tried}}
 
 
@@ -235,8 +265,8 @@ def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarra
 
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
-    """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign or drawn, ``names`` the effects to hide at
-    ``size`` N each; for a change that of what the calibration says is off."""
+    """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign, drawn or heat, ``names`` the effects to hide
+    at ``size`` N (K of heat) each; for a change that of what the calibration says is off."""
     rng = np.random.default_rng(seed)
     start = calibration
     removed = [name for name in names if name in calibration.effects]
@@ -247,10 +277,11 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
     base = plant_from_calibration(calibration, seed=seed)
     for name in removed:
         base["effects"][name] = 0.0
-    schedule = campaign(base, rng, stops)
+    schedule = heat_campaign(base, rng) if kind == "heat" else campaign(base, rng, stops)
     hidden: dict[str, dict[str, float]] = {}
-    if kind == "drawn":
-        hidden = sized(base, schedule, start, draw_foreign(np.random.default_rng(seed)), size, seed)
+    if kind in ("drawn", "heat"):
+        family = _FAMILY if kind == "drawn" else _HEAT_FAMILY
+        hidden = sized(base, schedule, start, draw_foreign(np.random.default_rng(seed), family), size, seed)
     elif kind == "foreign":
         hidden[names[0]] = dict(_FOREIGN[names[0]])
     elif names:
@@ -275,7 +306,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         for key, value in values.items():
             plant["effects"][name][key] = value
     fit_frames, _ = simulate_log(plant, schedule, seed=seed + 1)
-    judging = campaign(plant, rng, stops)
+    judging = heat_campaign(plant, rng) if kind == "heat" else campaign(plant, rng, stops)
     val_frames, _ = simulate_log(plant, judging, seed=seed + 2)
     fit_log, val_log = log_of(fit_frames), log_of(val_frames)
     begin = time.process_time()
@@ -302,6 +333,7 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         seconds,
         what_is_left(result, log_of(simulate_log(base, judging, seed=seed + 2)[0])),
         tuple(f.effect.name for f in result.accepted if f.in_calibration),
+        result.judged_residual.get("temperature"),
     )
 
 
@@ -345,7 +377,7 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
 
 
 def plan(
-    null: int, single: int, pairs: int, foreign: int, drawn: int = 0, triples: int = 0, changed: int = 0
+    null: int, single: int, pairs: int, foreign: int, drawn: int = 0, triples: int = 0, changed: int = 0, heat: int = 0
 ) -> list[tuple[int, str, tuple[str, ...], float]]:
     """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
     rng = np.random.default_rng(2009)
@@ -364,6 +396,7 @@ def plan(
     for k in range(changed):
         trials.append((70000 + 10 * k, "changed", (names[order[k % len(names)]],), SIZES_N[1 + k % 3]))
     trials += [(60000 + 10 * k, "drawn", (), SIZES_N[1 + k % 3]) for k in range(drawn)]
+    trials += [(80000 + 10 * k, "heat", (), SIZES_K[k % 2]) for k in range(heat)]
     strangers = [name for _ in range(foreign) for name in _FOREIGN]
     return trials + [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
 
@@ -403,7 +436,7 @@ def summary(trials: list[Trial]) -> str:
 
 _KINDS = {
     "null": "no effect", "single": "one effect", "pair": "two effects", "triple": "three effects",
-    "changed": "calibrated with another size", "drawn": "drawn by a seed",
+    "changed": "calibrated with another size", "drawn": "drawn by a seed", "heat": "heat, drawn by a seed",
 }  # fmt: skip
 #: From here a validation error counts as worse; below it is the noise of the reference.
 _WORSE = 1.05
@@ -449,6 +482,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--changed", type=int, default=13, help="plants with an effect calibrated with another size")
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
     parser.add_argument("--drawn", type=int, default=16, help="plants with an effect that a seed draws from a wider family")
+    parser.add_argument("--heat", type=int, default=16, help="the same in the heat balance")
     parser.add_argument("--bare", action="store_true", help="make no terms: does the report say that something is left?")
     parser.add_argument("--output", type=Path, help="trials, one JSON object per line; those already there are not run again")
     parser.add_argument("--calibration", type=Path, help="default: the shipped one")
@@ -457,8 +491,8 @@ def main(argv: list[str] | None = None) -> int:
         search.make_terms = lambda selection, progress: selection
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     counts = arguments.null, arguments.single, arguments.pairs, arguments.foreign
-    planned = plan(*counts, arguments.drawn, arguments.triples, arguments.changed)
-    done = {_key(t.seed, t.kind, () if t.kind == "drawn" else t.hidden, t.size): t for t in recorded(arguments.output)}
+    planned = plan(*counts, arguments.drawn, arguments.triples, arguments.changed, arguments.heat)
+    done = {_key(t.seed, t.kind, t.hidden, t.size): t for t in recorded(arguments.output)}
     trials = []
     for seed, kind, names, size in planned:
         trial = done.get(_key(seed, kind, names, size))
@@ -467,7 +501,9 @@ def main(argv: list[str] | None = None) -> int:
             state = "ok" if trial.named else "WRONG"
             found = ", ".join(trial.found) or "-"
             hidden, change = "+".join(trial.hidden), f"{trial.before:.1f} -> {trial.after:.1f} N"
-            text = f"{seed} {kind} {hidden} {size:.0f} N: {state}, {found}, {change}"
+            if trial.kelvin and kind == "heat":
+                change = f"{trial.kelvin[0]:.2f} -> {trial.kelvin[1]:.2f} K, {change}"
+            text = f"{seed} {kind} {hidden} {size:.0f}: {state}, {found}, {change}"
             print(text, trial.unexplained or "", file=sys.stderr, flush=True)
             if arguments.output:
                 with arguments.output.open("ab") as file:
@@ -478,7 +514,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _key(seed: int, kind: str, names: Iterable[str], size: float) -> tuple:
-    return seed, kind, tuple(names), size
+    return seed, kind, () if kind in ("drawn", "heat") else tuple(names), size
 
 
 if __name__ == "__main__":

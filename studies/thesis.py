@@ -19,22 +19,21 @@ from scipy.optimize import least_squares, minimize_scalar
 
 from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.parameters import CLEARANCE, INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT, moved
-from emb_daemon.calibration.types import Calibration
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import Campaign, load_campaign
 from emb_daemon.identify.campaign_file import Datasheet
 from emb_daemon.identify.dynamics import EPISODE, RELAXATION, TERMS, Pads, clearance_guess, curve_keys, powers, simulate
-from emb_daemon.identify.recording import Recording, recording
 from emb_daemon.identify.run import Identification, identify
 from emb_daemon.identify.steps import noise
-from emb_daemon.identify.steps.heat import thermal_parameters
 from emb_daemon.identify.steps.held_out import Errors, Fold
 from emb_daemon.identify.steps.softening import cold_bursts
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, TorqueStep, Unexplained
 from emb_daemon.identify.validation import Validation, at_thickness, validate
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import jackknife
+from emb_daemon.offline.recording import Recording, recording
 from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import CYCLE_S
 from studies.frequency import response
@@ -388,7 +387,7 @@ def thermal_lines(result: Identification) -> list[Line]:
     name = "validate: pads, torque known, K"
     if step.law and "tune" in step.fitted and name in step.figures:
         validate = recording(campaign.load(campaign.file.thermal.validate, "thermal.validate", "thermocouples"))
-        pad = fit_pad(step.fitted["tune"], thermal_parameters(result.calibration), step.law)
+        pad = fit_pad(step.fitted["tune"], np.atleast_1d(to_parameters(result.calibration)["thermal"]), step.law)
         his = rmse(pad(validate) - validate.measured[:8])
         known, car = step.figures[name], step.figures["validate: pads, no torque, estimated force, K"]
         lines.append(Line("pad temperatures, validate, brake torque known", "K", "3.7", [his], [known], "≤ 2", known <= 2.0))

@@ -16,11 +16,13 @@ from scipy.signal import lfilter
 from emb_daemon.calibration import terms as calibration_terms
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.diagnose import confirmation, diagnosis, grammar, prospects, search
+from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.comparison import errors
-from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
+from emb_daemon.diagnose.coordinates import Coordinate, about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
 from emb_daemon.diagnose.episodes import episodes
 from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out
@@ -700,6 +702,59 @@ def test_of_what_logs_cannot_tell_apart_what_is_too_large_is_not_it(coupled, mon
     assert len(tried) == 1 + accepted and len(set(tried)) == len(tried)
 
 
+def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled):
+    """What it leaves would look like another term."""
+    [name] = coupled[0].accepted
+    bare, candidate = coupled[0].without(name, "to be made again"), coupled[0].candidates[name]
+    search = Search(bare.model, "stiffness", grammar._signals(bare.model))
+    crooked = next(p for p in search._run(
+        [f for f in search.forms if (f.port, f.signal, f.shape) == ("stiffness", "brake_torque", "onset")]
+    ))  # fmt: skip
+    effect = made_effect(crooked.form, grammar._name(crooked.form, bare))
+    before = grammar._enter(bare, dataclasses.replace(candidate, effect=effect, evidence=crooked.evidence), crooked.form)
+    assert before.accepted == [effect.name]
+    found = grammar._restated(before, before, "stiffness")
+    [chosen] = found.accepted
+    [term] = [t for t in found.model.bench.calibrated(found.model.values).terms if t.name == chosen]
+    assert chosen != effect.name and (term.signal, term.shape) == ("brake_torque", "odd_power")
+    assert found.model.noise("stiffness") < before.model.noise("stiffness")
+
+
+def test_of_two_that_stand_for_one_cause_one_stays(monkeypatch):
+    """Each says nothing beside the other; what gains least goes, and then the other holds."""
+
+    def with_(*names):
+        own = {name: Coordinate(name, "torque", 0.0, 1.0, np.inf, ()) for name in names}
+        gone = lambda name, reason: with_(*(n for n in names if n != name))  # noqa: E731
+        return SimpleNamespace(accepted=list(names), model=SimpleNamespace(of_effect=lambda n: [own[n]]), without=gone)
+
+    gains = {"first": 0.9, "second": 0.2}
+    failing = lambda s, name: (gains[name], name, s.model.of_effect(name)) if len(s.accepted) == 2 else None  # noqa: E731
+    monkeypatch.setattr(selection_module, "_failing", failing)
+    assert revise(with_("first", "second")).accepted == ["first"]
+    assert revise(with_("second", "first")).accepted == ["first"]
+
+
+def test_a_term_that_its_limit_would_hold_is_not_taken(coupled):
+    """A product is held in the kernel; one that is at its limit in more than a tenth of the samples is something else."""
+    model = coupled[0].model
+    search = Search(model, "stiffness", grammar._signals(model))
+    of = {"port": "stiffness", "signal": "clamp_force", "shape": "odd_power", "scale": 1e4, "low": 0.0, "high": 2.5e4}
+    term = Term(name="term:x", coefficient=0.3, other="brake_torque", other_high=500.0, **of)
+    assert search.is_within(term)
+    assert not search.is_within(msgspec.structs.replace(term, coefficient=30.0))
+    assert search.is_within(msgspec.structs.replace(term, coefficient=0.3, other=None, other_high=0.0))
+
+
+def test_a_column_of_nothing_overflows_nothing():
+    """An effect whose signal stays at nothing, whatever is known of it beforehand."""
+    table = np.column_stack([np.zeros(60), np.linspace(0.0, 1.0, 60)])
+    moments = Moments.of(table, 2.0 * table[:, 1], np.repeat(np.arange(6), 10), 6)
+    with np.errstate(all="raise"):
+        found = leave_out(moments, np.array([1e12, 0.0]))
+    np.testing.assert_allclose(found.values, [0.0, 2.0], atol=1e-6)
+
+
 def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(coupled, monkeypatch):
     """What is proven over the whole grammar owes no chance of its own, but in the end it must still gain what matters."""
     assert revise(coupled[0]).accepted == coupled[0].accepted
@@ -737,6 +792,14 @@ def test_blind(calibration):
     assert trial.after < 45.0
     assert trial.after < 1.05 * trial.before
     assert trial.contribution_error < 0.15
+
+
+def test_a_term_of_the_heat_balance_is_named_and_carries_over(calibration, monkeypatch):
+    """A disc that cools faster the hotter it is: conductances alone leave 1.6 K of the temperatures on another log."""
+    monkeypatch.setattr(blind, "what_is_left", lambda result, alone: {})
+    trial = run_trial(calibration, 80000, "heat", (), 8.0)
+    assert trial.named and list(trial.found) == ["term:disc_cooling:disc_temperature"], trial
+    assert trial.kelvin[0] > 6.0 and trial.kelvin[1] < 0.8
 
 
 def test_a_ripple_of_a_sixth_of_the_current_s_noise_is_named_once_its_order_is_fitted(calibration, monkeypatch):
@@ -790,7 +853,7 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
 
     monkeypatch.setattr(blind, "run_trial", pretend)
     output = tmp_path / "blind.jsonl"
-    none = [part for kind in ("single", "triples", "changed", "foreign", "drawn") for part in (f"--{kind}", "0")]
+    none = [part for kind in ("single", "triples", "changed", "foreign", "drawn", "heat") for part in (f"--{kind}", "0")]
     few = [*none, "--pairs", "1", "--output", str(output)]
     assert blind.main(["--null", "2", *few]) == 0
     output.write_bytes(output.read_bytes()[:-20])

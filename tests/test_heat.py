@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, heat_step, mean_temperature
+from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, heat_step, mean_temperature
 
 
 @pytest.fixture
@@ -23,7 +23,9 @@ def _diffusivity(p):
 def _march(p, pads, seconds, dt, power=0.0, disc=20.0, backplate=20.0, braking=False, wheel_speed=0.0, ambient=20.0):
     work = np.empty((4, CHAIN))
     for _ in range(round(seconds / dt)):
-        disc = heat_step(p, pads, disc, backplate, backplate, ambient, power, braking, wheel_speed, dt, work, LONGEST_S)
+        disc = heat_step(
+            p, pads, disc, backplate, backplate, ambient, power, braking, wheel_speed, dt, work, LONGEST_S, UNALTERED
+        )
     return disc
 
 
@@ -70,7 +72,7 @@ def test_energy_is_conserved(thermal, dt):
         power = 9000.0 * braking
         capacity, _, outside, plates = naive.heat_matrices(thermal, pads, disc, 15.0, braking, 30.0)
         before = np.concatenate([pads[0], pads[1], [disc]])
-        disc = heat_step(thermal, pads, disc, 40.0, 35.0, 15.0, power, braking, 30.0, dt, work, LONGEST_S)
+        disc = heat_step(thermal, pads, disc, 40.0, 35.0, 15.0, power, braking, 30.0, dt, work, LONGEST_S, UNALTERED)
         after = np.concatenate([pads[0], pads[1], [disc]])
         stored = capacity @ (after - before)
         to_plates = plates[:NODES] @ (pads[0] - 40.0) + plates[NODES:-1] @ (pads[1] - 35.0)
@@ -103,7 +105,7 @@ def test_mesh_error_over_a_braking_cycle(thermal):
         braking, speed = time < 60.0, 37.7 * min(time / 60.0, 1.0)
         power = 2.0 * 0.4 * thermal["effective_radius"] * 4000.0 * speed * braking
         arguments = (20.0 + 0.5 * time, 20.0 + 0.5 * time, 20.0, power, braking, speed, dt)
-        disc = heat_step(thermal, pads, disc, *arguments, work, LONGEST_S)
+        disc = heat_step(thermal, pads, disc, *arguments, work, LONGEST_S, UNALTERED)
         fine_pads, fine_disc = naive.heat_step(fine, fine_pads, fine_disc, *arguments)
         errors = _profile(pads[0], coarse_nodes, disc) - _profile(fine_pads[0], fine["node_position"], fine_disc)
         worst = np.maximum(worst, np.abs(errors))
@@ -133,5 +135,5 @@ def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, d
     disc, work = 600.0, np.empty((4, CHAIN))
     for step in range(50):
         low, high = min(pads.min(), disc, 20.0), max(pads.max(), disc)
-        disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work, LONGEST_S)
+        disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work, LONGEST_S, UNALTERED)
         assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9

@@ -18,6 +18,7 @@ from emb_daemon.models.thermal import (
     CHAIN,
     LONGEST_S,
     NODES,
+    UNALTERED,
     at_depth,
     friction_power,
     heat_step,
@@ -114,7 +115,7 @@ def test_heat_chain(thermal, braking, dt):
     pads, disc = rng.uniform(20.0, 400.0, (2, NODES)), 300.0
     arguments = (40.0, 60.0, 15.0, 8000.0 * braking, braking, 20.0, dt)
     expected_pads, expected_disc = naive.heat_step(thermal, pads, disc, *arguments)
-    disc = heat_step(thermal, pads, disc, *arguments, np.empty((4, CHAIN)), LONGEST_S)
+    disc = heat_step(thermal, pads, disc, *arguments, np.empty((4, CHAIN)), LONGEST_S, UNALTERED)
     np.testing.assert_allclose(pads, expected_pads, rtol=1e-11)
     assert disc == pytest.approx(expected_disc, rel=1e-11)
 

@@ -5,8 +5,8 @@ import pytest
 from synthetic_rig import datasheet, draw, pads
 
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.identify.calibration import nominal
-from emb_daemon.identify.steps.heat import thermal_parameters
 from studies.frequency import fit_first_order, phasor, steady_rows
 from studies.thesis import best_fit_line, moving_window, regress_damping, regress_torque
 from studies.thesis_pad import thesis_nodes, thesis_profiles
@@ -91,7 +91,7 @@ def test_steady_rows_leave_out_the_approach_and_refuse_another_frequency():
 
 
 def _thesis_parameters():
-    p = thermal_parameters(nominal(datasheet(0.05, 1e-4), "rig", 10.0, [10.0]))
+    p = np.atleast_1d(to_parameters(nominal(datasheet(0.05, 1e-4), "rig", 10.0, [10.0]))["thermal"])
     p["conductivity_rise"] = 0.0
     return p
 

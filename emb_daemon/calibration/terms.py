@@ -12,13 +12,19 @@ from emb_daemon.errors import InvalidValue
 
 #: Most that a term may do at a port: what would leave nothing of the quantity that it changes. Angles and thickness: a
 #: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Current: what no sensor is off by. Force: as
-#: `Calibration` says of the largest.
-_MOST_AT = {"thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0}
+#: `Calibration` says of the largest. Heat: what pads that drag with 10 N m make at 100 rad/s.
+_MOST_AT = {
+    "thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0, "pad_heat": 1e3, "disc_heat": 1e3,
+}  # fmt: skip
 _FACTOR = 0.9
 #: ... and the most that may be added to a factor. Friction and times change severalfold with load and warmth, but of three
 #: times as much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor
-#: constant twice as large is another machine's.
-_GROWS = {"gear_friction": 2.0, "relaxation_time": 2.0}
+#: constant twice as large is another machine's. A contact conducts heat nearly in proportion to its pressure, and air at speed
+#: takes tenfold what still air takes.
+_GROWS = {
+    "gear_friction": 2.0, "relaxation_time": 2.0, "heat_share": 9.0, "contact_conductance": 9.0, "gap_conductance": 9.0,
+    "disc_cooling": 9.0,
+}  # fmt: skip
 #: Temperature (degC) from which one that multiplies counts.
 _COLD_C = 20.0
 

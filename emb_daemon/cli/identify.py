@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.identify.campaign import load_campaign
     from emb_daemon.identify.report import build
     from emb_daemon.identify.run import identify
+    from emb_daemon.identify.steps import thermal
     from emb_daemon.identify.steps.attribution import words
     from emb_daemon.logs.read import read_with_digest
 
@@ -55,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.report.mkdir(parents=True, exist_ok=True)
         build(result).write(arguments.report / "report.html")
     _print(result.validations, result.thermal.figures)
-    print(words(result.attribution))
+    print(" ".join(filter(None, (words(result.attribution), thermal.words(result.thermal)))))
     missing = [fault for fault in campaign.faults if not fault.startswith("thermal")]
     also = f", without what {len(missing)} lines above say (exit status {INCOMPLETE})" if missing else ""
     print(f"{arguments.output}: calibration {calibration_hash(result.calibration)}, {result.seconds:.0f} s{also}")

@@ -156,6 +156,11 @@ def _scale(calibration: Calibration, keys: list[str], channel: str, prior: float
     return Coordinate(first.key, channel, start, first.step / sizes[0], known_to, moves, least, first.high / sizes[0])
 
 
+def scaled_coordinate(calibration: Calibration, key: str, channel: str, prior: float) -> Coordinate:
+    """Coordinate of one key of the base calibration, known to a share ``prior`` of its size."""
+    return _scale(calibration, [key], channel, prior)
+
+
 def _usual(step: float) -> float:
     return 1e3 * step
 

@@ -14,18 +14,19 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.parameters import moved, parameter, value_of
-from emb_daemon.calibration.types import Calibration, Provenance, Source
+from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
 from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import LASTING, Progress, Selection
-from emb_daemon.diagnose.unexplained import Dependence, Left, dependences
+from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond
+from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -184,7 +185,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
         judged_residual={c: (_rms(judged_before[c]), _rms(final[c])) for c in judging.channels} if judges else {},
-        left=_left(selection, judged_before, final, judging),
+        left=_left(selection, judged_before, final, judging, augmented),
         left_before=selection.at_first,
         seconds=time.monotonic() - begin,
     )
@@ -294,11 +295,13 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
         groups.setdefault(c.name.partition("[")[0].removesuffix(".over_force").removesuffix(".over_speed"), []).append(c)
     result = {}
     for group in groups.values():
-        channel = group[0].channel
-        own = model.own(channel)
-        rest = [c for c in own if c not in group]
-        without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
-        gain = model.rms(_left_out(model, channel, rest, without) - _left_out(model, channel, own), channel)
+        channel, gain = group[0].channel, 0.0
+        # What stands as chosen was fitted elsewhere.
+        if not model.chosen.issuperset(group):
+            own = model.own(channel)
+            rest = [c for c in own if c not in group]
+            without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
+            gain = model.rms(_left_out(model, channel, rest, without) - _left_out(model, channel, own), channel)
         for c in group:
             size = next((move.weight for move in c.moves if move.key == c.name), 1.0)
             sigma = c.sigma_of(model.values[c], model.fits[c.channel].sigmas.get(c, 0.0)) * abs(size)
@@ -327,6 +330,7 @@ def _left(
     before: Mapping[str, np.ndarray],
     after: Mapping[str, np.ndarray],
     judging: Bench,
+    augmented: Calibration,
 ) -> dict[str, Left]:
     """What is left in each channel: its size where the error is judged, its dependences where effects were looked for."""
     model, screening, result = selection.model, selection.screening, {}
@@ -344,9 +348,24 @@ def _left(
             gains = {name: pair for name, pair in gains.items() if name not in NO_RIVALS.get(channel, ())}
             found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
         first, last = _rms(before[channel]), _rms(after[channel])
+        known = screening.achieved(model, channel, force, rise)
+        if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):
+            # Where the brake torque is measured the pads' friction has no share in it.
+            first, last = (_rms(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
+            known = screening.achieved(model, channel, force, np.zeros(0))
+            found = _heat_dependences(selection, augmented) if is_beyond(last, known) else []
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, screening.achieved(model, channel, force, rise), share, tuple(found))
+        result[channel] = Left(channel, last, known, share, tuple(found))
     return result
+
+
+def _heat_dependences(selection: Selection, augmented: Calibration) -> list[Dependence]:
+    """What the rest of the heat balance follows, by the best form of each signal at any of its ports."""
+    bench = heat_bench((trial.log for trial in selection.model.bench.trials), augmented)
+    if bench is None:
+        return []
+    model, floor = bench.model(), selection.screening.floor(selection.model, CHANNEL_OF_HEAT, made=True)
+    return dependences(CHANNEL_OF_HEAT, HeatSearch(model).dependence(), model.counted(CHANNEL_OF_HEAT), floor)
 
 
 def _rms(residual: np.ndarray) -> float:
@@ -431,7 +450,7 @@ def with_terms(calibration: Calibration, selection: Selection) -> Calibration:
         elif selection.candidates[term.name].accepted:
             own = [c for c in model.of_effect(term.name) if c.parameter in ("coefficient", "sine")]
             sigma = float(np.max([model.fits[c.channel].sigmas.get(c, 0.0) for c in own]))
-            logs = ", ".join(trial.log.path.name for trial in model.bench.trials)
+            logs = ", ".join(model.bench.sources)
             found = f"{datetime.now(UTC).date().isoformat()} in {logs}"
             kept.append(msgspec.structs.replace(term, sigma=sigma if np.isfinite(sigma) else 0.0, provenance=found))
     return msgspec.structs.replace(calibration, terms=tuple(kept))

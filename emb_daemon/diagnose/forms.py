@@ -42,6 +42,13 @@ _TYPED: dict[str, tuple[str, ...]] = {
     ),
     "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
     "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", "winding_heat", "housing_heat", *_SLOW),
+    "heat_share": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "friction_power", "energy"),
+    "contact_conductance": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "energy"),
+    "gap_conductance": ("disc_speed", "disc_temperature", "surface_temperature", "time_since_last_clamp"),
+    "pad_conductivity": ("clamp_force", "pad_temperature", "energy"),
+    "disc_cooling": ("disc_speed", "disc_temperature", "clamp_force", "energy"),
+    "pad_heat": ("disc_speed", "time_since_last_clamp"),
+    "disc_heat": ("disc_speed", "time_since_last_clamp"),
 }
 #: Ports at which there are forms.
 FORMED = tuple(_TYPED)
@@ -53,7 +60,10 @@ _GATES: dict[str, tuple[str, ...]] = {
 }
 #: Ports at which two signals may multiply: factors and lengths. What counts from the power on multiplies nothing, and places
 #: along the screw are asked by bumps.
-_MULTIPLIED = ("thickness", "stiffness", "torque_constant", "relaxation_time", "gear_gain", "gear_friction")
+_MULTIPLIED = (
+    "thickness", "stiffness", "torque_constant", "relaxation_time", "gear_gain", "gear_friction", "heat_share",
+    "contact_conductance", "disc_cooling",
+)  # fmt: skip
 _ALONE = ("motor_angle", "travel", "energy", "time_clamped", "time_since_last_clamp")
 #: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
 _EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
@@ -61,7 +71,9 @@ _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
 #: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
 _WIDER, _SHAPE = 8.0, 0.5
 #: A small coefficient by port, in its unit; of a factor a thousandth.
-_STEPS = {"thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4, "current": 1e-2}
+_STEPS = {
+    "thickness": 1e-6, "motor_angle": 1e-3, "force": 1.0, "torque": 1e-4, "current": 1e-2, "pad_heat": 0.1, "disc_heat": 0.1,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -115,6 +127,16 @@ class Form:
         """A small coefficient, in the port's unit."""
         return _STEPS.get(self.port, 1e-3)
 
+    @property
+    def amplitudes(self) -> tuple[float, float]:
+        """Bounds of the coefficient. A heat balance has them while it is fitted: next to nothing times very much would be as
+        good a conductance as what it is times a little."""
+        if HOOKS[self.port].channel != "temperature":
+            return -np.inf, np.inf
+        tried = self.term(coefficient=self.step)
+        shaped = tried.reach[1] / self.step
+        return -tried.limit / shaped, tried.growth / shaped
+
     def term(self, name: str = "term:tried", coefficient: float = 0.0, sine: float = 0.0) -> Term:
         sizes = {key: getattr(self, key) for key in ("scale", "centre", "exponent", "memory_scale", "low", "high")}
         return Term(
@@ -163,7 +185,8 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
             power = "even_power" if low < 0.0 and not centre else "odd_power"
             shapes = [("none", power, farthest, centre, exponent, 1.0) for exponent in _EXPONENTS]
             shapes.append(("none", "onset", high - low, low + _PLACES[0] * (high - low), 1.0, 1.0))
-            shapes += [("response", "even_power", farthest, centre, 1.0, time) for time in _TIMES_S]
+            times = _TIMES_S if HOOKS[port].channel != "temperature" else ()
+            shapes += [("response", "even_power", farthest, centre, 1.0, time) for time in times]
             for memory, shape, scale, middle, exponent, time in shapes:
                 form = Form(port, signal, memory, shape, "always", scale, middle, exponent, time, low, high, other, most)
                 straight = shape != "onset" and exponent == 1.0
@@ -204,6 +227,14 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for share in _SCALES:
             yield "none", "decay", share * reach, 0.0, 1.0, 1.0
         return
+    centre = _COLD_C if signal in _TEMPERATURES else 0.0
+    farthest = max(abs(low - centre), abs(high - centre))
+    if HOOKS[port].channel == "temperature":
+        # Temperatures remember by themselves.
+        yield from (("none", "odd_power", farthest, centre, exponent, 1.0) for exponent in _EXPONENTS)
+        yield from (("none", "decay", share * reach, 0.0, 1.0, 1.0) for share in _SCALES)
+        yield from (("none", "onset", width, low + place * width, 1.0, 1.0) for place in _PLACES)
+        return
     if port == "force":
         for time in _CREEP_S:
             yield "deficit", "odd_power", reach, 0.0, 1.0, time
@@ -215,8 +246,6 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for time in _CREEP_S:
             yield "lag", "odd_power", reach, 0.0, 1.0, time
         return
-    centre = _COLD_C if signal in _TEMPERATURES else 0.0
-    farthest = max(abs(low - centre), abs(high - centre))
     signed = low < 0.0 and signal not in _TEMPERATURES
     even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
     for exponent in _EXPONENTS:
@@ -272,7 +301,8 @@ def made_effect(form: Form, name: str) -> Effect:
 _QUANTITY = {
     "thickness": "pads and disc, m", "motor_angle": "θ", "stiffness": "stiffness", "force": "F", "torque_constant": "K_m",
     "torque": "T_m", "gear_gain": "γ", "gear_friction": "T_f", "pad_friction": "μ",
-    "current": "I", "relaxation_time": "τ",
+    "current": "I", "relaxation_time": "τ", "heat_share": "pads' heat share", "contact_conductance": "h_contact",
+    "gap_conductance": "h_gap", "pad_conductivity": "λ", "disc_cooling": "h_disc", "pad_heat": "Q_pads", "disc_heat": "Q_disc",
 }  # fmt: skip
 
 

@@ -10,9 +10,11 @@ signal at another time, and whether resampled episodes would choose the same.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, made_effect
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
@@ -26,11 +28,12 @@ from emb_daemon.diagnose.prospects import (
     noise_left,
     with_term,
 )
-from emb_daemon.diagnose.residuals import UNITS
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
+from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import MOST, SIGNALS
 from emb_daemon.offline.run import held
 from emb_daemon.offline.score import rmse
@@ -41,14 +44,23 @@ _BOOTSTRAPS = 100
 #: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all, unless
 #: they choose its port: all but a fifth must, because what the term follows there is not sure.
 _AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.2, 0.5, 0.8
+#: Terms of the heat balance in a calibration.
+_OF_HEAT = 2
+#: Ports and signals that are fitted where a small step does not tell.
+_FITTED = 4
+#: Fits after another that such a term is given, and share of the mean square from which another gains nothing.
+_FITS, _LITTLE = 8, 0.98
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 
 
 def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selection:
     """Terms made for what the catalogue leaves, one after the other until none is proven."""
+    if CHANNEL_OF_HEAT in selection.model.bench.channels:
+        progress("making a term for the heat balance")
+        selection = _with_heat_terms(selection)
     for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
-        if _wanted(selection, channel):
+        if channel != CHANNEL_OF_HEAT and _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
             selection = _with_orders_again(_called_by_name(selection, channel), channel)
@@ -56,11 +68,67 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
 
 
 def _with_terms(selection: Selection, channel: str) -> Selection:
-    while len(selection.model.bench.calibration.terms) < MOST and _wanted(selection, channel):
+    while _has_room(selection, channel) and _wanted(selection, channel):
         before, selection = selection, _one_more(selection, channel)
         if selection.accepted == before.accepted:
             break
+        selection = _restated(selection, before, channel)
     return selection
+
+
+def _has_room(selection: Selection, channel: str) -> bool:
+    of_heat = [HOOKS[term.port].channel == CHANNEL_OF_HEAT for term in selection.model.bench.calibration.terms]
+    if channel == CHANNEL_OF_HEAT:
+        return sum(of_heat) < _OF_HEAT
+    return len(of_heat) - sum(of_heat) < MOST - _OF_HEAT
+
+
+def _restated(found: Selection, before: Selection, channel: str) -> Selection:
+    """The same, or an earlier term in another shape, if that alone describes the residual as shortly as it does with the last
+    one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    # Terms of the heat balance were fitted in all their shapes, and a ripple has but one.
+    for name in _made(before, channel) if channel != CHANNEL_OF_HEAT else ():
+        candidate = before.candidates[name]
+        if "sine" in [c.parameter for c in candidate.amplitudes]:
+            continue
+        bare = before.without(name, "its shape was chosen again")
+        search = _search(bare.model, channel)
+        prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
+        for prospect in (p for p in prospects if p.evidence.gain > 0.0):
+            effect = made_effect(prospect.form, _name(prospect.form, bare))
+            other = _enter(bare, replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False), prospect.form)
+            if effect.name in other.accepted and _description(other, channel) <= _description(found, channel):
+                found = other
+    return found
+
+
+def search_heat(bench: warmth.HeatBench) -> Selection:
+    """Terms of the heat balance that recordings prove."""
+    model = bench.model()
+    return _with_terms(Selection(model, warmth.HeatScreening(bench, model)), CHANNEL_OF_HEAT)
+
+
+def _with_heat_terms(selection: Selection) -> Selection:
+    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them.
+
+    They stand as fitted with conductances and capacities to a measured brake torque: in the whole estimator friction and force
+    would have a say in them."""
+    model = selection.model
+    known = {c: value for c, value in model.values.items() if c.channel == CHANNEL_OF_HEAT and c.effect}
+    bench = warmth.heat_bench((trial.log for trial in model.bench.trials), model.bench.calibrated(known))
+    if bench is None:
+        return selection
+    found = search_heat(bench)
+    if not found.accepted:
+        return selection.noted(found.candidates.values())
+    terms = msgspec.structs.replace(model.bench.calibration, terms=found.model.bench.calibration.terms)
+    bare = model.without([c for c in model.values if c.channel == CHANNEL_OF_HEAT and not c.effect])
+    there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
+    if there.noise(CHANNEL_OF_HEAT) >= model.noise(CHANNEL_OF_HEAT):
+        worse = "with a brake torque that is not measured temperatures are no better for it"
+        return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
+    there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
+    return replace(selection, model=there).noted(found.candidates.values())
 
 
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
@@ -80,7 +148,7 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
         return found
     both = one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
-    matters = gain > found.screening.floor(found.model, channel) ** 2
+    matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
     return both if matters and _description(both, channel) < _description(found, channel) else found
 
 
@@ -107,7 +175,7 @@ def _description(selection: Selection, channel: str) -> float:
     """Description length of what lasts of a channel's residual, with all numbers of its effects and terms."""
     model, samples = selection.model, LASTING[channel]
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
-    matters = model.counted(channel) * selection.screening.floor(model, channel) ** 2
+    matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
     return description_length(max(left, matters), numbers, model.bench.episodes)
 
@@ -118,23 +186,25 @@ def _wanted(selection: Selection, channel: str) -> bool:
     known = screening.achieved(model, channel, screening.signals["clamp_force"], np.zeros(0))
     if is_beyond(np.sqrt(model.noise(channel)), known):
         return True
-    screen = Screen(model, channel, COARSE)
-    return rmse(screen.residual[:, 0] * screen.means.per_mean) >= screening.floor(model, channel)
+    screen = Screen(model, channel, 1 if channel == CHANNEL_OF_HEAT else COARSE)
+    return rmse(screen.residual[:, 0] * screen.means.per_mean) >= screening.floor(model, channel, made=True)
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
     """With the best term for one channel, accepted if it is proven, else with what speaks against it; where that is that it is
     too large, with the best that is as good."""
     model, screening = selection.model, selection.screening
-    signals = _signals(model)
-    if signals is None:
+    search = _search(model, channel)
+    if search is None:
         return selection
-    search = Search(model, channel, signals)
-    floor = screening.floor(model, channel)
+    floor = screening.floor(model, channel, made=True)
     prospects = search.prospects(floor)
-    if not prospects or model.rms(prospects[0].evidence.gain, channel) < floor:
+    straight = model.bench.straight or channel != CHANNEL_OF_HEAT
+    if not prospects or (straight and model.rms(prospects[0].evidence.gain, channel) < floor):
         return selection
     shares = _shares(search.screen, prospects)
+    if not straight:
+        return _best_fitted(selection, search, prospects, shares)
     for prospect in prospects:
         # Where these logs cannot tell forms apart, one that is more than its port may bear is not the one.
         if prospect.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain:
@@ -143,6 +213,18 @@ def _one_more(selection: Selection, channel: str) -> Selection:
             if selection.candidates[name].reason != TOO_LARGE:
                 break
     return selection
+
+
+def _best_fitted(
+    selection: Selection, search: Search, prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]
+) -> Selection:
+    """With the one of several prospects that leaves least when it is fitted with everything else. Heat does not answer in
+    proportion: what another conductance could do of a term in a small step, it cannot in one of the term's size."""
+    means = list(dict.fromkeys(prospect.means for prospect in prospects))[:_FITTED]
+    tried = [_with(selection, search, p, prospects, shares) for p in prospects if p.means in means]
+    accepted = [found for found in tried if len(found.accepted) > len(selection.accepted)]
+    refused = selection.noted(found.candidates[name] for found in tried for name in found.candidates)
+    return min(accepted, key=lambda found: found.model.noise(search.channel), default=refused)
 
 
 def _with(
@@ -222,6 +304,13 @@ def _made(selection: Selection, channel: str) -> list[str]:
     return [name for name, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]
 
 
+def _search(model: Model, channel: str) -> Search | None:
+    if channel == CHANNEL_OF_HEAT:
+        return warmth.HeatSearch(model)
+    signals = _signals(model)
+    return Search(model, channel, signals) if signals else None
+
+
 def _signals(model: Model) -> list[np.ndarray] | None:
     """What terms see, by log; None where an angle lost its zero."""
     result = []
@@ -231,6 +320,15 @@ def _signals(model: Model) -> list[np.ndarray] | None:
         parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
         result.append(follow_signals(trial.log.samples, parameters, heat))
     return result
+
+
+def _arrived(model: Model, channel: str) -> Model:
+    """Fitted until nothing is gained: from far away one fit does not arrive."""
+    for _ in range(_FITS):
+        before, model = model.noise(channel), model.refined({channel})
+        if model.noise(channel) > _LITTLE * before:
+            break
+    return model
 
 
 def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
@@ -275,6 +373,8 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     """With a term, fitted with everything else; without it again if it then proves nothing."""
     before, channel, name = selection.model, candidate.channel, candidate.effect.name
     index = len(before.bench.calibration.terms)
+    if index == MOST:
+        return selection.noted([replace(candidate, reason=f"a calibration holds {MOST} terms")])
     bench = with_term(before.bench, form.term(name))
     fields = ["coefficient", *(["sine"] if form.shape == "harmonic" else [])]
     amplitudes = [coordinate_of(index, channel, form, field, name) for field in fields]
@@ -283,11 +383,17 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
     evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0), LASTING[channel])
     gain = model.rms(evidence.gain, channel)
+    if not bench.straight:
+        model = _arrived(model, channel)
+        gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)
-    if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel):
+    if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel, made=True):
         return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
-    if not next(term for term in bench.calibrated(model.values).terms if term.name == name).is_bounded:
+    fitted = next(term for term in bench.calibrated(model.values).terms if term.name == name)
+    search = _search(model, channel) if fitted.is_held else None
+    if not fitted.is_bounded or not (search is None or search.is_within(fitted)):
         return selection.noted([replace(candidate, reason=TOO_LARGE)])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
-    explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]} on left-out episodes"
+    where = " on left-out episodes" if bench.straight else ""
+    explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]}{where}"
     return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])

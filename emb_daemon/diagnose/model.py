@@ -142,8 +142,7 @@ class Model:
             return own_residual(*(tried[c] for c in own))[0] / scale
 
         def derivative(tried: Values) -> np.ndarray:
-            # Heat answers to its parameters so nearly in proportion that one derivative serves all iterations.
-            key = tuple(tried[c] for c in own) if channel in FORCE_CHANNELS else ()
+            key = () if self.bench.straight and channel not in FORCE_CHANNELS else tuple(tried[c] for c in own)
             if key not in slopes:
                 at, heat = own_residual(*(tried[c] for c in own))
                 found = self.bench.regressors(self.values | dict(tried), [Probe(c) for c in own], {channel: at}, heat)

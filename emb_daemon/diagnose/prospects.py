@@ -15,7 +15,7 @@ from emb_daemon.diagnose.evidence import Averaging, Evidence, leave_out
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import Bench, Probe
+from emb_daemon.diagnose.residuals import SIDE_BY_SIDE, Bench, Probe
 from emb_daemon.diagnose.selection import LASTING, NOT_OF_A_FREE_MOTOR
 from emb_daemon.diagnose.signals import OF_A_BRAKE
 from emb_daemon.diagnose.unexplained import sample_noise
@@ -35,6 +35,8 @@ _SHARPENED, _TRIES = 24, 8
 _LEADING = 10
 #: Shifts of all signals in time, and of the chosen one's.
 _CHANCES, _SHIFTS = 99, 5
+#: Share of the samples in which a term must stay within what its port may bear.
+_HELD = 0.9
 #: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
 _ORDERS, _LOBES = (0.05, 100.0), 4
 
@@ -48,11 +50,16 @@ class Scores:
     a: np.ndarray
 
     @property
-    def gain(self) -> np.ndarray:
-        """Fall of the squared error summed over left-out episodes."""
+    def fall(self) -> np.ndarray:
+        """Fall of the squared error of each left-out episode."""
         rest = self.a.sum(axis=1, keepdims=True) - self.a
         without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=rest > 0.0)
-        return np.sum(2.0 * without * self.u - without**2 * self.a, axis=1)
+        return 2.0 * without * self.u - without**2 * self.a
+
+    @property
+    def gain(self) -> np.ndarray:
+        """The same summed over them."""
+        return np.sum(self.fall, axis=1)
 
 
 class Screen:
@@ -119,7 +126,7 @@ class Search:
         self.channel = channel
         self.signals = signals
         self.random: np.random.Generator = np.random.default_rng(0)
-        covered = _covered(np.concatenate(signals))
+        covered = covered_by(np.concatenate(signals))
         self.covered: dict[str, tuple[float, float]] = {
             name: reach for name, reach in covered.items() if model.bench.clamps or name not in OF_A_BRAKE
         }
@@ -158,6 +165,10 @@ class Search:
         """What left-out episodes gain by each of those."""
         return self._screened(self.products)
 
+    def answer(self, form: Form) -> np.ndarray:
+        """What a form of coefficient one does to the channel."""
+        return self.sensitivities[form.port] * _values(self.model.bench, form, self.signals)
+
     def _screened(self, forms: Sequence[Form]) -> np.ndarray:
         return _screen_forms(self.screen, forms, self.sensitivities, self.signals).gain
 
@@ -179,7 +190,7 @@ class Search:
         alone -= noise_left(model, self.channel, samples)
 
         def shortest(found: Sequence[Prospect]) -> list[Prospect]:
-            kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p)]
+            kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p) and self.is_within(_term_of(p))]
             return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
 
         single = shortest([*self._run(_sharpen(self, self.forms, self.gains)), *self.ripples()])
@@ -188,6 +199,22 @@ class Search:
             return single
         every = shortest([*single, *self._run(_sharpen(self, self.products, self.product_gains))])
         return every if every and every[0].form.other else single
+
+    def is_within(self, term: Term) -> bool:
+        """Whether a term that the kernel holds within its limits would stay there on these logs anyhow: one at its limit
+        more often is a constant there, and its shape says something else."""
+        if not term.is_held:
+            return True
+        values = values_of(self.model.bench, term, self.signals)
+        return bool(np.quantile(np.abs(values), _HELD) <= term.limit)
+
+    def of_means(self, port: str, signals: tuple[str, ...]) -> list[Prospect]:
+        """The best forms of some signals at a port, through the estimator."""
+        every, gains = self.forms, self.gains
+        if len(signals) > 1:
+            every, gains = self.products, self.product_gains
+        own = [index for index, form in enumerate(every) if form.port == port and {*form.signals} == {*signals}]
+        return self._run(_sharpen(self, [every[index] for index in own], gains[own])) if own else []
 
     def undecided(self, best: Prospect, rivals: Sequence[Prospect]) -> float:
         """Largest RMS by which a rival does otherwise than the best, beside all that the path's parameters can do."""
@@ -202,23 +229,31 @@ class Search:
 
     @cached_property
     def _chance(self) -> float:
-        return _chance(self, self.forms, self.gains)
+        return self.chance_of(self.forms, self.gains, _CHANCES)
 
     @cached_property
     def _chance_of_two(self) -> float:
-        return _chance(self, [*self.forms, *self.products], np.append(self.gains, self.product_gains))
+        return self.chance_of([*self.forms, *self.products], np.append(self.gains, self.product_gains), _CHANCES)
+
+    def chance_of(self, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
+        """Chance that the best of some forms gains as much with their signals moved in time, by so many trials."""
+        return _chance(self, forms, gains, chances)
 
     def at_another_time(self, form: Form) -> float:
-        """Largest gain of a term with its signal moved in time, as if the log were a circle; none for a ripple."""
-        if form.shape == "harmonic":
-            return 0.0
+        """Gain of a term with its signal moved in time, as if the log were a circle, the median of a few; none for a ripple.
+
+        Not by the largest: what rises once and stays is, moved by a little, still much of itself."""
+        return 0.0 if form.shape == "harmonic" else float(np.median(self.gains_moved(form, _SHIFTS)))
+
+    def gains_moved(self, form: Form, shifts: int) -> np.ndarray:
+        """The same of a form that is no ripple, for so many shifts."""
         values = _values(self.model.bench, form, self.signals)
-        shifts = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(_SHIFTS)]
-        columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in shifts])
-        return float(self.screen.scores(columns).gain.max())
+        by = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(shifts)]
+        columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in by])
+        return self.screen.scores(columns).gain
 
 
-def _covered(signals: np.ndarray) -> dict[str, tuple[float, float]]:
+def covered_by(signals: np.ndarray) -> dict[str, tuple[float, float]]:
     """Range of each signal that varies."""
     result = {}
     for index, name in enumerate(SIGNALS):
@@ -251,9 +286,10 @@ def with_term(bench: Bench, term: Term) -> Bench:
 def coordinate_of(index: int, channel: str, form: Form, field: str, effect: str) -> Coordinate:
     key = f"terms[{index}].{field}"
     if field in ("coefficient", "sine"):
-        moves = (Move(key, 1.0, -np.inf, np.inf),)
+        low, high = form.amplitudes
+        moves = (Move(key, 1.0, low, high),)
         return Coordinate(
-            key, channel, 0.0, form.step, np.inf, moves, unit=HOOKS[form.port].unit, effect=effect, parameter=field
+            key, channel, 0.0, form.step, np.inf, moves, low, high, HOOKS[form.port].unit, effect, parameter=field
         )
     low, high, prior = form.bounds(field)
     start = getattr(form, field)
@@ -283,21 +319,35 @@ def _screen_forms(
 
 def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
     """What a form of coefficient one makes of its signal, at every sample."""
-    record = _record_of(replace(form, port=form.port or PORTS[0]))
+    return _evaluated(bench, record_of(replace(form, port=form.port or PORTS[0])), signals)
+
+
+def values_of(bench: Bench, term: Term, signals: list[np.ndarray]) -> np.ndarray:
+    """What a term adds at its port at every sample if nothing holds it."""
+    return _evaluated(bench, _unheld(term), signals)
+
+
+def _evaluated(bench: Bench, record: np.void, signals: list[np.ndarray]) -> np.ndarray:
     largest = bench.calibration.stiffness.maximum_force_N
     parts = zip(bench.trials, signals, strict=True)
     return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])
 
 
-def _record_of(form: Form) -> np.void:
-    record = np.zeros(1, PARAMETERS)[0]
-    fill_terms(record, (form.term(),))
-    record["term"][0]["coefficient"], record["term"][0]["limit"] = 1.0, np.inf
-    return record["term"][0]
+def record_of(form: Form) -> np.void:
+    """A term (TERM) of coefficient one that nothing limits."""
+    record = _unheld(form.term())
+    record["coefficient"] = 1.0
+    return record
 
 
-def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray) -> float:
-    """Chance that the best of some forms gains as much with their signals moved in time."""
+def _unheld(term: Term) -> np.void:
+    parameters = np.zeros(1, PARAMETERS)[0]
+    fill_terms(parameters, (term,))
+    parameters["term"][0]["limit"] = np.inf
+    return parameters["term"][0]
+
+
+def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
     screen = Screen(search.model, search.channel, COARSE)
     shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
     row = {shape: index for index, shape in enumerate(shapes)}
@@ -309,12 +359,12 @@ def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray) -> float:
         if rows:
             by_port.append((screen.means.of((column * screen.keep)[:, None]), values[:, rows]))
     gain = gains.max()
-    for number in range(_CHANCES):
+    for number in range(chances):
         shift = int(len(values) * search.random.uniform(0.1, 0.9))
         if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
             # One that is as good is one too many, and settles it.
             return 2.0 / (2.0 + number)
-    return 1.0 / (1.0 + _CHANCES)
+    return 1.0 / (1.0 + chances)
 
 
 def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
@@ -342,8 +392,7 @@ def _fit_sizes(search: Search, form: Form) -> tuple[Form, float]:
     """A form with its sizes fitted one after the other on the screen, and its gain there."""
 
     def gain(tried: Form) -> float:
-        values = _values(search.model.bench, tried, search.signals)
-        return float(search.screen.scores((search.sensitivities[form.port] * values)[:, None]).gain[0])
+        return float(search.screen.scores(search.answer(tried)[:, None]).gain[0])
 
     best = gain(form)
     for size in form.fitted:
@@ -390,10 +439,14 @@ def _order(search: Search, port: str, order: float) -> float:
     return max((o for o in tried if o > 0.0), key=gain)
 
 
+def _term_of(prospect: Prospect) -> Term:
+    """The term at the size found; `InvalidValue` where a calibration may not hold it."""
+    return prospect.form.term("term:tried", *map(float, prospect.evidence.values))
+
+
 def _stays_in_bounds(prospect: Prospect) -> bool:
-    """Whether a calibration may hold the term at the size found."""
     try:
-        prospect.form.term("term:tried", *map(float, prospect.evidence.values))
+        _term_of(prospect)
     except InvalidValue:
         return False
     return True
@@ -414,4 +467,4 @@ def description_length(left: float, numbers: int, episodes: int) -> float:
 
 def noise_left(model: Model, channel: str, samples: int) -> float:
     """Squared error that no term explains, of means over ``samples``."""
-    return model.counted(channel) * sample_noise(model.residual[channel]) ** 2 / samples
+    return model.counted(channel) * sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1)) ** 2 / samples

@@ -29,7 +29,10 @@ from emb_daemon.offline.run import held, run_step
 #: Residuals by channel and their unit. `innovation` stands for the paths' reference where a log has none.
 UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
 FORCE_CHANNELS = ("stiffness", "torque", "innovation")
-HEAT_CHANNELS = ("temperature", "brake_torque")
+CHANNEL_OF_HEAT = "temperature"
+HEAT_CHANNELS = (CHANNEL_OF_HEAT, "brake_torque")
+#: Residuals of one time that follow each other, where that is more than one: of four thermocouples in each pad and the disc's.
+SIDE_BY_SIDE = {CHANNEL_OF_HEAT: 9}
 #: Brake torque is compared where pads slide: above this disc speed (rad/s; below, the sensor shows static friction) and this
 #: reference force (N).
 _SLIDING, _TOUCHING_N = 1.0, 300.0
@@ -138,6 +141,7 @@ class Bench:
 
     Attributes:
         channels: those that these logs can judge.
+        straight: whether heat answers so nearly in proportion that one derivative serves all iterations of a fit.
         episode: by channel, the episode number of every residual, shape (N,), counted over all logs.
         middle: of the motor angles that occur, rad; harmonics are fitted about it.
     """
@@ -154,6 +158,7 @@ class Bench:
         the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
         self.calibration = calibration
         self.own_data = own_data
+        self.straight: bool = True
         # A thread that waits for one other costs more than what most of these tasks do.
         self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
@@ -195,6 +200,11 @@ class Bench:
         speed = float(np.abs(samples["speed"]).max())
         found = {"A": current, "N·m": torque, "N·m·s/rad": torque / max(speed, 1e-9), "1/A²": 1.0 / max(current, 1e-9) ** 2}
         return {unit: found[unit] for unit in OF_THE_MOTOR}
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the logs."""
+        return [trial.log.path.name for trial in self.trials]
 
     @property
     def load_N(self) -> np.ndarray:

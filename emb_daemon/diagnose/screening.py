@@ -22,7 +22,7 @@ from emb_daemon.diagnose.coordinates import Coordinate, effect_coordinates
 from emb_daemon.diagnose.evidence import NOT_EXCITED, Evidence, leave_out
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench, Probe
+from emb_daemon.diagnose.residuals import FORCE_CHANNELS, SIDE_BY_SIDE, UNITS, Bench, Probe
 from emb_daemon.diagnose.signals import signals, smooth_basis
 from emb_daemon.diagnose.unexplained import achieved, sample_noise
 from emb_daemon.effects import REGISTRY
@@ -36,6 +36,9 @@ Q_VALUE = 0.01
 _RESIDUAL_SHARE, _SIGNAL_SHARE = 0.06, 0.002
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
+#: The same of a term (K), held against all that heat capacities and conductances can do in these logs, which may take four
+#: fifths of it and will not in the next: the standard deviation of a thermocouple (IEC 60584, class 1: 1.5 K are two).
+_MADE_K = 0.75
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 #: Draws of a placebo that runs through the estimator, and of one that does not.
@@ -117,10 +120,10 @@ class Screening:
         self._size = dict.fromkeys(bench.channels, self.force_N)
         self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
 
-    def floor(self, model: Model, channel: str) -> float:
-        """Least RMS of an effect that matters, in the channel's unit."""
+    def floor(self, model: Model, channel: str, made: bool = False) -> float:
+        """Least RMS of an effect that matters, or of a term that is ``made``, in the channel's unit."""
         if channel == "temperature":
-            return _FLOOR_K
+            return _MADE_K if made else _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         return float(max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel]))
 
@@ -128,7 +131,8 @@ class Screening:
         """RMS that a channel's residual need not exceed: what the calibration achieved on its own data, by what it states
         (`unexplained.achieved`), or where these are its own data by what of the residual is noise or does not matter."""
         if self.bench.own_data:
-            return max(sample_noise(model.residual[channel]), self.floor(model, channel))
+            noise = sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1))
+            return max(noise, self.floor(model, channel, made=True))
         return achieved(self.bench.calibration, channel, force_N, rise_K)
 
     # -- tests --------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import numpy as np
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
 from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.model import Model, is_shape
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
 from emb_daemon.effects import REGISTRY
@@ -34,7 +34,7 @@ _CARRIED = 2.0
 #: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
 #: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
 #: noise states (`noise.presliding`); on simulated brakes with nothing hidden it alone brought false terms of 70 to 120 N.
-LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32}
+LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32, "temperature": 1}
 #: Port at which nothing is looked for of a motor that turns free: a constant that falls with the current would explain any
 #: current, friction's above all.
 NOT_OF_A_FREE_MOTOR = "torque_constant"
@@ -82,11 +82,18 @@ class Selection:
 
     def applied(self, without: str = "") -> dict[Coordinate, float]:
         """What differs from the calibration; ``without`` one suspect, the others where they are."""
+        without = CHANNEL_OF_HEAT if self._is_of_heat(without) else without
         return {
             c: value
             for c, value in self.model.values.items()
             if c.channel in self.touched and without not in (c.effect or c.channel, c.channel)
         }
+
+    def _is_of_heat(self, suspect: str) -> bool:
+        """Whether a suspect is a term of the heat balance: conductances and capacities were fitted with it, and none of them
+        stands without the others."""
+        candidate = self.candidates.get(suspect)
+        return candidate is not None and candidate.made and candidate.channel == CHANNEL_OF_HEAT
 
     def noted(self, candidates: Iterable[Candidate]) -> "Selection":
         """With what became of some effects; regressors are not kept."""
@@ -97,6 +104,11 @@ class Selection:
         if suspect in self.recalibrated:
             return replace(self, recalibrated={c: gain for c, gain in self.recalibrated.items() if c != suspect})
         candidate, own = self.candidates[suspect], self.model.of_effect(suspect)
+        if self._is_of_heat(suspect):
+            together = [name for name in self.accepted if self._is_of_heat(name)]
+            refused = [replace(self.candidates[name], accepted=False, reason=reason) for name in together]
+            model = self.model.without([c for c in self.model.values if c.channel == candidate.channel])
+            return replace(self.noted(refused), model=model, dropped=self.dropped | {*together})
         if candidate.in_calibration:
             as_before = about_middle({c: c.start for c in own}, self.model.bench.middle)
             model = self.model.entered(as_before, chosen=own).refined({candidate.channel})
@@ -272,25 +284,37 @@ def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> 
 
 
 def revise(selection: Selection) -> Selection:
-    """Each accepted effect tested once more with all others in place; what, or which order, no longer holds goes."""
-    for name in selection.accepted:
-        model, candidate = selection.model, selection.candidates[name]
-        amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
-        gone = []
-        for group in groups(candidate.effect, amplitudes):
-            over_grammar = candidate.made or candidate.names
-            evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
-            little = model.rms(evidence.gain, candidate.channel) < selection.screening.floor(model, candidate.channel)
-            # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so
-            # must what is gained where a prior alone says how large it is.
-            chance = evidence.p_value > Q_VALUE and not over_grammar
-            if evidence.gain <= 0.0 or chance or (little and (over_grammar or not _is_carried(model, group))):
-                gone += group
-        if len(gone) == len(amplitudes):
+    """Each accepted effect tested once more with all others in place; what, or which order, no longer holds goes, beginning
+    with the least gain: of two that stand for one cause the other holds without it."""
+    while failing := [found for name in selection.accepted if (found := _failing(selection, name))]:
+        _, name, gone = min(failing, key=lambda found: found[0])
+        if len(gone) == sum(not is_shape(c) for c in selection.model.of_effect(name)):
             selection = selection.without(name, "no longer holds beside the other effects")
-        elif gone:
-            selection = replace(selection, model=model.without(gone).refined({candidate.channel}))
+        else:
+            channel = selection.candidates[name].channel
+            selection = replace(selection, model=selection.model.without(gone).refined({channel}))
     return selection
+
+
+def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordinate]] | None:
+    """The gain (RMS over the least that matters) of those amplitudes of an effect that no longer hold, its name and these."""
+    model, candidate = selection.model, selection.candidates[name]
+    amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
+    if model.chosen.issuperset(amplitudes):
+        return None
+    over_grammar = candidate.made or candidate.names
+    floor = selection.screening.floor(model, candidate.channel, candidate.made)
+    gone, gains = [], []
+    for group in groups(candidate.effect, amplitudes):
+        evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
+        little = model.rms(evidence.gain, candidate.channel) < floor
+        # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so must
+        # what is gained where a prior alone says how large it is.
+        chance = evidence.p_value > Q_VALUE and not over_grammar
+        if evidence.gain <= 0.0 or chance or (little and (over_grammar or not _is_carried(model, group))):
+            gone += group
+            gains.append(model.rms(evidence.gain, candidate.channel) / floor)
+    return (max(gains), name, gone) if gone else None
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:

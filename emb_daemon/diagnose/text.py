@@ -12,7 +12,10 @@ _PORTS = {
     "thickness": "the contact", "motor_angle": "the motor angle", "stiffness": "the stiffness", "force": "the clamp force",
     "torque_constant": "the torque constant", "torque": "the motor torque", "gear_gain": "the gear's transmission",
     "gear_friction": "the gear's friction", "pad_friction": "the pads' friction", "current": "the motor current",
-    "relaxation_time": "the relaxation time",
+    "relaxation_time": "the relaxation time", "heat_share": "the pads' share of the friction heat",
+    "contact_conductance": "the heat transfer of pressed pads", "gap_conductance": "the heat transfer of released pads",
+    "pad_conductivity": "the pads' conductivity",
+    "disc_cooling": "the disc's cooling", "pad_heat": "the heat into the pads", "disc_heat": "the heat into the disc",
 }  # fmt: skip
 #: Base parameters that the verdict names.
 _TOLD = 3

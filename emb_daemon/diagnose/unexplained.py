@@ -97,9 +97,10 @@ def is_beyond(rms: float, known: float) -> bool:
     return rms > CLEARLY * known
 
 
-def sample_noise(residual: np.ndarray) -> float:
-    """RMS of what of a residual differs from sample to sample; zero means none."""
-    return float(np.sqrt(0.5)) * rmse(np.diff(residual)[(residual[1:] != 0.0) & (residual[:-1] != 0.0)])
+def sample_noise(residual: np.ndarray, places: int = 1) -> float:
+    """RMS of what of a residual differs from sample to sample, each of so many ``places``; zero means none."""
+    later, earlier = residual[places:], residual[:-places]
+    return float(np.sqrt(0.5)) * rmse((later - earlier)[(later != 0.0) & (earlier != 0.0)])
 
 
 def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:

@@ -67,6 +67,16 @@ HOOKS = {
     "pad_friction": Hook("1", 1.0, ("surface",), "thermal", "brake_torque"),
     # Change of the disc temperature over ``dt`` that the disc model lacks.
     "disc": Hook("K", 0.0, ("heat_capacity", "disc", "ambient", "dt"), "thermal", "temperature"),
+    # Factors on the pads' share of the friction power, on the conductances from pads to disc (pressed on it, and across the
+    # gap) and through the pads, and on the disc's convection.
+    "heat_share": Hook("1", 1.0, ("dt",), "thermal", "temperature"),
+    "contact_conductance": Hook("1", 1.0, ("dt",), "thermal", "temperature"),
+    "gap_conductance": Hook("1", 1.0, ("dt",), "thermal", "temperature"),
+    "pad_conductivity": Hook("1", 1.0, ("dt",), "thermal", "temperature"),
+    "disc_cooling": Hook("1", 1.0, ("dt",), "thermal", "temperature"),
+    # Heat beside the friction power of a brake that is applied: into both friction surfaces together, and into the disc.
+    "pad_heat": Hook("W", 0.0, ("dt",), "thermal", "temperature"),
+    "disc_heat": Hook("W", 0.0, ("dt",), "thermal", "temperature"),
 }  # fmt: skip
 
 

@@ -12,9 +12,12 @@ from emb_daemon import effects
 from emb_daemon.effects import terms
 from emb_daemon.effects.base import HOOKS, Hook
 from emb_daemon.jit import Record, njit
+from emb_daemon.models.thermal import Altered
 
 #: Called with the quantity where the hook has no start, parameters and states of all effects, and the hook's arguments.
 _Hook: TypeAlias = Callable[..., float]
+#: Least factor on a conductance or a share of heat that is left: heat never flows uphill.
+_LEAST = 0.1
 
 
 def _source(name: str, hook: Hook) -> str:
@@ -63,7 +66,14 @@ gear_gain: _Hook = _compose("gear_gain")
 gear_friction: _Hook = _compose("gear_friction")
 backplate: _Hook = _compose("backplate")
 pad_friction: _Hook = _compose("pad_friction")
-disc_cooling: _Hook = _compose("disc")
+disc_change: _Hook = _compose("disc")
+_heat_share: _Hook = _compose("heat_share")
+_contact_conductance: _Hook = _compose("contact_conductance")
+_gap_conductance: _Hook = _compose("gap_conductance")
+_pad_conductivity: _Hook = _compose("pad_conductivity")
+_disc_cooling: _Hook = _compose("disc_cooling")
+_pad_heat: _Hook = _compose("pad_heat")
+_disc_heat: _Hook = _compose("disc_heat")
 
 
 @njit
@@ -85,6 +95,20 @@ def motor_torque(
 def backplates(e: Record, s: Record, inner: float, outer: float, dt: float) -> tuple[float, float]:
     """Temperatures (degC) of the backing plates from what their thermocouples show."""
     return backplate(inner, e, s, 0, dt), backplate(outer, e, s, 1, dt)
+
+
+@njit
+def heat_balance(e: Record, s: Record, dt: float) -> Altered:
+    """What effects make of the heat balance over ``dt`` seconds."""
+    return Altered(
+        max(_heat_share(e, s, dt), _LEAST),
+        max(_contact_conductance(e, s, dt), _LEAST),
+        max(_gap_conductance(e, s, dt), _LEAST),
+        max(_pad_conductivity(e, s, dt), _LEAST),
+        max(_disc_cooling(e, s, dt), _LEAST),
+        _pad_heat(e, s, dt),
+        _disc_heat(e, s, dt),
+    )
 
 
 @njit

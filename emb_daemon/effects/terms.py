@@ -13,12 +13,13 @@ from emb_daemon.jit import Record, fields, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Largest number of terms in a calibration.
-MOST = 4
+MOST = 6
 
 #: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
 PORTS = (
     "thickness", "motor_angle", "stiffness", "force", "torque_constant", "torque", "gear_gain", "gear_friction",
-    "pad_friction", "current", "relaxation_time",
+    "pad_friction", "current", "relaxation_time", "heat_share", "contact_conductance", "gap_conductance", "pad_conductivity",
+    "disc_cooling", "pad_heat", "disc_heat",
 )  # fmt: skip
 #: Signals and their units. Forces are those of the stiffness path, temperatures and brake torque the models' own; heat of the
 #: motor is that of the estimator's winding and housing, as a share of the steady value at the largest force's current.
@@ -56,7 +57,7 @@ _NONE, _LAG, _DEFICIT, _SLIP, _RESPONSE = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 (_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE, _TORQUE_CONSTANT, _TORQUE, _GEAR_GAIN, _GEAR_FRICTION, _PAD_FRICTION,
- _AMPERE, _RELAXATION) = range(len(PORTS))  # fmt: skip
+ _AMPERE, _RELAXATION, _SHARE, _CONTACT, _GAP, _THROUGH, _COOLING, _PAD_HEAT, _DISC_HEAT) = range(len(PORTS))  # fmt: skip
 
 #: Clamp force from which the brake counts as clamped, N.
 CLAMPED_N = 150.0
@@ -70,12 +71,13 @@ TERM = np.dtype(
 )
 #: ``other``: the signal that multiplies; negative for none.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` by port; ``sigma`` and ``torque_sigma``: standard deviations of the static force (N) and of the torque (N m) that
-#: terms outside of their range cause.
+#: ``added`` and its standard deviation ``outside`` of the terms' range, by port in its unit; ``sigma`` and ``torque_sigma``:
+#: what the latter makes of the static force (N) and of the torque (N m).
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
         ("added", "f8", (len(PORTS),)),
+        ("outside", "f8", (len(PORTS),)),
         *fields("f8", "sigma torque_sigma"),
         ("begun", "i8", (MOST,)),
         ("memory", "f8", (MOST,)),
@@ -227,18 +229,38 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
     t = s.effects.terms
     _follow(t.signal, s, m)
     for port in range(len(t.added)):
-        t.added[port] = 0.0
+        t.added[port] = t.outside[port] = 0.0
     of_force = of_torque = 0.0
     for k in range(e.count):
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
         sigma = _outside_sigma(q, t.signal, value)
-        if sigma > 0.0 and q.port <= _STATIC_FORCE:
-            of_force += (sigma * _of_force(q.port, s)) ** 2
-        elif sigma > 0.0:
-            of_torque += (sigma * _of_torque(q.port, s, p, m)) ** 2
+        if sigma > 0.0:
+            t.outside[q.port] = hypot(t.outside[q.port], sigma)
+            if q.port <= _STATIC_FORCE:
+                of_force += (sigma * _of_force(q.port, s)) ** 2
+            else:
+                of_torque += (sigma * _of_torque(q.port, s, p, m)) ** 2
     t.sigma, t.torque_sigma = sqrt(of_force), sqrt(of_torque)
+
+
+@njit
+def unsure_heat(
+    t: Record, p: Record, pads: float, disc: float, plates: float, around: float, power: float, wheel_speed: float,
+    braking: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Heat (W) into both pads and into the disc that is as unsure as terms outside of their range make it.
+
+    ``pads``, ``disc``, ``plates`` and ``around``: temperatures (degC) of friction surfaces, disc, backing plates and ambient.
+    """
+    o, both = t.outside, 2.0 * p.area
+    conductance, unsure = (p.contact_conductance, o[_CONTACT]) if braking else (p.gap_conductance, o[_GAP])
+    exchanged = unsure * conductance * both * (disc - pads)
+    exchanged = hypot(exchanged, o[_SHARE] * (p.heat_share[0] + p.heat_share[1]) * power)
+    kept = o[_THROUGH] * p.conductivity / p.thickness * both * (pads - plates)
+    cooled = o[_COOLING] * (p.disc_cooling + p.disc_cooling_per_speed * wheel_speed) * (disc - around)
+    return hypot(hypot(exchanged, kept), o[_PAD_HEAT]), hypot(hypot(exchanged, cooled), o[_DISC_HEAT])
 
 
 @njit

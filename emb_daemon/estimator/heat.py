@@ -1,10 +1,11 @@
 """Heat of one corner's pads and disc from sample to sample: what heats them, and what the estimate tells of them."""
 
-from math import exp
+from math import exp, hypot
 
 import numpy as np
 
 from emb_daemon.effects import paths as effects
+from emb_daemon.effects.terms import unsure_heat
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
@@ -123,17 +124,32 @@ def _flow(s, t, e, m):
     _watch_plates(s, t, m, dt)
     inner, outer = effects.backplates(e, s.effects, inner, outer, dt)
     power = s.heat_energy / dt
-    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, thermal.LONGEST_S)
-    s.disc += effects.disc_cooling(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
+    conduct(s, t, e, inner, outer, ambient, power, wheel_speed, dt, thermal.LONGEST_S)
     _tell_temperatures(s, t)
     rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
     forgotten = exp(-dt / t.history_time)
     s.history = forgotten * s.history + (1.0 - forgotten) * rise
     s.factor = stiffness_factor(t, rise, s.history)
     # A wrong start dies out as the disc, which stores most of it, cools.
-    s.temperature_sigma *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed) / t.disc_heat_capacity)
+    s.temperature_sigma *= exp(-dt * disc_loss(t, s.disc, ambient, wheel_speed, 1.0) / t.disc_heat_capacity)
     s.history_sigma *= forgotten
+    if e.terms.count > 0:
+        surface, plates = 0.5 * (s.pads[0, 0] + s.pads[1, 0]), 0.5 * (inner + outer)
+        of_pads, of_disc = unsure_heat(s.effects.terms, t, surface, s.disc, plates, ambient, power, wheel_speed, s.touching)
+        pads = 2.0 * t.area * t.thickness * t.density * t.specific_heat
+        s.temperature_sigma += dt * hypot(of_pads / pads, of_disc / t.disc_heat_capacity)
     s.heat_time = s.heat_energy = s.heat_travel = 0.0
+
+
+@njit
+def conduct(
+    s: Record, t: Record, e: Record, inner: float, outer: float, ambient: float, power: float, wheel_speed: float, dt: float,
+    longest: float,
+) -> None:  # fmt: skip
+    """Pads and disc after ``dt`` seconds of friction ``power`` (W), with what effects make of their balance."""
+    altered = effects.heat_balance(e, s.effects, dt)
+    s.disc = heat_step(t, s.pads, s.disc, inner, outer, ambient, power, s.touching, wheel_speed, dt, s.work, longest, altered)
+    s.disc += effects.disc_change(e, s.effects, t.disc_heat_capacity, s.disc, ambient, dt)
 
 
 @njit

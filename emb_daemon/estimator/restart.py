@@ -22,7 +22,7 @@ from emb_daemon.estimator.unknown import (
 )
 from emb_daemon.jit import Record, entry, njit
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
-from emb_daemon.models.thermal import NODES, heat_step
+from emb_daemon.models.thermal import NODES, UNALTERED, heat_step
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Largest heating of a disc while the daemon was off, K/s and K: hard braking from motorway speed.
@@ -151,8 +151,9 @@ def follow_heat(s: Record, t: Record, m: Record) -> None:
     if s.rested_s > 0.0:
         before = s.disc
         s.disc = heat_step(
-            t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S
-        )
+            t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S,
+            UNALTERED,
+        )  # fmt: skip
         # Cooling air and braking meanwhile are unknown; both effects vanish as the disc cools.
         s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
         s.temperature_sigma += 0.3 * abs(before - s.disc)

@@ -70,7 +70,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     progress(0.65, "pads and disc: heat")
     known = moved(start, stiff.values | motor.values | zero.values | levels.values)
     heat = thermal.identify(campaign, known)
-    known = moved(known, heat.values)
+    known = replace(moved(known, heat.values), terms=heat.terms)
     found = attribution.identify(stiff, heat.hot, known, lambda text, share: progress(0.7 + 0.2 * share, text))
     progress(0.9, "validating")
     folds = [fold.under(found.without(fold)) for fold in folds]

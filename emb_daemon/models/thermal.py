@@ -10,6 +10,8 @@ solved in one tridiagonal sweep, stable for any time step. Nodes stand on the fr
 loses the other gains, for any k(T) and C(T).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from emb_daemon.jit import Floats, Record, njit
@@ -24,6 +26,29 @@ CHAIN = 2 * NODES + 1
 _GROWTH = 1.1
 #: Longest step that `heat_step` takes at once: for accuracy, any is stable.
 LONGEST_S = 0.25
+
+
+class Altered(NamedTuple):
+    """What effects make of the heat balance: factors, and heat (W) that flows beside it.
+
+    Attributes:
+        heat_share: on the share of the friction power that goes into the pads; the disc gets the rest.
+        contact, gap: on the conductance between pads and disc while they press on it, and across the gap.
+        conductivity: on that of the pads.
+        cooling: on the disc's convection.
+        pad_W, disc_W: into the friction surfaces of both pads together, and into the disc.
+    """
+
+    heat_share: float
+    contact: float
+    gap: float
+    conductivity: float
+    cooling: float
+    pad_W: float
+    disc_W: float
+
+
+UNALTERED = Altered(1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
 
 
 def mesh(thickness: float) -> np.ndarray:
@@ -73,15 +98,15 @@ def conductance(p: Record, below: float, above: float, distance: float) -> float
 
 
 @njit
-def disc_loss(p: Record, disc: float, ambient: float, wheel_speed: float) -> float:
-    """W/K from disc to surroundings: convection rising with wheel speed (rad/s; thesis 8.2), and radiation."""
+def disc_loss(p: Record, disc: float, ambient: float, wheel_speed: float, convection: float) -> float:
+    """W/K from disc to surroundings: convection rising with wheel speed (rad/s; thesis 8.2), times a factor, and radiation."""
     hot, cold = disc + KELVIN, ambient + KELVIN
     radiation = p.disc_radiating_area * STEFAN_BOLTZMANN * (hot + cold) * (hot * hot + cold * cold)
-    return p.disc_cooling + p.disc_cooling_per_speed * wheel_speed + radiation
+    return convection * (p.disc_cooling + p.disc_cooling_per_speed * wheel_speed) + radiation
 
 
 @njit
-def _pad_rows(p, pad, side, backplate, to_disc, to_air, heating, ambient, dt, work):
+def _pad_rows(p, pad, side, backplate, to_disc, to_air, heating, ambient, altered, dt, work):
     """Heat balance of each node of one pad, over a unit of area: three diagonals, W/(m^2 K), and right-hand side, W/m^2.
 
     ``to_disc`` and ``to_air`` W/(m^2 K) leave the friction surface, into which ``heating`` W/m^2 goes."""
@@ -94,7 +119,7 @@ def _pad_rows(p, pad, side, backplate, to_disc, to_air, heating, ambient, dt, wo
         capacity = per_volume * 0.5 * (below + above) / dt
         balance, source = capacity, capacity * pad[node]
         if node > 0:
-            inwards = conductance(p, pad[node - 1], pad[node], below)
+            inwards = altered.conductivity * conductance(p, pad[node - 1], pad[node], below)
         else:
             inwards = to_disc
             balance += to_air
@@ -102,7 +127,7 @@ def _pad_rows(p, pad, side, backplate, to_disc, to_air, heating, ambient, dt, wo
         balance += inwards
         outwards = 0.0
         if node < NODES - 1:
-            outwards = conductance(p, pad[node], pad[node + 1], above)
+            outwards = altered.conductivity * conductance(p, pad[node], pad[node + 1], above)
             balance += outwards
         else:
             balance += p.backplate_conductance
@@ -128,18 +153,22 @@ def _solve(lower, diagonal, upper, right):
 
 
 @njit
-def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work):
+def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt, work, altered):
     """One implicit step of ``dt`` seconds; changes ``pads`` (2, NODES) and returns the new disc temperature."""
     lower, diagonal, upper, right = work[0], work[1], work[2], work[3]
-    contact = p.contact_conductance if braking else p.gap_conductance
+    contact = altered.contact * p.contact_conductance if braking else altered.gap * p.gap_conductance
     to_air = 0.0 if braking else p.surface_cooling_per_speed * wheel_speed
+    # No more than all of the friction power goes into the pads.
+    more = min(altered.heat_share, 1.0 / max(p.heat_share[0] + p.heat_share[1], 1e-9))
     for side in range(2):
         backplate = inner_backplate if side == 0 else outer_backplate
-        _pad_rows(p, pads[side], side, backplate, contact, to_air, p.heat_share[side] * power / p.area, ambient, dt, work)
-    loss = disc_loss(p, disc, ambient, wheel_speed) / p.area
+        heating = (more * p.heat_share[side] * power + 0.5 * altered.pad_W) / p.area
+        _pad_rows(p, pads[side], side, backplate, contact, to_air, heating, ambient, altered, dt, work)
+    loss = disc_loss(p, disc, ambient, wheel_speed, altered.cooling) / p.area
     storage = p.disc_heat_capacity / (p.area * dt)
     diagonal[NODES] = storage + 2.0 * contact + loss
-    right[NODES] = storage * disc + loss * ambient + (1.0 - p.heat_share[0] - p.heat_share[1]) * power / p.area
+    heating = (1.0 - more * p.heat_share[0] - more * p.heat_share[1]) * power + altered.disc_W
+    right[NODES] = storage * disc + loss * ambient + heating / p.area
     lower[NODES] = upper[NODES] = -contact
     _solve(lower, diagonal, upper, right)
     for node in range(NODES):
@@ -151,7 +180,7 @@ def _chain_step(p, pads, disc, inner_backplate, outer_backplate, ambient, power,
 @njit
 def heat_step(
     p: Record, pads: Floats, disc: float, inner_backplate: float, outer_backplate: float, ambient: float, power: float,
-    braking: bool, wheel_speed: float, dt: float, work: Floats, longest: float,
+    braking: bool, wheel_speed: float, dt: float, work: Floats, longest: float, altered: Altered,
 ) -> float:  # fmt: skip
     """Advance pads and disc by ``dt`` seconds.
 
@@ -164,6 +193,7 @@ def heat_step(
         braking: pads press on the disc and exchange heat by contact; else across a gap, which the wheel ventilates.
         longest: length of a single step at most, s.
         work: scratch, shape (4, CHAIN).
+        altered: what effects make of the balance, held over the step.
 
     Returns:
         The new disc temperature.
@@ -171,7 +201,7 @@ def heat_step(
     parts = int(np.ceil(dt / longest - 1e-9))
     for _ in range(parts):
         disc = _chain_step(
-            p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt / parts, work
+            p, pads, disc, inner_backplate, outer_backplate, ambient, power, braking, wheel_speed, dt / parts, work, altered
         )
     return disc
 

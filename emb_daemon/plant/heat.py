@@ -57,7 +57,7 @@ def friction_of_pads(p: Record, s: Record, wheel_speed: float) -> float:
     fade = p.effects.friction_coefficient_fade
     if fade.fade_per_K != 0.0:
         value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
-    value *= 1.0 + drawn(p.effects.drawn_pad_friction, s, 5)
+    value *= 1.0 + drawn(p.effects.drawn_pad_friction, s, 5, CYCLE_S)
     return max(value, 0.2 * p.friction_coefficient)
 
 
@@ -72,14 +72,19 @@ def heat_cycle(p: Record, s: Record, wheel_speed: float, ambient: float) -> None
     s.wear += 1e-12 * e.pad_wear.wear_um_per_MJ * power * dt
     cells = cell_count(p)
     width = p.pad_thickness / cells
-    conductance = p.gap_conductance
-    conductance += (p.contact_conductance - p.gap_conductance) * s.force / (s.force + p.touching_force)
-    into_disc = (1.0 - p.heat_share[0] - p.heat_share[1]) * power
+    contact = p.contact_conductance * max(1.0 + drawn(e.drawn_contact_conductance, s, 6, dt), 0.1)
+    gap = p.gap_conductance * max(1.0 + drawn(e.drawn_gap_conductance, s, 7, dt), 0.1)
+    conductivity = p.conductivity * max(1.0 + drawn(e.drawn_pad_conductivity, s, 11, dt), 0.1)
+    cooling = max(1.0 + drawn(e.drawn_disc_cooling, s, 8, dt), 0.1)
+    share = min(max(1.0 + drawn(e.drawn_heat_share, s, 9, dt), 0.1), 1.0 / max(p.heat_share[0] + p.heat_share[1], 1e-9))
+    conductance = gap + (contact - gap) * s.force / (s.force + p.touching_force)
+    into_disc = (1.0 - share * p.heat_share[0] - share * p.heat_share[1]) * power
+    into_disc += drawn(e.drawn_disc_heat, s, 10, dt)
     into_caliper = 0.0
     for side in range(2):
         pad = s.pads[side]
-        direct = p.heat_share[side] * power / p.pad_area
-        half = 2.0 * p.conductivity * (1.0 + p.conductivity_rise * (pad[0] - _REFERENCE_C)) / width
+        direct = share * p.heat_share[side] * power / p.pad_area
+        half = 2.0 * conductivity * (1.0 + p.conductivity_rise * (pad[0] - _REFERENCE_C)) / width
         # The surface stores no heat: inflow equals outflow.
         surface = (direct + conductance * s.disc + half * pad[0]) / (conductance + half)
         s.surface[side] = surface
@@ -89,10 +94,10 @@ def heat_cycle(p: Record, s: Record, wheel_speed: float, ambient: float) -> None
         for cell in range(cells):
             if cell < cells - 1:
                 between = 0.5 * (pad[cell] + pad[cell + 1])
-                onward = p.conductivity * (1.0 + p.conductivity_rise * (between - _REFERENCE_C)) / width
+                onward = conductivity * (1.0 + p.conductivity_rise * (between - _REFERENCE_C)) / width
                 onward *= pad[cell] - pad[cell + 1]
             else:
-                half = 2.0 * p.conductivity * (1.0 + p.conductivity_rise * (pad[cell] - _REFERENCE_C)) / width
+                half = 2.0 * conductivity * (1.0 + p.conductivity_rise * (pad[cell] - _REFERENCE_C)) / width
                 onward = (pad[cell] - s.plate[side]) * half * p.plate_conductance / (half + p.plate_conductance)
             heat = p.density * p.specific_heat * (1.0 + p.specific_heat_rise * (pad[cell] - _REFERENCE_C)) * width
             pad[cell] += dt * (flux - onward) / heat
@@ -104,7 +109,7 @@ def heat_cycle(p: Record, s: Record, wheel_speed: float, ambient: float) -> None
         s.plate_reading[side] += (s.plate[side] - s.plate_reading[side]) * dt / (lag + dt)
     hot, cold = s.disc + _KELVIN, ambient + _KELVIN
     area = p.disc_radiating_area + e.disc_radiation.area_m2
-    loss = (p.disc_cooling + p.disc_cooling_per_speed * wheel_speed) * (s.disc - ambient)
+    loss = cooling * (p.disc_cooling + p.disc_cooling_per_speed * wheel_speed) * (s.disc - ambient)
     loss += area * _STEFAN_BOLTZMANN * (hot**4 - cold**4)
     s.disc += dt * (into_disc - loss) / p.disc_heat_capacity
     caliper_loss = p.caliper_loss * (s.caliper - ambient)

@@ -122,7 +122,13 @@ EFFECTS: dict[str, tuple[Field, ...]] = {
             ("torque_constant", "1", "the torque constant's factor"),
             ("gear_friction", "1", "the gear friction's factor"),
             ("gear_gain", "1", "the load's factor"),
-            ("pad_friction", "1", "the pads' friction's factor; without lag"),
+            ("pad_friction", "1", "the pads' friction's factor"),
+            ("contact_conductance", "1", "the factor on the conductance of pressed pads to the disc"),
+            ("gap_conductance", "1", "the same across the gap"),
+            ("disc_cooling", "1", "the factor on the disc's convection"),
+            ("heat_share", "1", "the factor on the pads' share of the friction power"),
+            ("disc_heat", "W", "the heat into the disc"),
+            ("pad_conductivity", "1", "the factor on the pads' conductivity"),
         )
     },
     "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
@@ -213,7 +219,7 @@ PLANT_STATE = np.dtype(
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
         *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat"),
         # Amounts that drawn effects add, in the order of their table.
-        ("drawn", "f8", (6,)),
+        ("drawn", "f8", (12,)),
         *fields("f8", "excitation force force_rate static_force stiffness_factor"),
         # Controller.
         ("latched", "?"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_daemon.identify.campaign_file import DiscNominal
-from emb_daemon.identify.recording import Recording
+from emb_daemon.offline.recording import Recording
 from emb_daemon.report.figures import MARKS, MODEL, Panel, Style, Trace, xy_figure
 from emb_daemon.report.page import Section
 

@@ -7,9 +7,9 @@ import numpy as np
 from emb_daemon.calibration.types import FrictionTable
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID
-from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.text import rounded
 from emb_daemon.offline.fit import left_out_covariance
+from emb_daemon.offline.recording import Recording, simulate
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import Panel, Style, Trace, xy_figure
 from emb_daemon.report.page import Section
@@ -63,7 +63,7 @@ class FrictionFit:
     rms: float
 
 
-def _rows(r: Recording, parameters: np.ndarray) -> np.ndarray:
+def _rows(r: Recording, parameters: np.void) -> np.ndarray:
     surface = simulate(parameters, r)[:, 9:11].mean(axis=1)
     braking = r.touching & (r.force > _LEAST_FORCE_N) & (r.speed > _LEAST_SPEED_RAD_PER_S)
     steady = braking.copy()
@@ -77,7 +77,7 @@ def _rows(r: Recording, parameters: np.ndarray) -> np.ndarray:
     def averaged(values):
         return values[:whole].reshape(-1, together).mean(axis=1)[steady]
 
-    radius = float(parameters["effective_radius"][0])
+    radius = float(parameters["thermal"]["effective_radius"])
     force, speed = averaged(r.force), averaged(r.speed)
     return np.array([force, speed, averaged(surface), averaged(r.power) / (2.0 * radius * averaged(r.force * r.speed))])
 
@@ -149,7 +149,7 @@ class _Surface:
         return text
 
 
-def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> FrictionFit:
+def fit_friction(recordings: list[Recording], parameters: np.void) -> FrictionFit:
     """Friction coefficient from brake torque, clamp force and the modelled surface temperature (mean of both pads).
 
     The friction power of a recording is torque times speed.
@@ -160,7 +160,7 @@ def fit_friction(recordings: list[Recording], parameters: np.ndarray) -> Frictio
 
     Args:
         recordings: those with `Recording.dense`.
-        parameters: THERMAL, shape (1,), pads and disc already identified.
+        parameters: PARAMETERS, pads and disc already identified.
 
     Raises:
         InputError: too little steady braking.

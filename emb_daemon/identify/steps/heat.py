@@ -13,10 +13,10 @@ from emb_daemon.calibration.types import Calibration, Disc, Pad, Softening, Ther
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign_file import Datasheet
-from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.identify.steps.friction import constant_friction
 from emb_daemon.identify.text import rounded
 from emb_daemon.offline.fit import Block, Free, fit
+from emb_daemon.offline.recording import Recording, simulate
 
 #: Time between residuals. The model's errors, of the size of a thermocouple's noise (0.3 K), last for about a minute: each
 #: residual is worth a twelfth of an independent one, which this standard deviation makes it.
@@ -114,11 +114,6 @@ def nominal_thermal(sheet: Datasheet) -> Thermal:
     )
 
 
-def thermal_parameters(calibration: Calibration) -> np.ndarray:
-    """THERMAL, shape (1,)."""
-    return np.atleast_1d(to_parameters(calibration)["thermal"])
-
-
 def check_excitation(r: Recording) -> None:
     """Raises InputError unless friction heats the pads enough to show how heat flows in them."""
     rise = np.nanmax(r.measured[:8]) - np.nanmin(r.measured[:8, 0]) if np.isfinite(r.measured[:8]).any() else 0.0
@@ -153,9 +148,7 @@ def _block(r: Recording, start: Calibration, pieces: int) -> Block:
     known[:, :8] &= np.tile(np.array(DEPTHS_M) <= 1e-3 * start.pad_thickness_mm, 2)
 
     def residual(values):
-        return (simulate(thermal_parameters(moved(start, values)), r, every=every)[:, :9] - measured)[
-            known
-        ] / _RESIDUAL_SIGMA_K
+        return (simulate(to_parameters(moved(start, values)), r, every=every)[:, :9] - measured)[known] / _RESIDUAL_SIGMA_K
 
     count = int(known.sum())
     return Block(residual, tuple(UNKNOWNS), np.arange(count) * pieces // max(count, 1))

@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.dynamics import TERMS
-from emb_daemon.identify.recording import Recording, simulate
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import Log
 from emb_daemon.offline.fit import left_out_covariance, valley
+from emb_daemon.offline.recording import Recording, simulate
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import MODEL, Panel, Style, Trace, xy_figure
@@ -158,7 +158,7 @@ def cold_bursts(log: Log, heat: Recording, calibration: Calibration) -> Bursts:
     rows = find_bursts(log)
     if len(rows) < _LEAST_BURSTS:
         raise InputError(f"{log.path}: {len(rows)} bursts of clamps; at least {_LEAST_BURSTS} are needed for softening")
-    mean_C = simulate(stiffness["thermal"], heat)[:, 11:13].mean(axis=1)
+    mean_C = simulate(stiffness, heat)[:, 11:13].mean(axis=1)
     middle = np.array([log.time_s[part].mean() for part in rows])
     reference_C = float(np.interp(middle[0], heat.time_s, mean_C))
     rise = mean_C - reference_C

@@ -3,20 +3,29 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from msgspec import structs
 
 from emb_daemon.calibration.parameters import keys, moved, value_of
+from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.diagnose.diagnosis import with_terms
+from emb_daemon.diagnose.forms import equation
+from emb_daemon.diagnose.grammar import search_heat
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT
+from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.diagnose.unexplained import dependences, is_beyond
+from emb_daemon.diagnose.warmth import HeatBench, HeatSearch
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
-from emb_daemon.identify.recording import Recording, recording, simulate
 from emb_daemon.identify.steps import Step, cooling, friction, softening
 from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
 from emb_daemon.identify.steps.friction import FrictionFit, fit_friction
-from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat, thermal_parameters
+from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat
 from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
 from emb_daemon.identify.text import rounded, with_sigma
 from emb_daemon.offline import Log, estimate
+from emb_daemon.offline.recording import Recording, recording, simulate
 from emb_daemon.offline.score import rmse
 from emb_daemon.report.figures import MODEL, PALE, Panel, Style, Trace, shades, time_figure
 from emb_daemon.report.page import Page
@@ -53,6 +62,8 @@ class ThermalStep(Step):
     Attributes:
         fitted, unseen: recordings that fitted, and logs that validate, by name.
         hot: logs that fitted in which the brake works as in service: force over heat.
+        terms: of the heat balance, that these logs prove beside it.
+        left_K, follows: RMS that is clearly left of the temperatures nevertheless, and the signal that it follows most.
         heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
         figures: RMSE on logs that were not fitted, by name with unit, once `validate`d.
         achieved_K: the worst of these temperatures; None without one.
@@ -62,6 +73,9 @@ class ThermalStep(Step):
     fitted: dict[str, Recording]
     unseen: dict[str, Log] = field(default_factory=dict, repr=False)
     hot: tuple[Log, ...] = field(default=(), repr=False)
+    terms: tuple[Term, ...] = ()
+    left_K: float = 0.0
+    follows: str = ""
     heat: HeatFit | None = None
     law: CoolingLaw | None = None
     friction: FrictionFit | None = None
@@ -97,16 +111,20 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         )
         return ThermalStep(fitted={})
     heat = fit_heat(list(recordings.values()), cold)
+    terms, left_K, follows = find_terms(list(recordings.values()), moved(cold, heat.values))
+    if terms:
+        cold = structs.replace(cold, terms=terms)
+        heat = fit_heat(list(recordings.values()), cold)
     values, heated = dict(heat.values), moved(cold, heat.values)
     dense = [r for r in recordings.values() if r.dense]
-    rubbed = _attempt(campaign, fit_friction, dense, thermal_parameters(heated)) if dense else None
+    rubbed = _attempt(campaign, fit_friction, dense, to_parameters(heated)) if dense else None
     softened = None
     if "pad_cooling" in recordings:
         softened = _attempt(campaign, fit_softening, logs["pad_cooling"], recordings["pad_cooling"], heated)
     for found in (rubbed, softened):
         values |= found.values if found else {}
     if dense:
-        parameters = thermal_parameters(moved(cold, values))
+        parameters = to_parameters(moved(cold, values))
         spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
         values["thermal.sigma_K"] = rounded(max(spread, _LEAST_SIGMA_K), 3)
     law = cooling_law([r for name, r in recordings.items() if name.startswith("disc_cooling")], campaign.datasheet.disc)
@@ -116,12 +134,39 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         notes=_notes(heat, law, rubbed, softened),
         fitted=recordings,
         unseen=unseen,
+        terms=terms,
+        left_K=left_K,
+        follows=follows,
         hot=tuple(logs[name] for name in recordings if name == "tune" or name.startswith("integrated")),
         heat=heat,
         law=law,
         friction=rubbed,
         softening=softened,
     )
+
+
+def find_terms(recordings: list[Recording], heated: Calibration) -> tuple[tuple[Term, ...], float, str]:
+    """What pads and disc do that the heat balance lacks, as terms of a calibration; what is clearly left of the temperatures
+    (K RMS) nevertheless, and the signal that it follows most."""
+    bench = HeatBench(recordings, heated)
+    found = search_heat(bench)
+    model, floor = found.model, found.screening.floor(found.model, CHANNEL_OF_HEAT, made=True)
+    terms = with_terms(model.bench.calibrated(model.values), found).terms if found.accepted else ()
+    left_K = float(np.sqrt(model.noise(CHANNEL_OF_HEAT)))
+    if not is_beyond(left_K, floor):
+        return terms, 0.0, ""
+    gains = HeatSearch(model).dependence()
+    return terms, left_K, dependences(CHANNEL_OF_HEAT, gains, model.counted(CHANNEL_OF_HEAT), floor)[0].signal
+
+
+def words(step: ThermalStep) -> str:
+    """What was found beside the thesis's heat balance, and what is left of the temperatures; empty if neither."""
+    told = [f"Found in the heat of pads and disc: {' and '.join(map(equation, step.terms))}."] if step.terms else []
+    if step.follows:
+        signal = step.follows.replace("_", " ")
+        told.append(f"Not explained: {step.left_K:.2g} K RMS of the temperatures, which depend most on {signal}.")
+        told.append(f"What would tell: {MANOEUVRES[step.follows]}.")
+    return " ".join(told)
 
 
 def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
@@ -165,14 +210,14 @@ def _fitting(log: Log) -> Recording:
     return found
 
 
-def _errors(parameters: np.ndarray, r: Recording, torque_known: bool = True) -> np.ndarray:
+def _errors(parameters: np.void, r: Recording, torque_known: bool = True) -> np.ndarray:
     """Of the modelled temperatures, shape (9, n), K."""
     return simulate(parameters, r, torque_known)[:, :9].T - r.measured
 
 
 def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibration):
     """(temperatures to draw, figures on logs that fitted nothing, residuals of those that did)."""
-    temperatures, figures, residuals, parameters = {}, {}, {}, thermal_parameters(calibration)
+    temperatures, figures, residuals, parameters = {}, {}, {}, to_parameters(calibration)
     if "tune" in recordings:
         temperatures["tune"] = _compare("tune", recordings["tune"], parameters, residuals)
     for name, log in unseen.items():
@@ -240,7 +285,7 @@ def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
     numbers = [key for key in keys(calibration) if key.startswith("thermal.") and not key.startswith("thermal.friction.")]
     rows = [[key, with_sigma(value_of(calibration, key), step.sigmas.get(key))] for key in numbers]
     part.table(["parameter", "value"], rows)
-    part.items(list(step.notes))
+    part.items([*step.notes, *filter(None, [words(step)])])
     for name, found in step.temperatures.items():
         part.heading(f"Temperatures: {name}")
         part.figure(time_figure(_panels(found)))

@@ -4,13 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_daemon.effects import paths as effects
+from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.heat import TOUCHING_N
-from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.estimator.heat import TOUCHING_N, conduct
+from emb_daemon.estimator.records import DEPTHS_M, SAMPLE, STATE
 from emb_daemon.jit import njit
-from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, at_depth, friction_power, heat_step, mean_temperature
+from emb_daemon.models.thermal import LONGEST_S, at_depth, friction_power, mean_temperature
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
-from emb_daemon.offline import Log
+from emb_daemon.offline.log import Log
 
 #: (longest duration of a log, step of its grid), both s.
 _STEPS_S = ((930.0, 0.2), (3600.0, 0.5), (float("inf"), 1.0))
@@ -165,55 +167,68 @@ def _braking(log: Log, seconds, count: int, step: float) -> np.ndarray:
 
 
 @njit
-def _simulate(parameters, step, longest, every, inner, outer, ambient, power, known, touching, speed, force, out):
-    p = parameters[0]
-    positions = p.node_position
-    pads, work = np.empty((2, NODES)), np.empty((4, CHAIN))
-    pads[0, :], pads[1, :] = inner[0], outer[0]
-    disc = 0.5 * (inner[0] + outer[0])
+def _simulate(parameters, states, samples, step, longest, every, inner, outer, ambient, power, known, touching, speed, force,
+              out, signals):  # fmt: skip
+    p, s, m = parameters[0], states[0], samples[0]
+    e, t = p.effects, p.thermal
+    s.temperature_known = m.has_wheel_speed = True
+    m.dt = step
+    s.pads[0, :], s.pads[1, :] = inner[0], outer[0]
+    s.disc = 0.5 * (inner[0] + outer[0])
     for row in range(len(power)):
         if row > 0:
-            watts = 0.0
-            if known:
-                watts = power[row - 1]
-            elif touching[row - 1] and speed[row - 1] > TURNING_RAD_PER_S:
-                watts = friction_power(p, force[row - 1], speed[row - 1], 0.5 * (pads[0, 0] + pads[1, 0]))
-            disc = heat_step(
-                p,
-                pads,
-                disc,
-                inner[row],
-                outer[row],
-                ambient[row],
-                watts,
-                touching[row - 1],
-                speed[row - 1],
-                step,
-                work,
-                longest,
-            )
+            _advance(s, p, m, longest, inner[row], outer[row], ambient[row])
+        for side in range(2):
+            s.mean[side] = mean_temperature(s.pads[side], t.node_position)
+        s.touching, s.force, m.wheel_speed = touching[row], force[row], speed[row]
+        s.power = power[row]
+        if not known:
+            surface = 0.5 * (s.pads[0, 0] + s.pads[1, 0])
+            rubs = s.touching and m.wheel_speed > TURNING_RAD_PER_S
+            fade = effects.pad_friction(e, s.effects, surface)
+            s.power = friction_power(t, s.force, m.wheel_speed, surface) * fade if rubs else 0.0
+        effects.look(e.terms, s, p, m)
+        if len(signals) > 0:
+            signals[row] = s.effects.terms.signal
         if row % every == 0:
             into = out[row // every]
             for side in range(2):
                 for index in range(len(DEPTHS_M)):
-                    into[4 * side + index] = at_depth(pads[side], positions, DEPTHS_M[index])
-                into[9 + side] = pads[side, 0]
-                into[11 + side] = mean_temperature(pads[side], positions)
-            into[8] = disc
+                    into[4 * side + index] = at_depth(s.pads[side], t.node_position, DEPTHS_M[index])
+                into[9 + side], into[11 + side] = s.pads[side, 0], s.mean[side]
+            into[8] = s.disc
 
 
-def simulate(parameters: np.ndarray, r: Recording, torque_known: bool = True, every: int = 1) -> np.ndarray:
-    """Temperatures by the estimator's heat chain over a recording, every ``every``-th row.
+@njit
+def _advance(s, p, m, longest, inner, outer, ambient):
+    """Over the step that begins at the last row, to plates and ambient as they are at its end, degC."""
+    inner, outer = effects.backplates(p.effects, s.effects, inner, outer, m.dt)
+    conduct(s, p.thermal, p.effects, inner, outer, ambient, s.power, m.wheel_speed, m.dt, longest)
+
+
+def simulate(
+    parameters: np.void, r: Recording, torque_known: bool = True, every: int = 1, signals: np.ndarray | None = None
+) -> np.ndarray:
+    """Temperatures by the estimator's heat chain, with effects and terms, over a recording, every ``every``-th row.
 
     Args:
-        parameters: THERMAL, shape (1,).
+        parameters: PARAMETERS.
         torque_known: heat by the brake torque sensor, else by the friction table and the reference force.
+        signals: shape (n, signals), filled with what terms see (`effects.terms.SIGNALS`) at every row; what a recording does
+            not hold is zero or no number.
 
     Returns:
         Shape (rows, 13), degC: the nine of `Recording.measured`, both pad surfaces, both pad means.
     """
-    out = np.empty((-(-len(r.power) // every), 13))
+    own, out = np.atleast_1d(parameters), np.empty((-(-len(r.power) // every), 13))
+    if signals is None:
+        signals = np.zeros((0, len(SIGNALS)))
+    else:
+        # Without a term nobody looks.
+        own = own.copy()
+        own["effects"]["terms"]["count"] = np.maximum(own["effects"]["terms"]["count"], 1)
     longest = LONGEST_S if r.step_s <= _COARSE_S else r.step_s
+    records = np.zeros(1, STATE), np.zeros(1, SAMPLE)
     inputs = (r.inner, r.outer, r.ambient, r.power, torque_known, r.touching, r.speed, r.force)
-    _simulate(parameters, r.step_s, longest, every, *inputs, out)
+    _simulate(own, *records, r.step_s, longest, every, *inputs, out, signals)
     return out

@@ -1,0 +1,196 @@
+"""Terms of the heat balance: the grammar held against thermocouples.
+
+What a heat flow or a conductance does shows later and elsewhere, so that a form cannot be screened by what its port does at
+the same moment. But the heat chain alone costs a fiftieth of the whole step: each form runs through it, on the recordings that
+`identify` fits pads and disc to. The brake torque is measured there, so that friction and force cannot hide behind a term.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from emb_daemon.calibration.terms import Term
+from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.diagnose.coordinates import Coordinate, Values, base_coordinates, scaled_coordinate
+from emb_daemon.diagnose.evidence import leave_out
+from emb_daemon.diagnose.forms import FORMED, Form
+from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.prospects import Scores, Screen, Search, covered_by, record_of
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, Probe
+from emb_daemon.diagnose.screening import Screening
+from emb_daemon.effects.base import HOOKS
+from emb_daemon.effects.terms import PORTS, SIGNALS
+from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import DEPTHS_M
+from emb_daemon.offline.log import Log
+from emb_daemon.offline.recording import Recording, recording, simulate
+
+#: Time between residuals, and length of an episode, s: the model's errors last for about a minute.
+_EVERY_S, _EPISODE_S = 5.0, 30.0
+_PLACES = SIDE_BY_SIDE[CHANNEL_OF_HEAT]
+#: By which pads and disc may differ from their plates at the beginning, K. A log that begins warmer tells of what it does not
+#: hold.
+_SETTLED_K = 10.0
+#: Fewer episodes tell nothing.
+_LEAST_EPISODES = 8
+#: What the heat chain fits besides `base_coordinates`, and how well it is known, as there.
+_FURTHER = (
+    ("thermal.pad.conductivity_rise_per_K", 1.0),
+    ("thermal.pad.specific_heat_J_per_kgK", 0.15),
+    ("thermal.pad.surface_cooling_per_speed_J_per_rad_m2K", 1.0),
+    ("thermal.disc.radiating_area_m2", 1.0),
+)
+
+
+class HeatBench(Bench):
+    """Recordings on which a calibration's heat balance is tried: what `Bench` is for logs, of one channel."""
+
+    def __init__(self, recordings: Sequence[Recording], calibration: Calibration, workers: int = 2):
+        self.calibration = calibration
+        self.recordings: Sequence[Recording] = recordings
+        self.own_data = True
+        self.straight = False
+        self.middle = 0.0
+        self.map = ThreadPoolExecutor(workers).map if workers > 1 else map
+        self.channels = [CHANNEL_OF_HEAT]
+        inside = np.append(np.tile(np.array(DEPTHS_M) <= 1e-3 * calibration.pad_thickness_mm, 2), True)
+        self._every = [max(round(_EVERY_S / r.step_s), 1) for r in recordings]
+        pairs = list(zip(recordings, self._every, strict=True))
+        self._measured = [np.where(inside, r.measured[:, ::every].T, np.nan) for r, every in pairs]
+        cut = [(r.time_s[::every] // _EPISODE_S).astype(int) for r, every in pairs]
+        offsets = np.cumsum([0] + [int(own[-1]) + 1 for own in cut])
+        self.episodes = int(offsets[-1])
+        episode = np.concatenate([own + offset for own, offset in zip(cut, offsets, strict=False)])
+        self.sample_episode = np.repeat(episode, _PLACES)
+        self.episode = {CHANNEL_OF_HEAT: self.sample_episode}
+
+    @property
+    def sources(self) -> list[str]:
+        return [Path(r.name).name for r in self.recordings]
+
+    def residual_of(self, parameters: np.void) -> np.ndarray:
+        """Measured minus modelled temperatures (K) under PARAMETERS, zero where there are none."""
+        parts = [
+            measured - simulate(parameters, r, every=every)[:, :_PLACES]
+            for r, every, measured in zip(self.recordings, self._every, self._measured, strict=True)
+        ]
+        return np.nan_to_num(np.concatenate(parts)).ravel()
+
+    def run(self, values: Values) -> tuple[dict[str, np.ndarray], list[None]]:
+        return {CHANNEL_OF_HEAT: self.residual_of(to_parameters(self.calibrated(values)))}, [None] * len(self.recordings)
+
+    def regressors(
+        self, values: Values, probes: Sequence[Probe], at: Mapping[str, np.ndarray], heat: Sequence[None]
+    ) -> list[np.ndarray]:
+        def answer(probe: Probe) -> np.ndarray:
+            c, tried = probe.coordinate, {**values, **dict(probe.shape)}
+            now = tried.get(c, c.start)
+            step = c.step if now + c.step <= c.high else -c.step
+            return (at[CHANNEL_OF_HEAT] - self.run(tried | {c: now + step})[0][CHANNEL_OF_HEAT]) / step
+
+        return list(self.map(answer, probes))
+
+    def signals(self, values: Values) -> list[np.ndarray]:
+        """What terms see at every row, by recording."""
+        parameters, result = to_parameters(self.calibrated(values)), []
+        for r in self.recordings:
+            seen = np.full((len(r.power), len(SIGNALS)), np.nan)
+            simulate(parameters, r, signals=seen)
+            result.append(seen)
+        return result
+
+    def model(self) -> Model:
+        """The calibration's heat balance, fitted to the recordings."""
+        base = [c for c in base_coordinates(self.calibration, []) if c.channel == CHANNEL_OF_HEAT]
+        further = [scaled_coordinate(self.calibration, key, CHANNEL_OF_HEAT, prior) for key, prior in _FURTHER]
+        start: dict[Coordinate, float] = {c: c.start for c in (*base, *further)}
+        return Model(self, start, *self.run(start), centre=start).refined([CHANNEL_OF_HEAT])
+
+
+class HeatScreening(Screening):
+    """Of a heat bench: limits only. No smooth function of a signal is a rival, because temperatures remember."""
+
+    def __init__(self, bench: HeatBench, model: Model):
+        self.bench, self.initial, self.coordinates = bench, model.residual, {}
+        self.signals = {"clamp_force": np.zeros(0)}
+
+    def rival(self, model: Model, channel: str, rivals: dict, samples: int = 1) -> tuple[float, str]:
+        return 0.0, ""
+
+
+class HeatSearch(Search):
+    """All forms at the ports of the heat balance."""
+
+    def __init__(self, model: Model):
+        self.model, self.channel, self.signals = model, CHANNEL_OF_HEAT, model.bench.signals(model.values)
+        self.random = np.random.default_rng(0)
+        self.covered = covered_by(np.concatenate(self.signals))
+        self.ports = tuple(port for port in PORTS if port in FORMED and HOOKS[port].channel == CHANNEL_OF_HEAT)
+        self.screen = Screen(model, CHANNEL_OF_HEAT, 1)
+        self._parameters = to_parameters(model.bench.calibrated(model.values))
+        self._answers: dict[Form, np.ndarray] = {}
+
+    def answer(self, form: Form) -> np.ndarray:
+        own = self._parameters.copy()
+        terms = own["effects"]["terms"]
+        terms["term"][terms["count"]] = record_of(form)
+        terms["term"]["coefficient"][terms["count"]] = form.step
+        terms["count"] += 1
+        return (self.model.residual[CHANNEL_OF_HEAT] - self.model.bench.residual_of(own)) / form.step
+
+    def _answered(self, forms: Sequence[Form]) -> np.ndarray:
+        """Of each form, shape (N, forms)."""
+        new = [form for form in forms if form not in self._answers]
+        self._answers |= dict(zip(new, self.model.bench.map(self.answer, new), strict=True))
+        return np.column_stack([self._answers[form] for form in forms])
+
+    def _screened(self, forms: Sequence[Form]) -> np.ndarray:
+        return self.screen.scores(self._answered(forms)).gain
+
+    def _moved(self, columns: np.ndarray, low: float, high: float) -> np.ndarray:
+        """Columns at another time, as if the recordings were a circle: a share between two of them later."""
+        rows = len(columns) // _PLACES
+        return np.roll(columns, _PLACES * int(rows * self.random.uniform(low, high)), axis=0)
+
+    def chance_of(self, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
+        columns, most = self._answered(forms), gains.max()
+        for number in range(chances):
+            if float(self.screen.scores(self._moved(columns, 0.1, 0.9)).gain.max()) >= most:
+                return 2.0 / (2.0 + number)
+        return 1.0 / (1.0 + chances)
+
+    def gains_moved(self, form: Form, shifts: int) -> np.ndarray:
+        column = self.answer(form)[:, None]
+        return np.array([self.screen.scores(self._moved(column, 0.25, 0.75)).gain[0] for _ in range(shifts)])
+
+    def is_within(self, term: Term) -> bool:
+        return True
+
+    def dependence(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Squared error of each left-out episode, without and with the best form of each signal."""
+        own = self.model.own(CHANNEL_OF_HEAT)
+        moments = self.model.moments(CHANNEL_OF_HEAT, [self.model.columns[c] for c in own])
+        plain = leave_out(moments, self.model.penalty(own, CHANNEL_OF_HEAT)).left_out
+        scores, gains = self.screen.scores(self._answered(self.forms)), self.gains
+        found = {}
+        for signal in {form.signal for form in self.forms}:
+            best = max((index for index, form in enumerate(self.forms) if form.signal == signal), key=gains.__getitem__)
+            found[signal] = plain, plain - Scores(scores.u[best : best + 1], scores.a[best : best + 1]).fall[0]
+        return found
+
+
+def heat_bench(logs: Iterable[Log], calibration: Calibration) -> HeatBench | None:
+    """Of those logs that hold thermocouples and brake torque and begin at rest; None where they tell nothing."""
+    found = []
+    for log in logs:
+        try:
+            r = recording(log)
+        except InputError:
+            continue
+        apart = r.measured[:, 0] - 0.5 * (r.inner[0] + r.outer[0])
+        if not np.any(np.abs(apart) > _SETTLED_K):
+            found.append(r)
+    bench = HeatBench(found, calibration) if found else None
+    return bench if bench and bench.episodes >= _LEAST_EPISODES else None
