@@ -110,7 +110,7 @@ def _limited(share):
 
 @pytest.mark.parametrize("share", [0.4, 0.6, 0.8])
 def test_a_current_sensor_that_goes_no_further_is_not_believed_there(share):
-    """What it then shows is the least that flows. From its second stroke on it is known where that is: no sample of it is used,
+    """What it then shows is the least that flows. From its second stroke on it is known where that is: none of it is used,
     and the force stays right."""
     estimates, force = city.changed(_limited(share), seconds=40.0)
     samples, _ = drive(0, 40.0)
