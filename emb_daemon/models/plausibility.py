@@ -71,8 +71,8 @@ _CERTAIN = 6.0
 #: friction that may turn over within it, over the calibration's.
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
 #: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
-#: repetition in five, once in 600; then that one value is disbelieved until the current has exceeded it.
-_PINNED = 4
+#: repetition in five, once in 3000.
+_PINNED = 5
 #: Angle that the torque must have turned the motor by, rad, to contradict an angle that stands: eight times what is computed
 #: from rest for a motor that in truth came from one side and went back there. Torque beyond friction, in standard deviations,
 #: that noise may cause: one sample of 700 has more, and three in a row are needed.
@@ -148,7 +148,8 @@ def watch(
 
 @njit
 def _look_for_limit(c, current, travel):
-    """Notice whether the ``current`` (A) is as far as its sensor goes: then that much flows, or more."""
+    """Notice whether the ``current`` (A) is as far as its sensor goes: then that much flows, or more. A value that was none
+    such is disbelieved until the current has exceeded it."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
     if c.pinned >= _PINNED and c.current_flickered >= _FLICKERED:
         c.limit = abs(current)
