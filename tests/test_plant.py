@@ -61,6 +61,12 @@ VISIBLE = {
     "drawn_gear_friction": {"size": 0.3, "signal": 4, "exponent": 0.5, "other": 3},
     "drawn_gear_gain": {"size": 0.05, "signal": 3, "shape": 2, "other": -1},
     "drawn_pad_friction": {"size": -0.3, "signal": 9, "shape": 1, "other": -1},
+    "drawn_contact_conductance": {"size": 1.0, "signal": 3, "exponent": 1.0, "other": -1},
+    "drawn_gap_conductance": {"size": 5.0, "signal": 1, "exponent": 1.0, "other": -1},
+    "drawn_disc_cooling": {"size": 2.0, "signal": 7, "exponent": 1.0, "other": -1},
+    "drawn_heat_share": {"size": 1.0, "signal": 9, "exponent": 1.0, "other": -1},
+    "drawn_disc_heat": {"size": 500.0, "signal": 7, "exponent": 1.0, "other": -1},
+    "drawn_pad_conductivity": {"size": 0.5, "signal": 3, "exponent": 1.0, "other": -1},
 }
 
 
