@@ -73,7 +73,7 @@ def test_a_rejected_evaluation_changes_no_parameter_and_no_state(parked, outcome
     a["phase"], a["evaluation"], a["evaluation_ready"] = r.EVALUATING, outcome, True
     parameters, learned = np.zeros(1, PARAMETERS), np.ones(1, PARAMETERS)[0]
     before = parameters.tobytes(), state.tobytes()
-    training._conclude(a, state, parameters, learned, new_state(), np.zeros(4, r.TRAINING))
+    training._conclude(a, state, parameters, learned, new_state()[0], np.zeros(4, r.TRAINING))
     assert (parameters.tobytes(), state.tobytes()) == before
     assert (a["phase"], a["result"], a["outcome"], a["tried"]) == (r.IDLE, c.RESULT_REJECTED, outcome, True)
 
@@ -82,7 +82,7 @@ def test_an_evaluation_that_is_not_ready_changes_nothing(parked):
     a, state = parked[0], new_state()[0]
     a["phase"], a["evaluation"] = r.EVALUATING, r.ACCEPTED
     parameters = np.zeros(1, PARAMETERS)
-    training._conclude(a, state, parameters, np.ones(1, PARAMETERS)[0], new_state(), np.zeros(4, r.TRAINING))
+    training._conclude(a, state, parameters, np.ones(1, PARAMETERS)[0], new_state()[0], np.zeros(4, r.TRAINING))
     assert not np.frombuffer(parameters.tobytes(), np.uint8).any() and a["result"] == c.RESULT_ABORTED
 
 
@@ -140,10 +140,11 @@ def test_what_the_temperature_may_be_wrong_by_now_and_before_is_in_the_factors_s
 
 def observe(parked, others_hold=True):
     a, m, estimate, limits = parked
-    rows, scratch, parameters = np.zeros(4, r.TRAINING), new_state(), np.zeros(1, PARAMETERS)
+    rows, remembered, parameters = np.zeros(4, r.TRAINING), np.zeros(1, r.REMEMBERED), np.zeros(1, PARAMETERS)
     state = new_state()[0]
     state["factor"] = 1.0
-    training.observe(a, state, parameters, parameters[0], limits, others_hold, scratch, rows, m, estimate)
+    reached = new_state()[0]
+    training.observe(a, state, parameters, parameters[0], reached, remembered, limits, others_hold, rows, m, estimate)
 
 
 def test_who_parks_anew_waits_anew(parked):

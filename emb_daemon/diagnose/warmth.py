@@ -5,9 +5,10 @@ the same moment. But the heat chain alone costs a fiftieth of the whole step: ea
 `identify` fits pads and disc to. The brake torque is measured there, so that friction and force cannot hide behind a term.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.prospects import Scores, Screen, Search, covered_by, record_of
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, Probe
-from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.screening import Rivals, Screening
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
@@ -49,22 +50,22 @@ class HeatBench(Bench):
 
     def __init__(self, recordings: Sequence[Recording], calibration: Calibration, workers: int = 2):
         self.calibration = calibration
-        self.recordings: Sequence[Recording] = recordings
-        self.own_data = True
-        self.straight = False
-        self.middle = 0.0
-        self.map = ThreadPoolExecutor(workers).map if workers > 1 else map
-        self.channels = [CHANNEL_OF_HEAT]
+        self.recordings = recordings
+        self.own_data: bool = True
+        self.middle: float = 0.0
+        self.straight: bool = False
+        self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
+        self.channels: list[str] = [CHANNEL_OF_HEAT]
         inside = np.append(np.tile(np.array(DEPTHS_M) <= 1e-3 * calibration.pad_thickness_mm, 2), True)
         self._every = [max(round(_EVERY_S / r.step_s), 1) for r in recordings]
         pairs = list(zip(recordings, self._every, strict=True))
         self._measured = [np.where(inside, r.measured[:, ::every].T, np.nan) for r, every in pairs]
         cut = [(r.time_s[::every] // _EPISODE_S).astype(int) for r, every in pairs]
         offsets = np.cumsum([0] + [int(own[-1]) + 1 for own in cut])
-        self.episodes = int(offsets[-1])
+        self.episodes: int = int(offsets[-1])
         episode = np.concatenate([own + offset for own, offset in zip(cut, offsets, strict=False)])
-        self.sample_episode = np.repeat(episode, _PLACES)
-        self.episode = {CHANNEL_OF_HEAT: self.sample_episode}
+        self.sample_episode: np.ndarray = np.repeat(episode, _PLACES)
+        self.episode: dict[str, np.ndarray] = {CHANNEL_OF_HEAT: self.sample_episode}
 
     @property
     def sources(self) -> list[str]:
@@ -113,10 +114,12 @@ class HeatScreening(Screening):
     """Of a heat bench: limits only. No smooth function of a signal is a rival, because temperatures remember."""
 
     def __init__(self, bench: HeatBench, model: Model):
-        self.bench, self.initial, self.coordinates = bench, model.residual, {}
-        self.signals = {"clamp_force": np.zeros(0)}
+        self.bench = bench
+        self.initial: dict[str, np.ndarray] = model.residual
+        self.coordinates: dict[str, dict[str, Coordinate]] = {}
+        self.signals: dict[str, np.ndarray] = {"clamp_force": np.zeros(0)}
 
-    def rival(self, model: Model, channel: str, rivals: dict, samples: int = 1) -> tuple[float, str]:
+    def rival(self, model: Model, channel: str, rivals: Rivals, samples: int = 1) -> tuple[float, str]:
         return 0.0, ""
 
 
@@ -124,11 +127,13 @@ class HeatSearch(Search):
     """All forms at the ports of the heat balance."""
 
     def __init__(self, model: Model):
-        self.model, self.channel, self.signals = model, CHANNEL_OF_HEAT, model.bench.signals(model.values)
-        self.random = np.random.default_rng(0)
-        self.covered = covered_by(np.concatenate(self.signals))
-        self.ports = tuple(port for port in PORTS if port in FORMED and HOOKS[port].channel == CHANNEL_OF_HEAT)
-        self.screen = Screen(model, CHANNEL_OF_HEAT, 1)
+        self.model = model
+        self.channel: str = CHANNEL_OF_HEAT
+        self.signals: list[np.ndarray] = model.bench.signals(model.values)
+        self.random: np.random.Generator = np.random.default_rng(0)
+        self.covered: dict[str, tuple[float, float]] = covered_by(np.concatenate(self.signals))
+        self.ports: tuple[str, ...] = tuple(p for p in PORTS if p in FORMED and HOOKS[p].channel == CHANNEL_OF_HEAT)
+        self.screen: Screen = Screen(model, CHANNEL_OF_HEAT, 1)
         self._parameters = to_parameters(model.bench.calibrated(model.values))
         self._answers: dict[Form, np.ndarray] = {}
 

@@ -13,11 +13,10 @@ the motor reverses. So the likeliest jump is kept in addition to its successor, 
 for it.
 
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. The first hypothesis
-can explain the same torque by a torque constant or a friction within their priors, so the fused force does not follow a drift
-before it is proven, and clearly another contact or stiffness than the first's. Its difference from the fused force counts in
-the standard deviation by its odds, and so does unobserved growth of its disc: a drag heats a disc by tens of kelvin in seconds
-and hardly moves the motor. Evidence for it is remembered, because a first hypothesis that has attributed the pads' change to
-motor and friction contradicts it no more.
+can explain the same torque by a torque constant or a friction within their priors, so that neither is ever proven, and the
+fused force does not follow a drift. Its difference from the fused force counts in the standard deviation by its odds, and so
+does unobserved growth of its disc: a drag heats a disc by tens of kelvin in seconds and hardly moves the motor. Evidence for
+it is remembered, because a first hypothesis that has attributed the pads' change to motor and friction contradicts it no more.
 """
 
 from math import exp, log, sqrt
@@ -88,14 +87,14 @@ _OPENED_S, _KEPT = 1.0, 1.0
 #: Time, without that in the clearance, after which the stronger of two similar proven alternatives is accepted, and a merely
 #: suspected one given up at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
-#: Squared distance, in variances, that is no chance: 3 standard deviations. Of an offset from the last stroke's, from which on
-#: its walk is enlarged; of a drift's contact angle and stiffness from the first hypothesis's.
+#: Squared movement of an offset, in its variances, from which its walk is enlarged: 3 standard deviations.
 _SURELY = 9.0
 #: Standard deviations of the innovation beyond which a sample is not learned from: sensors jump, learned quantities change
 #: slowly.
 GATE = 5.0
 
-#: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts.
+#: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
+#: first hypothesis.
 ALTERNATIVES = 5
 STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
@@ -441,16 +440,6 @@ def _follow_offset(s):
 
 
 @njit
-def _has_drifted(s):
-    """Whether a drift is proven against all others, and its contact angle or stiffness clearly another than the first's. What
-    explains a little at a time may gain odds without."""
-    drift = s.alternatives[DRIFT]
-    x, P = drift.error, drift.covariance
-    other = x[CONTACT] * x[CONTACT] > _SURELY * P[CONTACT, CONTACT] or x[SCALE] * x[SCALE] > _SURELY * P[SCALE, SCALE]
-    return other and drift.log_odds - _likeliest_odds(s) >= _CLEARLY
-
-
-@njit
 def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
@@ -473,9 +462,6 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
         if a.kind == STIFFNESS_JUMP:
             s.jumps += 1.0
         _become_first(s, a)
-        return True
-    if released and _has_drifted(s):
-        _become_first(s, s.alternatives[DRIFT])
         return True
     stiffness, torque, kept = s.alternatives[STIFFNESS_JUMP], s.alternatives[TORQUE_JUMP], s.alternatives[KEPT_JUMP]
     undecided = released and _strongest(s, DRIFT) < _PROVEN
