@@ -688,6 +688,15 @@ def test_pads_that_still_relax_from_the_stroke_are_not_taken_for_settled(ideal):
     assert states[0]["force"] == pytest.approx(before)
 
 
+def test_a_training_begins_with_what_pads_remember(ideal):
+    """A released brake that held 10 kN long enough for a slow relaxation (10 % with 6 s): 1 kN of it is left, and fades."""
+    ideal["effects"]["third_relaxation"]["share"], ideal["effects"]["third_relaxation"]["time_constant_s"] = 0.1, 6.0
+    rows, state = trained_rows(ideal, noise=False)[:100], new_state()[0]
+    state["effects"]["third_relaxation"]["force"] = 10_000.0
+    reached = reach(rows, state, rows["angle"].max() + 1.0, ideal)
+    assert reached["force"] == pytest.approx(1000.0 * np.exp(-99 * 0.004 / 6.0), rel=0.01)
+
+
 def test_what_pads_remember_of_the_braking_before_is_known_to_a_training(tmp_path):
     """Before it is asked the motor holds 12 kN for seconds: a relaxation with 20 s is far from settled then."""
     effects = {"third_relaxation": {"share": 0.1, "time_constant_s": 20.0}}
