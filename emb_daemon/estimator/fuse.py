@@ -344,13 +344,6 @@ def _torque_alone(s, p, m):
     gain, load, coulomb = _gear(s, p, m, s.error, slope)
     torque = _motor_torque(s, s.error) - gain * spring
     force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
-    mean = square = 0.0
-    for kind in range(DRIFT):
-        a = s.alternatives[kind]
-        apart = (_motor_torque(s, a.error) - _motor_torque(s, s.error)) / gain
-        mean += a.share * apart
-        square += a.share * apart * apart
-    force, sigma = max(force + mean, 0.0), hypot(sigma, sqrt(max(square - mean * mean, 0.0)))
     sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
