@@ -6,6 +6,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator import uneven
+from emb_daemon.estimator.common import common_sigma, weigh_common
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.force_sensor import hear_sensor
 from emb_daemon.estimator.hypotheses import (
@@ -276,11 +277,14 @@ def fuse(
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
         s.torque_age = 0.0 if trusted else s.torque_age + m.dt
         fold(s, warmth, True)
+        stops = s.stops
         if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
             fold(s, warmth, False)
             open_others(s, p)
             forget(s.consistency)
             forget_level(s.contact)
+        if s.stops > stops:
+            weigh_common(s, p)
     else:
         s.torque_age += m.dt
     s.current_before, s.had_current = m.current_q, m.has_current
@@ -293,6 +297,7 @@ def fuse(
         out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
         # Error of the travel from the released position by a resolver with a wrong gain.
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
+        out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
     # Not max(), which may return the number if the other is NaN, so that a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0

@@ -35,7 +35,7 @@ _SETTLED_M = 5e-6
 #: sqrt(2 (3 um/MJ)^2 0.06 MJ) per root of a MJ, m per root of a J.
 _WORN_M_PER_SQRT_J = 1.0e-9
 #: Stiffness: compressibility of pads of one size spreads by a fifth between compounds (ISO 6310), share.
-_SCALE_JUMP = 0.2
+SCALE_JUMP = 0.2
 #: What a calibration's curve may be off by on its own brake, and what pads change by in an hour of use, share.
 _SCALE, _SCALE_WALK_PER_SQRT_S = 0.001, 0.01 / 60.0
 #: Time in which heat that nobody knows of has become another: it leaves a pad within minutes, s.
@@ -70,7 +70,7 @@ WINDING_S, HOUSING_S = 30.0, 300.0
 _MISSED, _MISSED_S = 0.3, 10.0
 #: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
 #: that moved), m; stiffness (thinnest pads, another compound) and motor torque, shares.
-_CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
+_CONTACT_REACH_M, _SCALE_REACH, GAIN_REACH = 100e-6, 0.3, 0.05
 #: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
 #: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
 #: it stands, m per root of a second; stiffness, which gains some 4 % with each millimetre that a lining wears, and its walk,
@@ -197,7 +197,7 @@ def stay_possible(
     _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
     _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
     _draw_near(x, P, gain, GROWTH, growth + x[GROWTH], 2.0 * _GROWTH_JUMP_M_PER_K / p.gear_gain)
-    _draw_near(x, P, gain, GAIN, x[GAIN], _GAIN_REACH + faded)
+    _draw_near(x, P, gain, GAIN, x[GAIN], GAIN_REACH + faded)
     _draw_near(x, P, gain, OFFSET, x[OFFSET], torque_offset(p))
     _draw_near(x, P, gain, LOAD, x[LOAD], p.load_friction)
     _draw_near(x, P, gain, COULOMB, x[COULOMB], 2.0 * p.offset_friction)
@@ -207,7 +207,7 @@ def stay_possible(
 def add_stiffness_jumps(P: Floats, p: Record) -> None:
     """What may have changed at once between motor angle and force."""
     P[CONTACT, CONTACT] += contact_jump(p) ** 2
-    P[SCALE, SCALE] += _SCALE_JUMP**2
+    P[SCALE, SCALE] += SCALE_JUMP**2
 
 
 @njit
