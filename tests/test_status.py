@@ -117,10 +117,12 @@ def test_a_learned_value_at_its_bound(seen, scale):
     assert seen.facts() == {"bound_reached"}
 
 
-def test_a_hundredth_of_the_largest_force(seen):
-    seen.out["sigma"] = 0.0101 * seen.p["maximum_force"]
+@pytest.mark.parametrize("largest_N, limit_N", [(30e3, 300.0), (45e3, 450.0), (16e3, 300.0), (10e3, 200.0)])
+def test_a_force_that_is_uncertain(seen, largest_N, limit_N):
+    seen.p["maximum_force"] = largest_N
+    seen.out["sigma"] = 1.01 * limit_N
     assert seen.facts() == {"force_uncertain"}
-    seen.out["sigma"] = 0.0099 * seen.p["maximum_force"]
+    seen.out["sigma"] = 0.99 * limit_N
     assert seen.facts() == set()
     seen.state["covariance"][..., 1, 1] = 0.51**2
     assert seen.facts() == {"force_uncertain"}

@@ -54,8 +54,9 @@ _TEMPERATURE_UNCERTAIN_K = 10.0
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
 _UNCERTAIN_RAD = 0.5
-#: Standard deviation of the force, share of the largest, from which it is reported as uncertain.
-_UNCERTAIN = 0.01
+#: Standard deviation of the force from which it is reported as uncertain: 1 % of an ordinary brake's 30 kN, N; of other brakes
+#: the same, but no less than the first and no more than the second share of their largest force.
+_UNCERTAIN_N, _UNCERTAIN_LEAST, _UNCERTAIN_MOST = 300.0, 0.01, 0.02
 
 
 @njit
@@ -197,7 +198,8 @@ def _look(s, p, m, facts, out):
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force
     out.sigma = min(out.sigma, p.maximum_force)
-    if out.sigma > _UNCERTAIN * p.maximum_force or s.covariance[CONTACT, CONTACT] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
+    uncertain = max(min(_UNCERTAIN_N, _UNCERTAIN_MOST * p.maximum_force), _UNCERTAIN_LEAST * p.maximum_force)
+    if out.sigma > uncertain or s.covariance[CONTACT, CONTACT] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
         facts |= FORCE_UNCERTAIN
     return facts
 
