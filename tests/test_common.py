@@ -9,7 +9,7 @@ import pytest
 
 from emb_daemon.estimator import common
 from emb_daemon.estimator.records import new_state
-from emb_daemon.estimator.unknown import GAIN_REACH, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
+from emb_daemon.estimator.unknown import GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.models.fusion import GAIN, INERTIA
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import RUNNING
@@ -22,29 +22,41 @@ def p(parameters):
     return brake.ideal(parameters)
 
 
-def _by_integration(stiffness, gain, inertia):
-    """Mean square of the common share by summing the mixture over a fine grid of shares."""
+def _share(*believed, pads=common.PADS_ODDS, rotor=common.OTHERS_ODDS, unit=common.OTHERS_ODDS):
+    return np.sqrt(common.common_variance(*believed, _SIGMA**2, 0.0, pads, rotor, unit)[0])
+
+
+def _by_integration(stiffness, gain, inertia, stiffness_variance, inertia_variance, pads_odds, rotor_odds, unit_odds):
+    """Mean square of the common share, and odds of other pads, rotor and unit, by sums over a fine grid of shares."""
     share = np.linspace(-0.6, 0.6, 1_200_001)
-    density = np.zeros_like(share)
-    for pads, motor, rotor in itertools.product((False, True), repeat=3):
-        odds = np.exp(-2.0) ** pads * np.exp(-3.5) ** motor * np.exp(-3.5) ** rotor
-        if pads and motor and rotor:
-            odds = np.exp(-3.5)
-        for value, sigma in (
-            (stiffness, SCALE_JUMP if pads else _SIGMA),
-            (gain, GAIN_REACH if motor else GAIN_SIGMA),
-            (inertia, 0.1 if rotor else INERTIA_SIGMA),
+    step, sums, square = share[1] - share[0], [], 0.0
+    alone = [
+        (a, b, c, 0.1, pads_odds**a * np.exp(-3.5) ** b * rotor_odds**c) for a, b, c in itertools.product((0, 1), repeat=3)
+    ]
+    for pads, motor, rotor, motor_sigma, odds in [*alone, (1, 1, 1, 0.03, unit_odds)]:
+        density = odds * step
+        for value, variance in (
+            (stiffness, stiffness_variance + (SCALE_JUMP**2 if pads else 0.0)),
+            (gain, (motor_sigma if motor else GAIN_SIGMA) ** 2),
+            (inertia, inertia_variance + (0.1 if rotor else INERTIA_SIGMA) ** 2),
         ):
-            odds = odds * np.exp(-0.5 * ((value + share) / sigma) ** 2) / sigma
-        density += odds
-    return np.sum(share * share * density) / np.sum(density)
+            density = density * np.exp(-0.5 * (value + share) ** 2 / variance) / np.sqrt(variance)
+        sums.append(np.sum(density))
+        square += np.sum(share * share * density)
+    total = sum(sums)
+    of_pads = sum(each for each, (pads, *_) in zip(sums, alone, strict=False) if pads)
+    of_rotor = sum(each for each, (_, _, rotor, *_) in zip(sums, alone, strict=False) if rotor)
+    return square / total, *(part / (total - part) for part in (of_pads, of_rotor, sums[-1]))
 
 
 @pytest.mark.parametrize(
+    "known", [(_SIGMA**2, 0.0, common.PADS_ODDS, common.OTHERS_ODDS, common.OTHERS_ODDS), (1e-4, 1e-4, 0.003, 0.2, 0.01)]
+)
+@pytest.mark.parametrize(
     "believed", [(0.0, 0.0, 0.0), (0.0, -0.033, 0.085), (-0.077, 0.02, -0.06), (0.25, 0.0, 0.01), (0.0, 0.1, 0.0)]
 )
-def test_it_is_the_mixtures_mean_square(believed):
-    assert common.common_variance(*believed, _SIGMA) == pytest.approx(_by_integration(*believed), rel=1e-4)
+def test_it_is_the_mixtures(believed, known):
+    assert common.common_variance(*believed, *known) == pytest.approx(_by_integration(*believed, *known), rel=1e-4)
 
 
 @pytest.mark.parametrize("gain", [-0.01, 0.0, 0.01])
@@ -53,6 +65,7 @@ def test_what_is_as_calibrated_adds_nothing(p, gain, inertia):
     """Beyond what the stiffness path itself states."""
     state = new_state()[0]
     state["scale"], p["stiffness_relative_sigma"] = 1.0, _SIGMA
+    common.forget_common(state)
     state["error"][GAIN], state["error"][INERTIA] = gain, inertia
     common.weigh_common(state, p)
     assert common.common_sigma(state, p) < 0.004
@@ -61,12 +74,31 @@ def test_what_is_as_calibrated_adds_nothing(p, gain, inertia):
 def test_other_pads_that_motor_and_rotor_agree_with_are_known():
     """A torque constant within 1 and an inertia within 2 % limit the share to about as much."""
     for pads in (-0.25, -0.1, 0.15):
-        assert common.common_variance(pads, 0.0, 0.0, _SIGMA) < (1.5 * GAIN_SIGMA) ** 2
+        assert _share(pads, 0.0, 0.0) < 1.5 * GAIN_SIGMA
 
 
 def test_a_current_sensor_that_passed_for_other_pads_is_covered():
     """A sensor that reads a tenth too little, taken for pads 8 % softer, a rotor 6 % lighter and a motor 2 % stronger."""
-    assert common.common_variance(-0.077, 0.02, -0.06, _SIGMA) > (0.08 / 2.0) ** 2
+    assert _share(-0.077, 0.02, -0.06) > 0.08 / 2.0
+
+
+def test_a_unit_that_was_the_calibrations_is_no_other_later():
+    """Only its motor can have changed by so much."""
+    fresh = _share(0.0, -0.1, 0.0)
+    assert fresh > 0.02
+    assert _share(0.0, -0.1, 0.0, pads=0.003, rotor=0.006, unit=3e-4) < 0.4 * fresh
+
+
+def test_what_a_stop_has_shown_of_pads_and_rotor_is_remembered(p):
+    state = new_state()[0]
+    state["scale"], p["stiffness_relative_sigma"] = 1.0, _SIGMA
+    common.forget_common(state)
+    common.weigh_common(state, p)
+    shown = [float(state[name]) for name in ("pads_odds", "rotor_odds", "unit_odds")]
+    assert shown[0] < 0.1 * common.PADS_ODDS and shown[1] < 0.5 * common.OTHERS_ODDS and shown[2] < 0.1 * common.OTHERS_ODDS
+    state["error"][GAIN], state["error"][INERTIA] = -0.04, 0.1
+    common.weigh_common(state, p)
+    assert [state[name] for name in ("pads_odds", "rotor_odds", "unit_odds")] == shown
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -12,7 +12,7 @@ import numpy as np
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row
-from emb_daemon.estimator.common import weigh_common
+from emb_daemon.estimator.common import forget_common, weigh_common
 from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
@@ -216,6 +216,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     else:
         s.contact_anchor = s.contact_angle
         open_all(s, learned)
+        forget_common(s)
     weigh_common(s, learned)
 
 

@@ -3,59 +3,91 @@
 The torque tells stiffness over torque constant, and inertia over torque constant; a share common to all three changes
 neither, and only what is known of each beforehand limits it. A filter's priors are normal, and wrong where it matters: a
 torque constant that is three standard deviations off and an inertia that is four off do not belong to the calibrated brake,
-and its pads need not either. Here each of the three is as the calibration says, or another's, so that the common share has a
-mixture of normal distributions.
+and its pads need not either. Here each of the three is as the calibration says, or another's, or all three are those of
+another unit, so that the common share has a mixture of normal distributions. Rotor and pads are no others later if a stop has
+shown that they are the calibration's; a motor may fade.
 """
 
 from math import exp, sqrt
 
-from emb_daemon.estimator.unknown import GAIN_REACH, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
+from emb_daemon.estimator.hypotheses import PRIOR_ODDS
+from emb_daemon.estimator.unknown import GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
 
-#: Inertia of another unit of one drawing, share.
-_ANOTHER_ROTOR = 0.1
+#: Inertia of another unit of one drawing; torque constant of magnets that have lost strength or of a wrong current sensor,
+#: shares (as in `adapt.fit`).
+_ANOTHER_ROTOR, _ANOTHER_MOTOR = 0.1, 0.1
 #: Odds that pads differ from the calibration's in small ways, and that motor, rotor or a whole unit are others, as those of
 #: the hypotheses (`estimator.hypotheses`): one in eight, and one of 34. Of 4100 stretches of ten seconds of drives with one
 #: fault each, 55 have a share of force error beyond three standard deviations without this, and 19 to 25 with it, whether
 #: these odds are doubled or halved.
-_PADS, _OTHERS = exp(-2.0), exp(-3.5)
+PADS_ODDS, OTHERS_ODDS = exp(-2.0), exp(-3.5)
+#: Kind that is another unit, after the combinations of the three; least error of a calibration's stiffness, share.
+_UNIT, _LEAST = 8, 1e-4
 
 
 @njit
-def _odds(pads, motor, rotor):
-    if pads and motor and rotor:
-        return _OTHERS
-    return (_PADS if pads else 1.0) * (_OTHERS if motor else 1.0) * (_OTHERS if rotor else 1.0)
-
-
-@njit
-def common_variance(stiffness: float, gain: float, inertia: float, stiffness_sigma: float) -> float:
-    """Mean square of the common share.
+def common_variance(
+    stiffness: float, gain: float, inertia: float, stiffness_variance: float, inertia_variance: float, pads_odds: float,
+    rotor_odds: float, unit_odds: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Mean square of the common share, and the odds by it that the pads, the rotor, and the unit are others.
 
     Args:
         stiffness, gain, inertia: what is believed of each beside the calibration, shares.
-        stiffness_sigma: standard deviation of the calibration's own stiffness, share.
+        stiffness_variance: of what is believed and of the calibration's own stiffness; ``inertia_variance``: of the former.
+        pads_odds, rotor_odds, unit_odds: odds beforehand.
     """
-    total = square = 0.0
-    for kind in range(8):
-        pads, motor, rotor = kind & 1 != 0, kind & 2 != 0, kind & 4 != 0
-        a = (SCALE_JUMP if pads else stiffness_sigma) ** -2
-        b = (GAIN_REACH if motor else GAIN_SIGMA) ** -2
-        c = (_ANOTHER_ROTOR if rotor else INERTIA_SIGMA) ** -2
+    total = square = of_pads = of_rotor = of_unit = 0.0
+    for kind in range(_UNIT + 1):
+        unit = kind == _UNIT
+        pads, motor, rotor = unit or kind & 1 != 0, unit or kind & 2 != 0, unit or kind & 4 != 0
+        odds = (pads_odds if pads else 1.0) * (OTHERS_ODDS if motor else 1.0) * (rotor_odds if rotor else 1.0)
+        gain_sigma = _ANOTHER_MOTOR if motor else GAIN_SIGMA
+        if unit:
+            # Its torque constant is within the datasheet's tolerance.
+            odds, gain_sigma = unit_odds, GAIN_JUMP
+        a = 1.0 / (stiffness_variance + (SCALE_JUMP * SCALE_JUMP if pads else 0.0))
+        b = 1.0 / (gain_sigma * gain_sigma)
+        c = 1.0 / (inertia_variance + (_ANOTHER_ROTOR if rotor else INERTIA_SIGMA) ** 2)
         information = a + b + c
         mean = -(a * stiffness + b * gain + c * inertia) / information
         cost = a * stiffness * stiffness + b * gain * gain + c * inertia * inertia - information * mean * mean
-        likelihood = _odds(pads, motor, rotor) * sqrt(a * b * c / information) * exp(-0.5 * cost)
+        likelihood = odds * sqrt(a * b * c / information) * exp(-0.5 * cost)
         total += likelihood
         square += likelihood * (mean * mean + 1.0 / information)
-    return square / total if total > 0.0 else SCALE_JUMP * SCALE_JUMP
+        if unit:
+            of_unit = likelihood
+        else:
+            of_pads += likelihood if pads else 0.0
+            of_rotor += likelihood if rotor else 0.0
+    if total <= 0.0:
+        return SCALE_JUMP * SCALE_JUMP, pads_odds, rotor_odds, unit_odds
+    return square / total, _to_odds(of_pads, total), _to_odds(of_rotor, total), _to_odds(of_unit, total)
+
+
+@njit
+def _to_odds(part, total):
+    return part / max(total - part, 1e-9 * total)
+
+
+@njit
+def forget_common(s: Record) -> None:
+    """Nothing is known of pads, rotor and unit but the calibration."""
+    s.common, s.pads_odds, s.rotor_odds, s.unit_odds = 0.0, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS
 
 
 @njit
 def weigh_common(s: Record, p: Record) -> None:
     """Take in what the first hypothesis believes now."""
-    s.common = common_variance(s.scale - 1.0, s.error[GAIN], s.error[INERTIA], p.stiffness_relative_sigma)
+    stiffness, gain, inertia = s.scale - 1.0, s.error[GAIN], s.error[INERTIA]
+    own = s.covariance[SCALE, SCALE] + max(p.stiffness_relative_sigma, _LEAST) ** 2
+    rotor_variance = s.covariance[INERTIA, INERTIA]
+    _, pads, rotor, unit = common_variance(stiffness, gain, inertia, own, rotor_variance, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS)
+    s.pads_odds = max(min(s.pads_odds, pads), exp(PRIOR_ODDS))
+    s.rotor_odds, s.unit_odds = min(s.rotor_odds, rotor), min(s.unit_odds, unit)
+    s.common, _, _, _ = common_variance(stiffness, gain, inertia, own, rotor_variance, s.pads_odds, s.rotor_odds, s.unit_odds)
 
 
 @njit

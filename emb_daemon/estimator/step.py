@@ -9,7 +9,7 @@ from math import sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
-from emb_daemon.estimator.common import weigh_common
+from emb_daemon.estimator.common import forget_common, weigh_common
 from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
@@ -75,6 +75,7 @@ def _start(s, p, m):
     s.friction_variance = 1.0
     s.torque_age = s.no_current_s = 1e9
     open_all(s, p)
+    forget_common(s)
     if s.resumed:
         weigh_common(s, p)
     s.balance = np.nan

@@ -45,7 +45,7 @@ _MEASURED_K = 10.0
 #: Growth of disc and pads: grey iron of 26 mm, 1.0e-5 1/K, m/K; and what a calibration without it leaves.
 _GROWTH_JUMP_M_PER_K = 0.26e-6
 #: Torque constant and current gain: datasheets state 2 to 3 %; a calibration's own is known better, and ages.
-GAIN_SIGMA, _GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
+GAIN_SIGMA, GAIN_JUMP, _GAIN_WALK_PER_SQRT_S = 0.01, 0.03, 0.01 / 60.0
 #: Offset of the motor torque at power-on: share of the torque that the largest force needs (Hall sensors: 0.5 to 1 % of a
 #: range that is several times that current); and time in which it drifts as far again, s.
 _OFFSET, _OFFSET_DRIFTS_S = 0.1, 36000.0
@@ -70,7 +70,7 @@ WINDING_S, HOUSING_S = 30.0, 300.0
 _MISSED, _MISSED_S = 0.3, 10.0
 #: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
 #: that moved), m; stiffness (thinnest pads, another compound) and motor torque, shares.
-_CONTACT_REACH_M, _SCALE_REACH, GAIN_REACH = 100e-6, 0.3, 0.05
+_CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
 #: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
 #: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
 #: it stands, m per root of a second; stiffness, which gains some 4 % with each millimetre that a lining wears, and its walk,
@@ -197,7 +197,7 @@ def stay_possible(
     _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
     _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
     _draw_near(x, P, gain, GROWTH, growth + x[GROWTH], 2.0 * _GROWTH_JUMP_M_PER_K / p.gear_gain)
-    _draw_near(x, P, gain, GAIN, x[GAIN], GAIN_REACH + faded)
+    _draw_near(x, P, gain, GAIN, x[GAIN], _GAIN_REACH + faded)
     _draw_near(x, P, gain, OFFSET, x[OFFSET], torque_offset(p))
     _draw_near(x, P, gain, LOAD, x[LOAD], p.load_friction)
     _draw_near(x, P, gain, COULOMB, x[COULOMB], 2.0 * p.offset_friction)
@@ -235,7 +235,7 @@ def add_drift_walks(walked: Floats, p: Record, turning: bool, dt: float) -> None
 @njit
 def add_torque_jumps(P: Floats, p: Record) -> None:
     """What may have changed at once between motor current and force."""
-    P[GAIN, GAIN] += _GAIN_JUMP**2
+    P[GAIN, GAIN] += GAIN_JUMP**2
     P[OFFSET, OFFSET] += torque_offset(p) ** 2
     P[LOAD, LOAD] += (_FRICTION_JUMP * p.load_friction) ** 2
     P[COULOMB, COULOMB] += (_FRICTION_JUMP * p.offset_friction) ** 2
