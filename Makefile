@@ -11,7 +11,7 @@ demo: $(READY)
 # As many processes as cores: threads of linear algebra beside them would only wait for each other.
 # Byte code is kept whatever the shell says, or a hundred processes would each translate the sources.
 test: $(READY) lint
-	OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -7,6 +7,9 @@ from pathlib import Path
 
 from emb_daemon.errors import InputErrors
 
+#: Taken from a file that says to be smaller, as those of /proc do.
+_UNKNOWN_SIZE = 1 << 20
+
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Content of a regular file; never blocks.
@@ -17,10 +20,11 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     # open() of a pipe would wait for a writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
-        mode = os.fstat(handle).st_mode
+        mode, size = os.fstat(handle).st_mode, os.fstat(handle).st_size
         if not stat.S_ISREG(mode):
             raise OSError(errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL, "not a regular file", str(path))
-        content = file.read(most_bytes + 1)
+        # Python reserves what read() may return: not more than the file has, nor too little where a file system does not know.
+        content = file.read(min(most_bytes, max(size, _UNKNOWN_SIZE)) + 1)
     if len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return content

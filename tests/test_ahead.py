@@ -1,12 +1,14 @@
 """Kernels compiled ahead: the same bytes as from numba, without it; and nothing else is ever taken for them."""
 
 import argparse
+import ctypes
 import os
 import platform
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import adaptkit
 import aheadkit
@@ -247,10 +249,24 @@ def test_a_manifest_says_what_was_sealed(tmp_path):
 )
 def test_an_argument_of_another_kind_never_reaches_the_library(kind, argument):
     with pytest.raises(TypeError):
-        library._converter(kind)(argument)
+        _words(kind, argument)
 
 
 def test_records_and_arrays_are_passed_where_they_are():
     rows = np.zeros(3, SAMPLE)
-    assert library._converter(SAMPLE)(rows[2]) == (rows.ctypes.data + 2 * SAMPLE.itemsize,)
-    assert library._converter(Array(SAMPLE))(rows[1:]) == (rows.ctypes.data + SAMPLE.itemsize, 2)
+    assert _words(SAMPLE, rows[2]) == [rows.ctypes.data + 2 * SAMPLE.itemsize]
+    assert _words(Array(SAMPLE), rows[1:]) == [rows.ctypes.data + SAMPLE.itemsize, 2]
+    grid = np.zeros((2, 5))
+    pair = Pair(Array(float, 2), int)
+    assert _words(pair, Pair(grid, np.int64(-7))) == [grid.ctypes.data, 2, 5, -7]
+
+
+class Pair(NamedTuple):
+    first: object
+    second: object
+
+
+def _words(kind, argument) -> list[int]:
+    words = (ctypes.c_int64 * library._size(kind))()
+    library._writer(kind)(words, 0, argument)
+    return list(words)

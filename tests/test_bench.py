@@ -8,6 +8,7 @@ import pytest
 from emb_daemon.bench.logs import difference
 from emb_daemon.bench.loop import held_up, measure_loop, measure_start
 from emb_daemon.bench.report import text, verdict
+from emb_daemon.cli import bench
 from emb_daemon.estimator.records import ESTIMATE
 
 
@@ -133,6 +134,18 @@ def test_kernels_from_numba_and_compiled_ahead_stand_side_by_side(figures):
     figures["verdict"] = verdict(figures)
     shown = [line.split() for line in text(figures).splitlines()]
     assert ["start", "to", "ready,", "s", "1.00", "0.45"] in shown and ["resident,", "MiB", "186", "57"] in shown
+
+
+def test_kernels_take_turns_and_the_median_round_counts(monkeypatch):
+    ticks = iter([3, 13, 1, 11, 2, 12, 9, 19, 0, 10])
+    monkeypatch.setattr(
+        "emb_daemon.bench.loop.measure_loop",
+        lambda corners, seconds, kernels: {"kernels": kernels, "tick": {"p50_us": next(ticks)}},
+    )
+    assert bench._compare("k.so", 3.0) == {
+        "numba": {"kernels": "", "tick": {"p50_us": 2}},
+        "ahead": {"kernels": "k.so", "tick": {"p50_us": 12}},
+    }
 
 
 def test_the_daemon_is_measured_in_a_process_of_its_own():

@@ -59,6 +59,18 @@ def test_a_frame_of_ours_that_comes_once_more_is_somebody_elses(ends):
     assert len(_heard(ours, 1)) == 1
 
 
+@pytest.mark.parametrize(("one", "other"), [(_GROUP, "239.74.162.1"), (f"ff15::{os.getpid() % 0xFFFF:x}", "ff15::1:1")])
+def test_two_groups_on_one_machine_are_two_buses(one, other):
+    try:
+        first, second = open_bus("udp_multicast", one, _OURS), open_bus("udp_multicast", other, _OURS)
+    except Unavailable as error:
+        pytest.skip(f"NOT RUN: no multicast here: {error}")
+    second.send(wirekit.frame("EMB_FL_ClampForce", ClampForce=5.0))
+    assert _heard(first, 1) == []
+    first.close()
+    second.close()
+
+
 @pytest.fixture
 def virtual():
     """Our end of an in-process bus, and python-can's of somebody who sends what does not concern us too."""

@@ -2,6 +2,7 @@
 
 import gzip
 import os
+import tracemalloc
 
 import can
 import numpy as np
@@ -298,3 +299,16 @@ def test_a_fast_library_changes_nothing_of_what_is_read_or_said(damage, tmp_path
     fast = outcome()
     monkeypatch.setattr(read, "isal_zlib", None)
     assert outcome() == fast
+
+
+def test_a_log_takes_memory_for_its_frames_and_not_for_its_lines(tmp_path):
+    count = 20_000
+    path = tmp_path / "long.log"
+    path.write_text("".join(f"(1.{i:06d}) can0 0A0#0011223344556677\n" for i in range(count)))
+    read_log(path)
+    tracemalloc.start()
+    recorded = read_log(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * path.stat().st_size
+    assert set(recorded.channels) == {"can0"}

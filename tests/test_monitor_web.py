@@ -71,6 +71,18 @@ def test_a_force_that_is_not_to_be_used_is_no_metric():
     assert found["emb_status", 'corner="FL",status="fault"'] == 1.0
 
 
+def test_lost_and_damaged_frames_are_counted_apart():
+    listener = _heard()
+    late = _broadcasts(100 * SECOND_NS, 4)
+    late["data"][1] ^= 1 << 60
+    listener.hear(late)
+    found = _samples(exposition(listener, 100 * SECOND_NS))
+    # Three of each of the other kinds of message were lost before these, and one came with a wrong CRC.
+    assert found["emb_frames_missing_total", 'corner="FL"'] == 9.0
+    assert found["emb_frames_damaged_total", 'corner="FL"'] == 1.0
+    assert found["emb_frames_received_total", 'corner="FL"'] == 7.0
+
+
 def _get(port: int, path: str, host: str = "127.0.0.1"):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
     connection.request("GET", path, headers={"Host": f"{host}:{port}"})

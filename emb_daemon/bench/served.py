@@ -45,14 +45,17 @@ _ROOM = 1_000_000
 
 
 class Pacer(loop.Pacer):
-    """Records the deadline for which the loop sleeps (0 while a sample is overdue), and the process's CPU time before."""
+    """Records whether the loop sleeps (it waits on the bus while a sample is overdue), when that ends at the latest, and the
+    process's CPU time before."""
 
+    sleeps: bool = False
     deadline_ns: int = 0
     worked_ns: int = 0
 
     def next_wake(self, now_ns: int) -> int:
         wake = super().next_wake(now_ns)
-        self.deadline_ns = wake if wake > now_ns else 0
+        self.sleeps = wake > now_ns
+        self.deadline_ns = wake if self.sleeps else now_ns + loop.QUEUED_NS
         self.worked_ns = time.process_time_ns()
         return wake
 
@@ -101,7 +104,7 @@ class Ledger:
         taken = time.perf_counter_ns() - begin
         if not corners["started"].any():
             return
-        if pacer.deadline_ns and self._woken < _ROOM:
+        if pacer.sleeps and self._woken < _ROOM:
             self._late[self._woken] = now_ns - pacer.deadline_ns
             self._woken += 1
         if corners["cycle"].sum() > cycles and self._used < _ROOM:
@@ -115,7 +118,7 @@ class Ledger:
     def _attribute(self, now_ns: int, pacer: Pacer) -> None:
         """Count missed periods that the machine caused: the loop was not woken, and nothing of the process ran."""
         missed, self._missed = self._daemons[0].missed - self._missed, self._daemons[0].missed
-        if missed and pacer.deadline_ns and held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
+        if missed and held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
             self._held_up += missed
 
     def _stand(self) -> tuple:

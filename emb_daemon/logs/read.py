@@ -124,8 +124,13 @@ def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[
         print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
     elif bad_line:
         raise InputError(f"{path}:{bad_line}: not a candump line, expected '(seconds.fraction) interface id#data'")
-    lines = islice(filter(None, text.splitlines()), len(frames))
-    return frames, octets, lambda: np.array([line.split(b" ", 2)[1].decode() for line in lines])
+
+    def channels() -> np.ndarray:
+        # Only when asked: the lines of a long log take more memory than its frames.
+        lines = islice(filter(None, text.splitlines()), len(frames))
+        return np.array([line.split(b" ", 2)[1].decode() for line in lines])
+
+    return frames, octets, channels
 
 
 def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:

@@ -1,6 +1,8 @@
 """Any bus behind the same four calls: wait, drain, send, close."""
 
+import os
 import select
+import socket
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Number of sent frames whose echo may still be outstanding; four corners send 16 in their busiest tick.
 _ECHOES = 256
+# Linux UAPI values that the socket module does not export.
+_IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 
 
 class Bus(Protocol):
@@ -187,6 +191,18 @@ def _open(chosen: dict[str, Any]) -> PythonCan:
     import can
 
     try:
-        return can.Bus(**chosen)
+        bus = can.Bus(**chosen)
+        if chosen["interface"] == "udp_multicast":
+            _hear_own_group(bus.fileno())
     except Exception as error:
         raise Unavailable(f"bus: {chosen['interface']} {chosen.get('channel')}: {error}") from None
+    return bus
+
+
+def _hear_own_group(descriptor: int) -> None:
+    """Keep a socket from receiving the groups that other programs on this machine have joined: all use the same port."""
+    with socket.socket(fileno=os.dup(descriptor)) as handle:
+        if handle.family == socket.AF_INET6:
+            handle.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
+        else:
+            handle.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)

@@ -39,7 +39,7 @@ from emb_daemon.wire.receive import RECEPTION
 _MARGIN_NS = 200_000
 #: Time that a frame may take from its stamp into the queue before the loop treats it as missing. The loop waits for so long,
 #: because a replay of the recorded bus knows only the stamp and must decide the same.
-_QUEUED_NS = 1_000_000
+QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are estimated in one tick.
 _TOGETHER_NS = 400_000
 #: Time for which a disturbance of bus or loop is reported with the estimates.
@@ -236,7 +236,7 @@ class Daemon:
             if remaining > 0:
                 time.sleep(1e-9 * remaining)
             else:
-                self._bus.wait(1e-9 * _QUEUED_NS)
+                self._bus.wait(1e-9 * QUEUED_NS)
             now = time.monotonic_ns()
             self._count(now, pacer)
             self.tick(now, pacer)
@@ -260,7 +260,7 @@ class Daemon:
     def tick(self, now_ns: int, pacer: Pacer) -> None:
         """Take everything that has arrived, estimate, and send."""
         pipeline, frames, start = self.pipeline, self._bus.drain(), 0
-        heard_ns = int(frames["time_ns"][-1]) if self._bus.full else now_ns - _QUEUED_NS
+        heard_ns = int(frames["time_ns"][-1]) if self._bus.full else now_ns - QUEUED_NS
         while True:
             start, count = pipeline.collect(frames, start, predictions=False)
             if start >= len(frames):

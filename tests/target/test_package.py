@@ -33,11 +33,13 @@ from emb_daemon.calibration.parameters import CLEARANCE, value_of
 pytestmark = pytest.mark.target("package")
 
 CONFIG, CALIBRATION = Path("/etc/emb_daemon/emb.yaml"), Path("/etc/emb_daemon/calibration.yaml")
-STATE = Path("/var/lib/emb_daemon")
+HOME, STATE = Path("/opt/emb_daemon"), Path("/var/lib/emb_daemon")
 # What dpkg, systemd and the journal keep of anything that was ever there.
 KEPT_BY_OTHERS = ("/var/lib/dpkg", "/var/log", "/var/cache/apt", "/var/lib/apt", "/var/lib/systemd", "/var/tmp")
 READY_S = 60  # 4 to 6 s seen
 MAXIMAL_EXPOSURE = 1.0
+#: Of the daemon with four corners, and of what is installed.
+MAXIMAL_MIB, MAXIMAL_MB = 80, 120
 
 
 def files_there() -> set[str]:
@@ -112,6 +114,10 @@ def test_install_configure_run_upgrade_remove_purge(
         int(line.split()[1]) for line in Path(f"/proc/{main_pid()}/status").read_text().splitlines() if "VmRSS" in line
     )
     print(f"{resident / 1024:.1f} MiB resident")
+    assert resident <= 1024 * MAXIMAL_MIB
+    installed = sum(path.lstat().st_size for path in HOME.rglob("*")) / 1e6
+    print(f"{installed:.0f} MB installed")
+    assert installed <= MAXIMAL_MB
 
     with playing(rig_log, "-l", "i"):
         wait_for_forces(record, timeout_s=30)
@@ -131,7 +137,7 @@ def test_install_configure_run_upgrade_remove_purge(
     assert CHANNEL in CONFIG.read_text() and "later version" not in CONFIG.read_text()
 
     apt_get("remove", "emb-daemon")
-    assert prop("ActiveState") == "inactive" and not Path("/opt/emb_daemon").exists()
+    assert prop("ActiveState") == "inactive" and not HOME.exists()
     assert (STATE / "adaptation-FR.json").read_bytes() == accepted and CHANNEL in CONFIG.read_text()
 
     apt_get("purge", "emb-daemon")
