@@ -4,6 +4,7 @@ needs to be in step."""
 import os
 import subprocess
 import sys
+import threading
 import time
 from functools import cache, partial
 from pathlib import Path
@@ -198,6 +199,10 @@ def test_what_stands_on_the_wire():
     assert (thermocouple["Set"], thermocouple["Freshness"]) == (1, 1)
     assert [signals["Freshness"] for name, signals in decoded[1:257] if name == "EMB_FL_Auth"] == list(range(256))
     assert decoded[257][1]["ResetCounter"] == 2
+    announced = [wirekit.decode(frame)[1] for frame in frames[frames["can_id"] == FRESHNESS]]
+    expected = [(number % 15, 0, 1, number) for number in range(1, len(announced) + 1)]
+    names = ("Counter", "Status", "TripCounter", "ResetCounter")
+    assert [tuple(signals[name] for name in names) for signals in announced] == expected
     reset, sets = 1, {0: [0x100, 0x110], 1: [0x120], FRESHNESS_SET: [FRESHNESS]}
     for index in np.flatnonzero(frames["can_id"] == AUTH):
         signals = wirekit.decode(frames[index])[1]
@@ -484,6 +489,23 @@ class TestFreshnessFile:
         authentication._writer.join()
         assert FreshnessFile(tmp_path).load().heard["EMB_FL_Auth"][0] == 1
 
+    def test_one_thread_at_a_time_stores(self, tmp_path, monkeypatch):
+        """And none where logs are read; what the first had not heard the last one stores."""
+        authentication, held, stored = opened(tmp_path), threading.Event(), []
+        monkeypatch.setattr(authentication._file, "keep", lambda kept: (held.wait(20.0), stored.append(kept)))
+        frames = signed()
+        authentication.verify(frames[:2000])
+        authentication.keep()
+        authentication.verify(frames[2000:])
+        authentication.keep()
+        held.set()
+        authentication.close()
+        assert [kept.heard["EMB_FL_Auth"] for kept in stored] == [(1, 2), authentication._verifier.last()["EMB_FL_Auth"]]
+        reading = Authentication(RECEIVED, SENT, KEYS, Freshness(trip=1))
+        reading.verify(frames)
+        reading.close()
+        assert reading._writer is None
+
     def test_a_damaged_file_is_set_aside(self, tmp_path, caplog):
         FreshnessFile(tmp_path).path.write_text("{")
         assert FreshnessFile(tmp_path).begin_trip().trip == 1
@@ -612,6 +634,22 @@ class TestConfiguration:
         (tmp_path / "other.dbc").write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=r"VEH_Freshness.TripCounter: expected 24 bits from bit 16"):
             load_links(tmp_path / "other.dbc", ("FL",))
+
+    def test_a_dbc_without_a_force_sensor_has_one_set_less(self, tmp_path):
+        text = resource("dbc/emb.dbc").read_text(encoding="utf-8").replace("_ForceSensor", "_Other")
+        (tmp_path / "other.dbc").write_text(text, encoding="utf-8")
+        (corner, vehicle), _ = load_links(tmp_path / "other.dbc", ("FL",))
+        assert (len(RECEIVED[0].sets), corner.sets, vehicle) == (3, RECEIVED[0].sets[:2], RECEIVED[1])
+
+    def test_the_daemon_begins_a_trip_and_knows_which_corners_lack_a_key(self, tmp_path, caplog):
+        """The vehicle's key concerns no corner alone."""
+        lines = "".join(f"{name} {key.hex()}\n" for name, key in KEYS.items() if name == "EMB_FL_EstimateAuth")
+        TestKeys().written(tmp_path, lines)
+        setup, bus = Setup(configured(tmp_path, "secoc: {keys: keys}\n")), SimpleNamespace(close=lambda: None)
+        secured_bus, keyless = secured.secure(bus, setup, tmp_path / "state")
+        assert keyless == {"FL"} and "no key EMB_FL_Auth" in caplog.text and "no key VEH_Auth" in caplog.text
+        secured_bus.close()
+        assert FreshnessFile(tmp_path / "state").load().trip == 1
 
     def test_freshness_needs_a_state_directory(self, tmp_path):
         TestKeys().written(tmp_path, TestKeys.GOOD)
