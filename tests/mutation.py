@@ -1,9 +1,9 @@
 """Mutation testing: does a test fail when one operator, comparison or constant of a kernel is changed?
 
 Run as ``python tests/mutation.py [COUNT] [SEED] [PART]``. COUNT mutants (60), of modules whose path contains PART (all), are
-drawn from E2E check, authentication, reception, plausibility, fusion, monitor, state files and runtime; each is built into a
-copy of the package, on which the tests that hold these run as plain Python until the first fails. Survivors are printed with
-their line.
+drawn from E2E check, authentication, reception, the filter, plausibility, monitor, training, discovery, state files and
+runtime; each is built into a copy of the package, on which the tests that hold these run as plain Python until the first
+fails. Survivors are printed with their line.
 """
 
 import ast
@@ -27,6 +27,10 @@ _KEPT = [
     "tests/test_snapshots.py::test_what_is_no_file_holds_nobody_up",
     "tests/test_snapshots.py::test_a_file_that_cannot_be_set_aside_stops_nothing",
     "tests/test_snapshots.py::test_a_file_of_another_format_is_set_aside",
+    "tests/test_snapshots.py::test_a_state_directory_is_one_daemons",
+    "tests/test_snapshots.py::test_what_a_killed_writer_left_goes_after_an_hour_and_not_before",
+    "tests/test_adapt.py::test_history_is_bounded_and_a_rejection_changes_nothing_in_use",
+    "tests/test_training_rules.py::test_values_of_an_accepted_training_alone_are_kept",
 ]
 _RUNTIME = [
     "tests/test_faults_loop.py",
@@ -50,11 +54,13 @@ _RUNTIME = [
         )
     ),
 ]
+_CMAC = ["tests/test_secoc.py::test_vectors_of_rfc_4493", "tests/test_secoc.py::test_any_message_has_the_cmac_of_the_rfc"]
 _SECOC = [
     f"tests/test_secoc.py::{name}"
     for name in (
         "test_vectors_of_rfc_4493",
         "test_check_value_of_the_documentation",
+        "test_authenticator_and_its_place_are_those_of_cantools",
         "test_what_stands_on_the_wire",
         "test_after_lost_authentications_the_next_is_right",
         "test_a_lost_freshness_frame_costs_nothing",
@@ -66,8 +72,39 @@ _SECOC = [
         "test_who_is_not_in_step_or_has_no_key_believes_nothing",
         "test_a_flood_of_authentication_frames_costs_a_bounded_number_of_tries",
         "test_frames_of_other_kinds_pass_to_be_refused_for_that",
+        "test_more_than_eight_frames_that_wait_are_refused_the_oldest_first",
+        "test_the_last_set_comes_no_second_time",
         "TestFreshnessFile",
+        "TestConfiguration",
         "TestKeys",
+    )
+]
+#: Those that follow no drive of minutes.
+_HYPOTHESES = "not (attributed or that_closes or drifts_takes or lubricant or fades or nothing_has or first_stroke or their_first or noisy)"
+_TRAINING = ["tests/test_training_rules.py", "tests/test_adaptation.py"]
+_EVIDENCE = [
+    f"tests/test_diagnose.py::{name}"
+    for name in (
+        "test_left_out_error_is_that_of_fits_without_the_episode",
+        "test_one_episode_proves_nothing",
+        "test_a_regressor_that_nuisances_span_is_not_credited",
+        "test_means_lose_nothing_that_lasts_and_cross_no_episode",
+        "test_a_true_effect_is_seen_with_its_size_and_sigma",
+        "test_autocorrelated_noise_is_no_effect",
+        "test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut",
+        "test_a_hold_is_one_episode_however_long",
+        "test_holds_whose_way_was_not_recorded_are_several_episodes",
+    )
+]
+_COORDINATES = [
+    f"tests/test_diagnose.py::{name}"
+    for name in (
+        "test_coordinates_at_their_start_are_the_calibration",
+        "test_a_coordinate_moves_its_keys_and_nothing_else",
+        "test_no_step_of_a_fit_leaves_what_a_calibration_may_say",
+        "test_zero_is_a_start_like_any_other",
+        "test_what_ends_at_the_bound_of_the_search_is_known_no_better_than_it_moved",
+        "test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves",
     )
 ]
 SCOPE = {
@@ -76,13 +113,23 @@ SCOPE = {
         "tests/test_wire.py",
         "tests/test_hostile.py::test_a_sender_that_was_held_up_may_catch_up",
         "tests/test_hostile.py::test_spoofed_frames_with_the_next_counter_come_too_early",
+        "tests/test_hostile.py::test_a_sender_whose_clock_runs_slower_is_followed",
     ],
+    "emb_daemon/wire/cmac.py": _CMAC,
     "emb_daemon/wire/secoc.py": _SECOC,
     "emb_daemon/wire/keys.py": _SECOC,
     "emb_daemon/runtime/secured.py": _SECOC,
     "emb_daemon/models/plausibility.py": ["tests/test_plausibility_kernels.py"],
     "emb_daemon/models/fusion.py": ["tests/test_kernels.py"],
     "emb_daemon/estimator/monitor.py": ["tests/test_monitor_bounds.py"],
+    "emb_daemon/estimator/hypotheses.py": ["tests/test_hypotheses.py", "-k", _HYPOTHESES],
+    "emb_daemon/estimator/status.py": ["tests/test_status.py"],
+    "emb_daemon/estimator/step.py": ["tests/test_status.py", "tests/test_step.py"],
+    "emb_daemon/adapt/training.py": _TRAINING,
+    "emb_daemon/adapt/adaptation.py": _TRAINING,
+    "emb_daemon/diagnose/coordinates.py": _COORDINATES,
+    "emb_daemon/diagnose/episodes.py": _EVIDENCE,
+    "emb_daemon/diagnose/evidence.py": _EVIDENCE,
     "emb_daemon/bounded.py": _KEPT,
     "emb_daemon/adapt/files.py": _KEPT,
     "emb_daemon/adapt/memory.py": _KEPT,
