@@ -1,5 +1,6 @@
 """What ends a training, each reason alone, and that a rejected one changes nothing: the rules, without a brake."""
 
+import adaptkit
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt import training
 from emb_daemon.adapt.learned import Evaluation
 from emb_daemon.adapt.memory import entry_of
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.hypotheses import DRIFT
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
 from emb_daemon.models.fusion import (
@@ -128,7 +130,7 @@ def follow(a, estimate, limits, state=None, parameters=None, sample=None):
     state = new_state()[0] if state is None else state
     parameters = np.zeros(1, PARAMETERS)[0] if parameters is None else parameters
     sample = np.zeros(1, SAMPLE)[0] if sample is None else sample
-    state["factor"] = 1.0
+    state["factor"] = state["factor"] or 1.0
     training._follow(a, state, parameters, limits, sample, estimate)
 
 
@@ -146,12 +148,13 @@ def test_what_the_temperature_may_be_wrong_by_now_and_before_is_in_the_factors_s
     parameters, state = np.zeros(1, PARAMETERS)[0], new_state()[0]
     estimate["torque_force"] = np.nan
     state["temperature_sigma"], state["history_sigma"], parameters["thermal"]["sigma"] = 3.0, 12.0, 4.0
+    state["factor"] = 0.8
     parts = []
     for now, history in ((1e-3, 0.0), (0.0, 2e-3), (1e-3, 2e-3)):
         parameters["thermal"]["softening"], parameters["thermal"]["softening_history"] = now, history
         follow(a, estimate, limits, state, parameters)
         parts.append(float(a["factor_sigma"]))
-    np.testing.assert_allclose(parts, [5e-3, 2e-3 * np.hypot(12.0, 4.0), 5e-3 + 2e-3 * np.hypot(12.0, 4.0)])
+    np.testing.assert_allclose(0.8 * np.array(parts), [5e-3, 2e-3 * np.hypot(12.0, 4.0), 5e-3 + 2e-3 * np.hypot(12.0, 4.0)])
 
 
 def observe(parked, others_hold=True):
@@ -201,6 +204,112 @@ def test_values_of_an_accepted_training_alone_are_kept(outcome):
     accepted = outcome == r.ACCEPTED
     assert (entry.values, entry.sigmas) == (({"a": 1.0}, {"a": 0.1}) if accepted else ({}, {}))
     assert entry.evidence == {"b": None} and entry.pad_rise_K is None
+
+
+@pytest.mark.parametrize(("still_time", "phase"), [(0.0, r.WATCHING), (9.0, r.ASKING)])
+def test_a_training_begins_with_nothing_of_the_one_before(parked, still_time, phase):
+    a, m, estimate, limits = parked
+    for name, value in (("phase", r.IDLE), ("asked", phase == r.WATCHING), ("started", True), ("still_angle", 0.5)):
+        a[name] = value
+    a["phase_time"], a["tail_time"], a["was_low"], a["was_high"], a["rows"] = 7.0, 0.5, True, True, 5
+    a["still_time"], a["parked_time"], estimate["torque_force"], limits["high_force"] = still_time, 60.0, np.nan, 1.0
+    # Turned by more than counts as motion, or not at all.
+    m["dt"], m["angle"], limits["enabled"] = 0.004, 0.5 if still_time else 1.0, True
+    observe(parked)
+    assert (a["phase"], a["asked"]) == (phase, phase == r.ASKING)
+    assert [a[name] for name in ("phase_time", "tail_time", "was_low", "was_high", "rows")] == [0.0, 0.0, False, False, 0]
+
+
+def test_samples_of_a_tick_are_answered_until_a_training_ends_or_waits():
+    """Then its outcome is kept, or its evaluation begins, before the next sample."""
+    samples, estimates = np.zeros(3, SAMPLE), np.zeros(3, ESTIMATE)
+    samples["corner"], samples["has_status"], samples["park_brake"] = 1, True, c.PARK_APPLIED
+    for name in ("inner_backplate", "outer_backplate", "caliper", "ambient"):
+        samples[name] = 20.0
+    samples["has_thermocouple"] = samples["has_current"] = samples["has_wheel_speed"] = True
+    samples["vehicle_speed"][1], samples["dt"][1:] = 1.0, 0.004
+    adapters, limits = np.zeros(4, r.ADAPTER), np.zeros(4, r.LIMITS)
+    adapters["phase"][1], adapters["asked"][1] = r.ASKING, True
+    limits["enabled"], limits["estimated"] = True, [False, True, False, False]
+    limits["maximum_ambient"], limits["high_force"], limits["answer_time"] = 40.0, 1.0, 9.0
+    parameters = np.repeat(np.atleast_1d(to_parameters(adaptkit.shipped())), 4)
+    states, rows = new_state(4), np.zeros((4, 5), r.TRAINING)
+    arguments = (
+        states,
+        parameters,
+        parameters.copy(),
+        new_state(4),
+        np.zeros(4, r.REMEMBERED),
+        estimates,
+        adapters,
+        limits,
+        rows,
+    )
+    assert training.answer_adapting(samples, 0, 3, *arguments) == 2
+    assert adapters["ended"].tolist() == [False, True, False, False] and adapters["outcome"][1] == r.VEHICLE_MOVED
+    adapters["ended"] = False
+    assert training.answer_adapting(samples, 2, 3, *arguments) == 3
+    assert states["started"].tolist() == [False, True, False, False] and estimates["corner"].tolist() == [1, 1, 1]
+
+
+def test_a_released_park_brake_allows_another_training(parked):
+    """And whatever ends one begins the waiting anew."""
+    a, m, estimate, limits = parked
+    a["tried"], a["parked_time"], limits["enabled"], estimate["torque_force"] = True, 3.0, True, np.nan
+    m["vehicle_speed"], m["dt"] = 1.0, 0.004
+    observe(parked)
+    assert (a["phase"], a["tried"], a["ended"], a["parked_time"]) == (r.IDLE, True, True, 0.0)
+    m["park_brake"], a["ended"] = c.PARK_IN_TRANSITION, False
+    observe(parked)
+    assert not a["tried"] and not a["ended"], "there was none to end"
+
+
+def test_who_brakes_while_parked_waits_anew(parked):
+    a, m, estimate, limits = parked
+    limits["enabled"], limits["settling_time"], estimate["torque_force"] = True, 9.0, np.nan
+    a["phase"], a["asked"], a["started"], a["still_time"], m["dt"] = r.IDLE, False, True, 9.0, 0.5
+    for request, parked_s in ((0.0, 0.5), (0.0, 1.0), (1.0, 0.0), (0.0, 0.5)):
+        m["brake_request"] = request
+        observe(parked)
+        assert a["parked_time"] == parked_s and a["phase"] == r.IDLE
+
+
+@pytest.mark.parametrize(
+    ("phase", "result", "mode", "told"),
+    [
+        (r.IDLE, c.NO_RESULT, c.RUNNING, (0, 0, c.NO_RESULT, c.RUNNING)),
+        (r.IDLE, c.RESULT_ACCEPTED, c.RUNNING, (0, 100, c.RESULT_ACCEPTED, c.RUNNING)),
+        (r.IDLE, c.RESULT_REJECTED, c.RUNNING, (0, 0, c.RESULT_REJECTED, c.RUNNING)),
+        (r.ASKING, c.RESULT_ACCEPTED, c.RUNNING, (1, 50, c.NO_RESULT, c.ADAPTING)),
+        (r.WATCHING, c.NO_RESULT, c.DEGRADED, (0, 50, c.NO_RESULT, c.DEGRADED)),
+        (r.EVALUATING, c.NO_RESULT, c.RUNNING, (0, 95, c.NO_RESULT, c.ADAPTING)),
+    ],
+)
+def test_what_is_told_of_a_training(parked, phase, result, mode, told):
+    a, _, estimate, limits = parked
+    limits["enabled"], limits["high_force"], limits["settling_time"] = True, 1e4, 9.0
+    limits["longest_training"] = limits["answer_time"] = 1e9
+    a["phase"], a["result"], estimate["mode"], a["still_time"], a["force"], a["was_high"] = phase, result, mode, 1.0, 2e4, True
+    a["asked"], a["started"], estimate["torque_force"] = phase == r.ASKING, True, np.nan
+    observe(parked)
+    names = ("adapt_request", "adapt_progress", "adapt_result", "mode")
+    assert tuple(estimate[name] for name in names) == told
+
+
+def test_an_accepted_evaluation_takes_effect_with_what_came_since(parked):
+    """Parameters at once, the path models over the samples after the training, and a snapshot that belongs to both."""
+    p = to_parameters(adaptkit.shipped())
+    state, reached, parameters, learned = new_state()[0], new_state()[0], np.atleast_1d(p).copy(), p.copy()
+    learned["curve"][1] *= 1.1
+    a, rows = parked[0], np.zeros(6, r.TRAINING)
+    rows["dt"], rows["factor"], rows["angle"] = 0.004, 1.0, [99.0, 99.0, 8.0, 8.5, 9.0, 99.0]
+    reached["started"], reached["angle"], reached["contact_angle"], reached["past_contact"] = True, 7.5, 7.0, 0.5
+    a["phase"], a["evaluation"], a["evaluation_ready"], a["time_ns"] = r.EVALUATING, r.ACCEPTED, True, 12
+    a["training_rows"], a["rows"], a["contact_angle"], a["contact_sigma"] = 2, 5, 7.0, 0.01
+    training._conclude(a, state, parameters, learned, reached, rows)
+    assert parameters.tobytes() == learned.tobytes() and state["past_contact"] == pytest.approx(2.0)
+    assert (a["result"], a["outcome"], a["tried"], a["snapshot_wanted"]) == (c.RESULT_ACCEPTED, r.ACCEPTED, True, True)
+    assert a["snapshot_ns"] == 12
 
 
 def strokes(parked, *forces, dt=0.25):
@@ -268,13 +377,13 @@ def test_a_wheel_that_turns_is_a_car_that_moves(parked, speed, moved):
     assert training._obstacle(*parked, True) == (r.VEHICLE_MOVED if moved else r.ACCEPTED)
 
 
-def advance(parked, rows=None, dt=0.25):
+def advance(parked, rows=None, dt=0.25, remembered=None, force=0.0):
     a, m, _, limits = parked
     m["dt"] = dt
     state, parameters = new_state()[0], np.zeros(1, PARAMETERS)
-    state["factor"] = 1.0
+    state["factor"], state["effects"]["second_relaxation"]["force"] = 1.0, force
     rows = np.zeros(10, r.TRAINING) if rows is None else rows
-    remembered = np.zeros(1, r.REMEMBERED)
+    remembered = np.zeros(1, r.REMEMBERED) if remembered is None else remembered
     training._advance(a, state, parameters, parameters[0], new_state()[0], remembered, limits, rows, m)
     return rows
 
@@ -323,9 +432,11 @@ def test_what_a_training_collects_is_what_the_path_models_read(parked):
     shared = [name for name in r.TRAINING.names if name != "factor"]
     for number, name in enumerate(shared):
         m[name] = True if name.startswith("has_") else 2.0 + number
-    rows = advance(parked, dt=0.004)
+    remembered = np.zeros(1, r.REMEMBERED)
+    rows = advance(parked, None, 0.004, remembered, 3.0)
     assert all(rows[0][name] == m[name] for name in shared) and rows[0]["factor"] == 1.0
-    advance(parked, rows, dt=0.1)
+    advance(parked, rows, 0.1, remembered, 4.0)
+    assert remembered["second_relaxation"]["force"] == 3.0
     assert not rows[1]["has_current"] and rows[1]["angle"] == m["angle"] and a["rows"] == 2
 
 
