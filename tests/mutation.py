@@ -146,10 +146,11 @@ _SWAPPED = {
 
 
 def _sites(tree: ast.Module) -> list[tuple[ast.AST, int]]:
-    """Nodes inside functions that can be changed, with the index of the comparison."""
+    """Nodes inside functions that can be changed, with the index of the comparison. Their signatures, in decorators, matter only
+    where kernels are compiled ahead."""
     sites = []
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
-        for node in ast.walk(function):
+        for node in (part for statement in function.body for part in ast.walk(statement)):
             if isinstance(node, ast.BinOp | ast.AugAssign | ast.BoolOp) and type(node.op) in _SWAPPED:
                 sites.append((node, -1))
             elif isinstance(node, ast.Compare):

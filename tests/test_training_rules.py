@@ -390,7 +390,7 @@ def advance(parked, rows=None, dt=0.25, remembered=None, force=0.0):
 
 def test_who_does_not_answer_in_time_is_not_asked_again(parked):
     a, _, _, limits = parked
-    limits["answer_time"], a["still_time"] = 1.0, 9.0
+    limits["answer_time"], a["still_time"] = 1.0, 0.5
     for _ in range(4):
         advance(parked)
         assert (a["phase"], a["tried"], a["rows"]) == (r.ASKING, False, 0)
