@@ -96,17 +96,6 @@ _EVIDENCE = [
         "test_holds_whose_way_was_not_recorded_are_several_episodes",
     )
 ]
-_COORDINATES = [
-    f"tests/test_diagnose.py::{name}"
-    for name in (
-        "test_coordinates_at_their_start_are_the_calibration",
-        "test_a_coordinate_moves_its_keys_and_nothing_else",
-        "test_no_step_of_a_fit_leaves_what_a_calibration_may_say",
-        "test_zero_is_a_start_like_any_other",
-        "test_what_ends_at_the_bound_of_the_search_is_known_no_better_than_it_moved",
-        "test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves",
-    )
-]
 SCOPE = {
     "emb_daemon/wire/e2e.py": ["tests/test_wire.py"],
     "emb_daemon/wire/receive.py": [
@@ -127,7 +116,6 @@ SCOPE = {
     "emb_daemon/estimator/step.py": ["tests/test_status.py", "tests/test_step.py"],
     "emb_daemon/adapt/training.py": _TRAINING,
     "emb_daemon/adapt/adaptation.py": _TRAINING,
-    "emb_daemon/diagnose/coordinates.py": _COORDINATES,
     "emb_daemon/diagnose/episodes.py": _EVIDENCE,
     "emb_daemon/diagnose/evidence.py": _EVIDENCE,
     "emb_daemon/bounded.py": _KEPT,
@@ -146,8 +134,8 @@ _SWAPPED = {
 
 
 def _sites(tree: ast.Module) -> list[tuple[ast.AST, int]]:
-    """Nodes inside functions that can be changed, with the index of the comparison. Their signatures, in decorators, matter only
-    where kernels are compiled ahead."""
+    """Nodes inside functions that can be changed, with the index of the comparison. Decorators are left out: their signatures
+    matter only where kernels are compiled ahead."""
     sites = []
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         for node in (part for statement in function.body for part in ast.walk(statement)):
