@@ -85,6 +85,11 @@ _TRAINING = ["tests/test_training_rules.py", "tests/test_adaptation.py"]
 _EVIDENCE = [
     f"tests/test_diagnose.py::{name}"
     for name in (
+        "test_evidence_is_what_its_definition_gives",
+        "test_two_episodes_alone_prove_nothing_however_much_they_say",
+        "test_what_is_nothing_or_no_number_is_not_judged",
+        "test_a_column_that_is_nothing_leaves_the_others_alone",
+        "test_means_are_of_as_many_samples_as_asked_for",
         "test_left_out_error_is_that_of_fits_without_the_episode",
         "test_one_episode_proves_nothing",
         "test_a_regressor_that_nuisances_span_is_not_credited",
@@ -93,6 +98,9 @@ _EVIDENCE = [
         "test_autocorrelated_noise_is_no_effect",
         "test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut",
         "test_a_hold_is_one_episode_however_long",
+        "test_episodes_are_the_same_whenever_a_log_begins",
+        "test_a_short_log_is_cut_into_forty_pieces_and_no_shorter_than_half_a_second",
+        "test_a_pause_of_less_than_a_third_of_a_second_ends_no_application",
         "test_holds_whose_way_was_not_recorded_are_several_episodes",
     )
 ]
