@@ -424,6 +424,15 @@ def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
     )
 
 
+def test_heat_that_explains_a_share_of_the_torque_lets_the_torque_constant_be_as_far_off(p, opened):
+    """Both lags, whichever way they go: what a brake can be at all is that much wider."""
+    s, prior = opened[0], opened[0]["covariance"][GAIN, GAIN]
+    s["error"][[FADE, HOUSING]], s["winding"], s["housing"] = (0.2, -0.3), 0.5, 0.4
+    open_all(s, p)
+    allowed = 0.05 + 0.2 * 0.5 + 0.3 * 0.4
+    assert s["alternatives"]["covariance"][DISC_GROWTH, GAIN, GAIN] == pytest.approx(1.0 / (1.0 / prior + 1.0 / allowed**2))
+
+
 def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):
     s = opened[0]
     s["alternatives"]["log_odds"][TORQUE_JUMP] = 50.0
@@ -499,6 +508,15 @@ def test_pads_that_are_knocked_back_are_expected_to_be_again(p, opened):
     for _ in range(500):
         _stop(s, p, jumps=False)
     assert odds[STIFFNESS_JUMP] > PRIOR_ODDS and _share(odds[STIFFNESS_JUMP]) < 0.02
+
+
+def test_what_is_expected_before_the_first_jump_is_what_is_expected_of_any_brake(p, opened):
+    """The rare event that was not seen yet counts like sixteen stops without it."""
+    s = opened[0]
+    for jumps, stops, odds in ((1e-12, 0.0, PRIOR_ODDS), (1.0, 0.0, np.log(1.04 / 14.96)), (20.0, 1.0, 0.0)):
+        s["jumps"], s["stops"] = jumps, stops
+        open_all(s, p)
+        assert s["alternatives"]["least"][STIFFNESS_JUMP] == pytest.approx(odds, abs=0.02)
 
 
 def test_a_change_that_is_certain_is_not_doubted_until_the_release(p, opened):

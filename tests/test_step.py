@@ -7,7 +7,8 @@ import pytest
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import predict, step
-from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
+from emb_daemon.estimator.unknown import add_softening, set_priors
+from emb_daemon.models.fusion import CONTACT, SCALE, STATES, maximum_likelihood
 from emb_daemon.models.gear import steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.offline import estimate
@@ -46,6 +47,17 @@ def test_a_brake_that_is_held_as_known_has_no_other_stiffness(p):
     state, out = new_state()[0], np.zeros(1, ESTIMATE)[0]
     step(state, p, row(), out)
     assert state["covariance"][SCALE, SCALE] == state["covariance"][CONTACT, CONTACT] == 0.0
+
+
+@pytest.mark.parametrize("temperature", [-25.0, 20.0])
+def test_what_is_not_known_of_cold_pads_softening_is_in_their_stiffness(p, temperature):
+    state, out, expected = new_state()[0], np.zeros(1, ESTIMATE)[0], np.zeros((STATES, STATES))
+    step(state, p, row(temperature=temperature), out)
+    set_priors(expected, p)
+    known = expected[SCALE, SCALE]
+    add_softening(expected, p, temperature - p["thermal"]["reference"], state["temperature_sigma"])
+    assert state["covariance"][SCALE, SCALE] == pytest.approx(expected[SCALE, SCALE], rel=1e-3)
+    assert (expected[SCALE, SCALE] > 1.2 * known) == (temperature < 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +159,36 @@ def test_a_cams_contact_is_told_as_the_resolver_reads_it(shipped_setup):
     state["factor"] = state["scale"] = 1.0
     predict(state, p, 0.004, out)
     assert out["sigma"] == pytest.approx(reached - start)
+
+
+@pytest.mark.parametrize(("names", "source"), [(("angle", "speed"), r.TORQUE_ONLY), (("current_q",), r.STIFFNESS_ONLY)])
+def test_a_sensor_that_repeats_while_the_motor_must_turn_is_not_used(p, names, source):
+    up = brake.clamp(p, 14.0, 0.6)
+    rows, _ = brake.samples(p, np.concatenate([up, up[::-1]]))
+    rows = brake.noisy(rows, p)
+    frozen = 130
+    for name in names:
+        rows[name][frozen:] = rows[name][frozen]
+    estimates = estimate(rows, p)
+    stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
+    assert frozen < stuck[0] < frozen + 60 and np.all(estimates["source"][stuck[0] : stuck[0] + 40] == source)
+
+
+def test_an_angle_that_jumps_moves_the_contact_with_it(p):
+    """What no motor can do in a cycle the resolver's zero has done: the force stays, and no torque is made of it."""
+    rows, force = brake.samples(p, np.concatenate([brake.clamp(p, 12.0, 0.6), np.full(60, p["clearance"] + 12.0)]))
+    rows["angle"][180:] += 30.0
+    estimates = estimate(rows, p)
+    assert estimates["reasons"][180] & r.OUT_OF_RANGE and not np.any(estimates["reasons"][190:] & r.OUT_OF_RANGE)
+    assert np.isnan(estimates["torque_force"][180]) and estimates["contact_angle"][-1] == pytest.approx(
+        p["clearance"] + 30, abs=0.5
+    )
+    assert np.all(np.abs(estimates["force"] - force)[180:] < 3.0 * estimates["sigma"][180:])
+
+
+def test_a_motor_that_needs_torque_while_it_stands_may_hold_a_clamped_brake(p):
+    """The contact is then unknown, and the torque alone says what the force is."""
+    rows = np.array([row(3.0, 0.004 * (number > 0), 0.0, 6.0) for number in range(60)])
+    estimates = estimate(rows, p)
+    assert np.all(estimates["source"][30:] == r.TORQUE_ONLY) and np.all(estimates["reasons"][30:] & r.CONTACT_UNCERTAIN)
+    assert np.all(estimates["sigma"][30:] > 1000.0)
