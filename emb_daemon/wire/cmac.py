@@ -174,14 +174,16 @@ def _substitutes() -> list[int]:
     return table
 
 
+_TABLE = _substitutes()
+
+
 def new_key(key: bytes, record: np.void) -> None:
     """Fill a KEY record, within an array, from the 16 bytes of an AES-128 key."""
-    table, constant = _substitutes(), 1
-    expanded = list(key)
+    expanded, constant = list(key), 1
     while len(expanded) < 16 * 11:
         last = expanded[-4:]
         if len(expanded) % 16 == 0:
-            last = [table[byte] for byte in last[1:] + last[:1]]
+            last = [_TABLE[byte] for byte in last[1:] + last[:1]]
             last[0] ^= constant
             constant = constant << 1 ^ (0x11B if constant & 0x80 else 0)
         expanded += [a ^ b for a, b in zip(expanded[-16:-12], last, strict=True)]
