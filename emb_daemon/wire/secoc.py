@@ -197,9 +197,13 @@ class Signer:
         links: those of which the process is the sender; messages of a link without a key are sent without authentication.
         keys: of 16 bytes, by the links' names.
         trip: trip counter of the process, one more than at its last start.
+
+    Attributes:
+        links: their LINK records, shape (links,).
     """
 
     def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], trip: int):
+        self.links: np.ndarray
         self.links, self._places = _new_links(links, keys)
         self.links["trip"] = trip
         self._frames = np.zeros(64, FRAME)
@@ -274,11 +278,15 @@ class Verifier:
         links: those of which the process is the receiver; every frame of a link without a key is refused.
         keys: of 16 bytes, by the links' names.
         last: (trip, reset) by the links' names: the last ones received, so that only later freshness values are accepted.
+
+    Attributes:
+        links: their LINK records, shape (links,).
     """
 
     def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], last: Mapping[str, tuple[int, int]]):
         links = list(links)
         self._names = [link.name for link in links]
+        self.links: np.ndarray
         self.links, self._places = _new_links(links, keys)
         for name, record in zip(self._names, self.links, strict=True):
             record["trip"], record["reset"] = last.get(name, (0, 0))
