@@ -37,7 +37,7 @@ _PIECES = [piece.replace(b"_", b" ") for piece in _PIECES.split(b" ")] + [b" ", 
 
 
 def edited(good: bytes, draw: random.Random) -> bytes:
-    """A good file, one to four digits or pieces of which are replaced: by random bytes, what means something, or other pieces."""
+    """A good file with one to four digits or pieces replaced: by random bytes, what means something, or other pieces."""
     content = bytearray(good)
     for _ in range(draw.randint(1, 4)):
         at, other = draw.randrange(len(good)), draw.randrange(len(good))
