@@ -81,7 +81,6 @@ def run(good: bytes, name: str, read: Callable[[Path], None], count: int, seed: 
                 print(content, file=sys.stderr)
                 raise
             longest = max(longest, time.perf_counter() - began)
-    assert longest < _LONGEST_S, longest
     return taken, longest
 
 
@@ -94,6 +93,7 @@ def main() -> None:
     run(*TARGETS[target], 10, 0)
     taken, longest = run(*TARGETS[target], int(count), int(seed))
     print(f"{target}, seed {seed}: {count} files, {taken} read, the others refused; the longest took {longest:.2f} s")
+    assert longest < _LONGEST_S
 
 
 if __name__ == "__main__":
