@@ -291,6 +291,13 @@ def test_a_hold_is_one_episode_however_long():
     assert len(set(number[time > 60.1])) >= 4
 
 
+def test_a_hold_begins_when_the_motor_has_stopped():
+    """Forty pieces of a log are wanted, a second each: one of them would end a tenth of a second into the hold."""
+    time = np.arange(0.0, 40.0, 0.01)
+    number = episodes(time, np.full(len(time), 3000.0), np.where(time < 7.9, 5.0 + 7.9 - time, 5.0))
+    assert len(set(number[time > 7.91])) == 1 and number[time < 7.5][-1] > 5
+
+
 def test_holds_whose_way_was_not_recorded_are_several_episodes():
     """A bench that keeps the settled part of each load step alone: between two parts the gear was wound up."""
     hold = np.arange(0.0, 8.0, 0.004)

@@ -473,7 +473,7 @@ def test_what_spoke_for_a_drift_is_remembered_and_never_makes_it_the_likelier(p,
 def test_two_that_are_alike_wait_for_more_strokes(p, opened):
     """The stronger is taken after twenty seconds, even if the other explains almost as much."""
     s = opened[0]
-    s["alternatives"]["log_odds"][:2] = 12.0, 10.0
+    s["alternatives"]["log_odds"][:2] = 12.0, 11.5
     assert not settle(s, p, True, 0.004)
     s["alternatives"]["age_s"] = 20.1
     assert settle(s, p, True, 0.004)

@@ -83,6 +83,12 @@ def test_any_message_has_the_cmac_of_the_rfc(key, message):
     assert code_of(key, message) == plain_cmac(key, message)
 
 
+def test_every_length_has_the_cmac_of_the_rfc():
+    for length in range(66):
+        key, message = bytes(range(length, length + 16)), bytes(range(100, 100 + length))
+        assert code_of(key, message) == plain_cmac(key, message), length
+
+
 def code_of(key: bytes, message: bytes) -> bytes:
     keys, code = np.zeros(1, KEY), np.zeros(16, np.uint8)
     new_key(key, keys[0])
