@@ -58,7 +58,7 @@ SOAK_SECONDS ?= 1800
 soak: $(READY)
 	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
 
-# Mutants of E2E check, reception, plausibility, fusion, monitor, state files and runtime, drawn with a fixed seed.
+# Mutants of wire, authentication, filter, plausibility, monitor, training, discovery, state files and runtime, drawn with a fixed seed.
 MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)

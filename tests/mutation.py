@@ -80,7 +80,7 @@ _SECOC = [
     )
 ]
 #: Those that follow no drive of minutes.
-_HYPOTHESES = "not (attributed or closes or drifts_takes or lubricant or fades or nothing_has or first_st or noisy)"
+_HYPOTHESES = "not (attributed or closes or drifts_takes or lubricant or fades or proven_where or first_st or noisy)"
 _TRAINING = ["tests/test_training_rules.py", "tests/test_adaptation.py"]
 _EVIDENCE = [
     f"tests/test_diagnose.py::{name}"
