@@ -58,7 +58,7 @@ SOAK_SECONDS ?= 1800
 soak: $(READY)
 	$(VENV)/bin/python tests/soak.py $(SOAK_SECONDS)
 
-# Mutants of E2E check, reception, plausibility, fusion, monitor, state files and runtime, drawn with a fixed seed.
+# Mutants of wire, authentication, filter, plausibility, monitor, training, discovery, state files and runtime, drawn with a fixed seed.
 MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
@@ -80,12 +80,11 @@ $(SUPPLY)/pip-audit:
 
 sbom: $(SUPPLY)/pip-audit
 	mkdir -p dist
-	cat requirements-box.lock requirements-secoc.lock | $(SUPPLY)/cyclonedx-py requirements --pyproject pyproject.toml --short-PURLs \
-		--output-reproducible --of JSON --output-file dist/emb_daemon.cdx.json -
+	$(SUPPLY)/cyclonedx-py requirements --pyproject pyproject.toml --short-PURLs \
+		--output-reproducible --of JSON --output-file dist/emb_daemon.cdx.json requirements-box.lock
 
 audit: $(SUPPLY)/pip-audit
 	$(SUPPLY)/pip-audit --strict --disable-pip --require-hashes -r requirements-box.lock
-	$(SUPPLY)/pip-audit --strict --disable-pip --require-hashes -r requirements-secoc.lock
 
 # A simulated fleet of 200 units for 30 days, three batches and ten units of which have secrets: are they found, and no others?
 FLEET_SEED ?= 1
@@ -117,7 +116,7 @@ format: $(READY)
 
 # Needs uv; versions are chosen for every supported Python at once.
 lock:
-	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra formats --extra secoc --extra docs --extra fleet --extra live --extra workshop --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra offline --extra mf4 --extra formats --extra docs --extra fleet --extra live --extra workshop --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-annotate --quiet --output-file requirements.lock
 	$(VENV)/bin/pip install --quiet --require-hashes -r requirements.lock
 	$(VENV)/bin/python tools/lock_box.py

@@ -30,7 +30,6 @@ from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_NS, FAULT
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
-from emb_daemon.wire.keys import cmac
 from emb_daemon.wire.layout import CORNERS, MOTOR_ANGLE, RESOLVER, default_layout, pack, unpack
 from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
 from emb_daemon.wire.secoc import FRESHNESS_SET, Signer, Verifier, load_links
@@ -116,16 +115,16 @@ def flood(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return noise
 
 
-def keys_of(seed: int):
-    """CMACs of all links by name, and one of an unknown key."""
+def keys_of(seed: int) -> tuple[dict[str, bytes], bytes]:
+    """Keys of all links by name, and one that no receiver knows."""
     rng = np.random.default_rng((seed, 7))
-    macs = {link.name: cmac(rng.bytes(16)) for link in (*_RECEIVED, *_SENT)}
-    return macs, cmac(rng.bytes(16))
+    keys = {link.name: rng.bytes(16) for link in (*_RECEIVED, *_SENT)}
+    return keys, rng.bytes(16)
 
 
-def signed(frames: np.ndarray, macs) -> np.ndarray:
+def signed(frames: np.ndarray, keys) -> np.ndarray:
     """A drive as its senders authenticate it."""
-    return Signer(_RECEIVED, macs, 1).sign(frames).copy()
+    return Signer(_RECEIVED, keys, 1).sign(frames).copy()
 
 
 @njit
@@ -149,7 +148,7 @@ def _with_code(frames: np.ndarray, code: np.ndarray) -> np.ndarray:
     return frames
 
 
-def _forged_sets(genuine, rng, _macs):
+def _forged_sets(genuine, rng, _keys):
     """Forged values, and a guessed authenticator under the expected freshness value."""
     forged = _early(genuine, rng)
     named = np.isin(forged["can_id"], [link.authentication_id for link in _RECEIVED])
@@ -158,22 +157,22 @@ def _forged_sets(genuine, rng, _macs):
     return forged
 
 
-def _guesses(genuine, rng, _macs):
+def _guesses(genuine, rng, _keys):
     """Genuine values, and many guesses of their authenticator."""
     guesses = np.repeat(_early(genuine[genuine["can_id"] == _AUTH], rng), 4)
     return _with_code(guesses, rng.integers(0, 2**36, len(guesses)))
 
 
-def _played_back(genuine, rng, _macs):
+def _played_back(genuine, rng, _keys):
     """All frames of some turns of the counter ago, authentication included."""
     again = _early(genuine, rng)
     again["time_ns"] += rng.integers(1, 100) * COUNTER_MODULO * CYCLE_NS
     return again
 
 
-def _played_back_as_expected(genuine, rng, macs):
+def _played_back_as_expected(genuine, rng, keys):
     """The same, with the message counter that is expected now."""
-    again = _played_back(genuine, rng, macs)
+    again = _played_back(genuine, rng, keys)
     now, named = genuine[genuine["can_id"] == _AUTH], again["can_id"] == _AUTH
     place = np.searchsorted(now["time_ns"], again["time_ns"][named]).clip(0, len(now) - 1)
     message = np.uint64(0xFF << 20)
@@ -181,7 +180,7 @@ def _played_back_as_expected(genuine, rng, macs):
     return again
 
 
-def _freshness_of_the_future(genuine, rng, _macs):
+def _freshness_of_the_future(genuine, rng, _keys):
     """Trip and reset counters far ahead, after which all genuine frames would count as old, each with a guessed
     authenticator."""
     forged = _early(genuine[genuine["can_id"] == _AUTH], rng)
@@ -195,9 +194,9 @@ def _freshness_of_the_future(genuine, rng, _macs):
     return forged
 
 
-def _another_key(genuine, rng, macs):
+def _another_key(genuine, rng, keys):
     """Frames that a sender with another key has authenticated."""
-    theirs = Signer(_RECEIVED, dict.fromkeys(macs, macs["nobody"]), 1).sign(genuine[_of_drive(genuine)])
+    theirs = Signer(_RECEIVED, dict.fromkeys(keys, keys["nobody"]), 1).sign(genuine[_of_drive(genuine)])
     return _early(theirs.copy(), rng)
 
 
@@ -216,33 +215,33 @@ def _of_drive(frames: np.ndarray) -> np.ndarray:
     return ~np.isin(frames["can_id"], [can_id for link in _RECEIVED for can_id in (link.authentication_id, link.freshness_id)])
 
 
-def forged(name: str, genuine: np.ndarray, rng: np.random.Generator, macs) -> np.ndarray:
+def forged(name: str, genuine: np.ndarray, rng: np.random.Generator, keys) -> np.ndarray:
     """Frames of one of the six attackers on the bus whose authentic frames are ``genuine``, rightly E2E protected."""
-    frames = FORGERIES[name](genuine, rng, macs)
+    frames = FORGERIES[name](genuine, rng, keys)
     _protect_anew(frames)
     return frames[(frames["time_ns"] > _START_NS) & (frames["time_ns"] < genuine["time_ns"][-1])]
 
 
-def believed(genuine: np.ndarray, foreign: np.ndarray, macs) -> tuple[np.ndarray, int, int]:
+def believed(genuine: np.ndarray, foreign: np.ndarray, keys) -> tuple[np.ndarray, int, int]:
     """What `Verifier` gives of both together; how many frames of ``genuine`` are missing, and how many others are taken."""
     mixed = np.concatenate([foreign, genuine])
-    heard = Verifier(_RECEIVED, macs, {}).verify(mixed[np.argsort(mixed["time_ns"], kind="stable")])
+    heard = Verifier(_RECEIVED, keys, {}).verify(mixed[np.argsort(mixed["time_ns"], kind="stable")])
     taken, expected = heard[heard["flags"] == 0], genuine[_of_drive(genuine)]
     theirs, ours = (Counter(zip(part["can_id"].tolist(), part["data"].tolist(), strict=True)) for part in (taken, expected))
     return heard, (ours - theirs).total(), (theirs - ours).total()
 
 
 def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
-    macs, nobody = keys_of(seed)
-    genuine = signed(frames, macs)
-    macs["nobody"] = nobody
-    good = _estimates(Verifier(_RECEIVED, macs, {}).verify(genuine))
+    keys, nobody = keys_of(seed)
+    genuine = signed(frames, keys)
+    keys["nobody"] = nobody
+    good = _estimates(Verifier(_RECEIVED, keys, {}).verify(genuine))
     totals = {name: np.zeros(4, int) for name in FORGERIES}
     turn = 0
     while sum(total[0] for total in totals.values()) < count:
         for number, (name, total) in enumerate(totals.items()):
-            foreign = forged(name, genuine, np.random.default_rng((seed, turn, number)), macs)
-            heard, missing, others = believed(genuine, foreign, macs)
+            foreign = forged(name, genuine, np.random.default_rng((seed, turn, number)), keys)
+            heard, missing, others = believed(genuine, foreign, keys)
             estimates = _estimates(heard)
             changed = np.sum(estimates["force"] != good["force"]) if len(estimates) == len(good) else len(good)
             total += (len(foreign), others, missing, changed)
@@ -263,8 +262,8 @@ def _cost(seed: int) -> None:
     schedule = city_drive().first(20.0)
     drive = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]
     received, sent = load_links()
-    macs = {link.name: cmac(link.name.encode().ljust(16)[:16]) for link in (*received, *sent)}
-    car, verifier, signer = Signer(received, macs, 1), Verifier(received, macs, {}), Signer(sent, macs, 1)
+    keys = {link.name: link.name.encode().ljust(16)[:16] for link in (*received, *sent)}
+    car, verifier, signer = Signer(received, keys, 1), Verifier(received, keys, {}), Signer(sent, keys, 1)
     pipeline = Pipeline(np.repeat(to_parameters(calibration), 4), CORNERS)
     pipeline.begin(_START_NS)
     spent, answers = {"verify": [], "sign": []}, 0

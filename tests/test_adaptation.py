@@ -1,5 +1,6 @@
 """What adaptation does beside the tick, without a brake: whose evaluation is taken, what of it is kept, and as whose."""
 
+import os
 import threading
 
 import adaptkit
@@ -16,7 +17,8 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.parameters import CLEARANCE, OFFSET_FRICTION, moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator import restart
-from emb_daemon.estimator.records import PARAMETERS, new_state
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
+from emb_daemon.wire import contract
 
 SHIPPED = adaptkit.shipped()
 LEARNED = np.ones(1, PARAMETERS)[0]
@@ -135,3 +137,74 @@ def test_where_learning_is_switched_off_nothing_learned_is_used(tmp_path):
     adaptation = Adaptation({"FL": off}, Memory(tmp_path), int)
     adaptation._stores[0] = store
     assert adaptation.in_use("FL") == off and not adaptation.limits["enabled"][0]
+
+
+def test_how_the_last_training_ended_is_said_once_one_has(adaptation):
+    adaptation.adapters[0]["outcome"] = r.RESIDUAL
+    assert adaptation.last_outcome("FL") == ""
+    adaptation.adapters[0]["result"] = contract.RESULT_REJECTED
+    assert adaptation.last_outcome("FL") == "residual too large"
+
+
+def test_an_outcome_is_dated_by_the_real_time_of_its_sample(adaptation, tmp_path):
+    adaptation._evaluations[0] = Evaluation(r.NOT_CONVERGED)
+    adaptation.adapters[0]["outcome"], adaptation.adapters[0]["time_ns"] = r.NOT_CONVERGED, 1_700_000_000_400_000_000
+    adaptation._keep(0, adaptation.adapters[0])
+    assert Memory(tmp_path).read("FL").history[0].date == "2023-11-14T22:13:20+00:00"
+
+
+@pytest.mark.parametrize(("kept_ns", "elapsed_s"), [(3 * 10**9, 4.0), (7 * 10**9, 0.0), (7 * 10**9 + 1, None)])
+def test_a_snapshot_is_as_old_as_the_corners_first_sample_is_later(adaptation, monkeypatch, caplog, kept_ns, elapsed_s):
+    """A prediction is no sample, nor is another corner's; one that is later than its reader is not used."""
+    resumed = []
+    monkeypatch.setattr(restart, "resume", lambda *arguments: resumed.append(arguments))
+    adaptation._resumable[0] = "snapshot", kept_ns
+    samples, states = np.zeros(4, SAMPLE), new_state(4)
+    samples["corner"], samples["is_prediction"] = [1, 0, 0, 0], [False, True, False, False]
+    samples["time_ns"] = [5 * 10**9, 6 * 10**9, 7 * 10**9, 8 * 10**9]
+    parameters = np.zeros(4, PARAMETERS)
+    adaptation._resume(samples[:2], states, parameters)
+    assert not resumed and list(adaptation._resumable) == [0]
+    adaptation._resume(samples, states, parameters)
+    assert not adaptation._resumable and [(arguments[2], arguments[3]) for arguments in resumed] == (
+        [("snapshot", elapsed_s)] if elapsed_s is not None else []
+    )
+    assert ("in the future" in caplog.text) == (elapsed_s is None)
+
+
+def test_what_a_sample_asked_for_is_done_before_the_next(adaptation, monkeypatch):
+    """Of a tick's samples, the second of which ends a training, and while an evaluation comes back."""
+    begun, attended, taken = [], [], []
+
+    def rows(_samples, first, count, *_):
+        begun.append(first)
+        adaptation.adapters[0]["ended"] = first == 0
+        return 2 if first == 0 else count
+
+    def attend(corner, adapter, *_):
+        attended.append((corner, bool(adapter["ended"]), len(begun)))
+        adapter["ended"] = False
+        adaptation._done.put("evaluation")
+
+    monkeypatch.setattr(module, "answer_adapting", rows)
+    monkeypatch.setattr(adaptation, "_attend", attend)
+    monkeypatch.setattr(adaptation, "_take_evaluation", lambda *arguments: taken.append((arguments, len(begun))))
+    adaptation.answer(np.zeros(5, SAMPLE), 5, new_state(4), np.zeros(4, PARAMETERS), np.zeros(5, ESTIMATE))
+    assert begun == [0, 2] and attended == [(0, True, 1)] and taken == [(tuple("evaluation"), 1)]
+
+
+def test_a_helper_thread_is_started_where_one_is_wanted_and_is_no_real_time_thread(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "compile_fit", lambda *_: None)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *arguments: asked.append(arguments))
+    monkeypatch.setattr(os, "setpriority", lambda *arguments: asked.append(arguments))
+    parameters = np.zeros(4, PARAMETERS)
+    for threaded in (False, True):
+        adaptation = Adaptation({"FL": SHIPPED}, Memory(tmp_path), int, threaded=threaded)
+        adaptation.warm_up(new_state(1)[0], to_parameters(SHIPPED))
+        assert (adaptation._thread is not None) == threaded
+    native = adaptation._thread.native_id
+    adaptation.close(new_state(4), parameters)
+    (process, policy, parameter), (which, thread, niceness) = asked
+    assert (process, policy, parameter.sched_priority) == (0, os.SCHED_OTHER, 0)
+    assert (which, thread) == (os.PRIO_PROCESS, native) and niceness >= 10

@@ -78,6 +78,27 @@ def test_every_key_of_the_files_has_a_meaning():
         assert len(rows) > 8 and all(row.split(" | ")[-1].strip(" |") for row in rows)
 
 
+@pytest.mark.parametrize("page", ["safety.md", "threats.md"])
+def test_tests_that_a_promise_names_exist(page):
+    """`::test` without a file is of the file named last."""
+    file, named = "", 0
+    text = (_ROOT / "docs" / page).read_text(encoding="utf-8")
+    for path, test in re.findall(r"`(?:tests/)?((?:target/)?test_\w+\.py)?(?:::(\w+(?:::\w+)?))?`", text):
+        file, named = path or file, named + 1
+        source = (_ROOT / "tests" / file).read_text(encoding="utf-8")
+        for word in filter(None, test.split("::")):
+            assert re.search(rf"^ *(def|class) {word}\b", source, re.MULTILINE), f"{file}::{test}"
+    assert named > 15
+
+
+def test_every_failure_has_a_test():
+    table = (_ROOT / "docs" / "safety.md").read_text(encoding="utf-8").partition("| failure |")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    assert len(rows) > 50
+    for row in rows:
+        assert len(row) == 4 and re.search(r"`.*(test_|studies/).*`|the same", row[-1]), row[0]
+
+
 def test_commands_in_the_documentation_exist():
     named = {word for page in _PAGES for word in re.findall(r"\bemb-daemon ([a-z]+)\b", page.read_text(encoding="utf-8"))}
     assert {"monitor", "replay", "diagnose"} <= named <= set(COMMANDS)

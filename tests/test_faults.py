@@ -208,6 +208,7 @@ def test_frozen_sender(car):  # noqa: F811
     cycles = np.arange(_BEFORE + 2, _BEFORE + _DURING)
     assert np.array_equal(_raised(estimates, r.RESOLVER_LOST)[: len(cycles)], cycles)
     assert _predicted(np.array([_at(estimates, cycle) for cycle in cycles])).any()
+    assert set(cycles) <= set(_raised(estimates, r.E2E_ERROR))
 
 
 @pytest.mark.parametrize("late_ms", [1, 3, 6, 20])
@@ -314,7 +315,8 @@ def test_sender_that_says_it_is_faulty_is_not_used(car):  # noqa: F811
         return [wirekit.frame("EMB_FL_Resolver", int(frame["time_ns"][0]), cycle % 15, 2, MotorAngle=19.0)]
 
     estimates, _ = _fault(car, faulty)
-    assert _raised(estimates, r.RESOLVER_LOST)[0] == _BEFORE + 2
+    assert _raised(estimates, r.RESOLVER_LOST)[0] == _raised(estimates, r.E2E_ERROR)[0] == _BEFORE + 2
+    assert _at(estimates, _BEFORE + _DURING - 1)["source"] == r.INVALID
     assert _at(estimates, _BEFORE + _DURING, sample=True)["source"] in (r.FUSED, r.STIFFNESS_ONLY)
 
 
@@ -362,6 +364,7 @@ def test_restarted_controller(car):  # noqa: F811
     estimates, _ = _run(car, np.concatenate(frames))
     samples = estimates[estimates["is_sample"]]
     assert len(samples) == 159 and 100 not in samples["cycle"] and samples["cycle"][-1] == 159
+    assert _raised(estimates, r.E2E_ERROR)[0] == 101
     assert samples["source"][-1] == r.FUSED
 
 

@@ -305,6 +305,15 @@ def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(dr
     assert not _pinged(driven.daemon)
 
 
+@pytest.mark.parametrize(("corner", "name"), [(1, "FR"), (3, "RR")])
+def test_a_change_is_logged_as_its_corners(driven, caplog, corner, name):
+    estimate = driven.daemon.pipeline.estimates[0]
+    estimate["corner"], estimate["mode"], estimate["reasons"] = corner, r.DEGRADED, r.STUCK
+    for _ in range(2):
+        driven.daemon._follow(1, driven.pacer)
+    assert caplog.text.count("corner") == caplog.text.count(f"corner {name}: degraded (signal stuck)") == 1
+
+
 def test_a_loop_that_misses_most_of_its_ticks_is_not_well(driven, caplog):
     driven.run(20)
     assert _pinged(driven.daemon)

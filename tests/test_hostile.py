@@ -165,6 +165,19 @@ def test_a_sender_that_was_late_for_long_may_be_on_time_again(start, late_ms, fr
     assert all(receive(frame[0], receptions, layout)[1] == ACCEPTED for frame in sent)
 
 
+def test_a_sender_whose_clock_runs_slower_is_followed():
+    """By 60 ppm for eighty seconds, more than a cycle: who comes half a cycle before it is early all the same."""
+    receptions, layout = new_reception(), default_layout()[0]
+    cycles = 20_000
+    times = np.arange(cycles + 1) * (CYCLE_NS + 250)
+    sent = (wirekit.frame("EMB_FL_Resolver", int(time), cycle % 15) for cycle, time in enumerate(times[:-1]))
+    assert all(receive(frame[0], receptions, layout)[1] == ACCEPTED for frame in sent)
+    early, genuine = (
+        wirekit.frame("EMB_FL_Resolver", int(times[-1]) - ahead_ns, cycles % 15) for ahead_ns in (26 * MS // 10, 0)
+    )
+    assert [receive(frame[0], receptions, layout)[1] == ACCEPTED for frame in (early, genuine)] == [False, True]
+
+
 def test_in_the_traffic_of_a_real_car(car, undisturbed, shared):  # noqa: F811
     """A minute's excerpt of a road car's bus, some of whose ids are ours, at its full rate around our frames: those on ids
     that we send are a second sender; none on ids that we receive passes the check."""

@@ -2,6 +2,7 @@
 it, and nothing is proven where nothing has changed."""
 
 import brake
+import naive
 import numpy as np
 import pytest
 
@@ -14,22 +15,46 @@ from emb_daemon.estimator.hypotheses import (
     PRIOR_ODDS,
     STIFFNESS_JUMP,
     TORQUE_JUMP,
+    contact_sigma,
     drift_odds,
     exists,
+    fold,
+    learn,
+    learned_torque,
+    likely_shift,
     mix,
     open_again,
     open_all,
     open_others,
+    place,
     settle,
     stay_finite,
     suspected,
     to_force,
+    to_torque,
     unproven,
     weigh,
 )
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import set_priors
-from emb_daemon.models.fusion import CONTACT, COULOMB, GAIN, GROWTH, LOAD, OFFSET, SCALE, STATES, force_variance
+from emb_daemon.models.fusion import (
+    CONTACT,
+    COULOMB,
+    FADE,
+    FAST,
+    GAIN,
+    GROWTH,
+    HOUSING,
+    INERTIA,
+    LOAD,
+    NOISE,
+    OFFSET,
+    SCALE,
+    SLOW,
+    STATES,
+    VISCOUS,
+    force_variance,
+)
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, PATHS_DISAGREE
 
@@ -222,15 +247,22 @@ def test_nothing_is_proven_where_nothing_has_changed(p, seed):
     assert rmse < 1.1 * _end(known, rows, force, stops=18)[0] + 5.0
 
 
-@pytest.fixture
-def clamped(p):
-    """State of a brake that holds under load, what it stands on, and the next row."""
+@pytest.fixture(scope="module")
+def holding(shipped_setup):
+    p = brake.ideal(shipped_setup.parameters)
     rows, force = _drive(p, stops=2)
     now = _STOP + _STILL + 150
     state = new_state()
     estimates = estimate(rows[:now], p, state)
     assert force[now] > 3500.0 and not estimates["reasons"][1:].any()
     return state, rows[now : now + 1], float(estimates["sigma"][-1])
+
+
+@pytest.fixture
+def clamped(holding):
+    """State of a brake that holds under load, the next row, and the force's sigma."""
+    state, row, sigma = holding
+    return state.copy(), row.copy(), sigma
 
 
 def test_mixture_is_the_law_of_total_variance(p, clamped):
@@ -392,6 +424,15 @@ def test_alternatives_allow_what_may_have_jumped_and_no_more(p, opened):
     )
 
 
+def test_heat_that_explains_a_share_of_the_torque_lets_the_torque_constant_be_as_far_off(p, opened):
+    """Both lags, whichever way they go: what a brake can be at all is that much wider."""
+    s, prior = opened[0], opened[0]["covariance"][GAIN, GAIN]
+    s["error"][[FADE, HOUSING]], s["winding"], s["housing"] = (0.2, -0.3), 0.5, 0.4
+    open_all(s, p)
+    allowed = 0.05 + 0.2 * 0.5 + 0.3 * 0.4
+    assert s["alternatives"]["covariance"][DISC_GROWTH, GAIN, GAIN] == pytest.approx(1.0 / (1.0 / prior + 1.0 / allowed**2))
+
+
 def test_nothing_is_proven_before_the_clearance_was_passed_back(p, opened):
     s = opened[0]
     s["alternatives"]["log_odds"][TORQUE_JUMP] = 50.0
@@ -432,7 +473,7 @@ def test_what_spoke_for_a_drift_is_remembered_and_never_makes_it_the_likelier(p,
 def test_two_that_are_alike_wait_for_more_strokes(p, opened):
     """The stronger is taken after twenty seconds, even if the other explains almost as much."""
     s = opened[0]
-    s["alternatives"]["log_odds"][:2] = 12.0, 10.0
+    s["alternatives"]["log_odds"][:2] = 12.0, 11.5
     assert not settle(s, p, True, 0.004)
     s["alternatives"]["age_s"] = 20.1
     assert settle(s, p, True, 0.004)
@@ -467,6 +508,15 @@ def test_pads_that_are_knocked_back_are_expected_to_be_again(p, opened):
     for _ in range(500):
         _stop(s, p, jumps=False)
     assert odds[STIFFNESS_JUMP] > PRIOR_ODDS and _share(odds[STIFFNESS_JUMP]) < 0.02
+
+
+def test_what_is_expected_before_the_first_jump_is_what_is_expected_of_any_brake(p, opened):
+    """The rare event that was not seen yet counts like sixteen stops without it."""
+    s = opened[0]
+    for jumps, stops, odds in ((1e-12, 0.0, PRIOR_ODDS), (1.0, 0.0, np.log(1.04 / 14.96)), (20.0, 1.0, 0.0)):
+        s["jumps"], s["stops"] = jumps, stops
+        open_all(s, p)
+        assert s["alternatives"]["least"][STIFFNESS_JUMP] == pytest.approx(odds, abs=0.02)
 
 
 def test_a_change_that_is_certain_is_not_doubted_until_the_release(p, opened):
@@ -595,6 +645,132 @@ def test_the_likeliest_of_the_other_kind_is_kept_beside_a_proven_jump(p, opened,
         assert (s["force"], k["shift"]) == (30.0, shift - 30.0)
     open_others(s, p)
     assert a["log_odds"][TORQUE_JUMP] == PRIOR_ODDS and (k["log_odds"] > -np.inf) == (kept is not None)
+
+
+def _covariance(rng, scale=1.0):
+    root = rng.standard_normal((STATES, STATES))
+    return scale * root @ root.T
+
+
+def test_torque_tells_of_each_error_what_the_balance_says():
+    """The equations at the head of `models.fusion`, of errors of every kind at once."""
+    rng, h = np.random.default_rng(4), np.zeros(STATES)
+    x = rng.standard_normal(STATES)
+    spread, slope, force, warmth, leverage, gear, mean, speed, slow, turning, motor, u, v = rng.uniform(0.5, 2.0, 13)
+    to_force(h, spread, slope, force, warmth)
+    off = spread * x[FAST] - slope * x[CONTACT] + force * x[SCALE] + slope * warmth * x[GROWTH]
+    assert h @ x == pytest.approx(off)
+    to_torque(h, leverage, gear, mean, force, speed, slow, turning, motor, u, v)
+    friction = mean * force * gear * x[LOAD] + mean * x[COULOMB] + speed * x[VISCOUS] + slow * x[SLOW]
+    lost = motor * (x[GAIN] + u * x[FADE] + v * x[HOUSING])
+    assert h @ x == pytest.approx(leverage * off + friction - lost + turning * x[INERTIA] + x[NOISE] + x[OFFSET])
+
+
+def test_what_motor_and_friction_explain_has_the_standard_deviation_of_that():
+    rng = np.random.default_rng(5)
+    x, h, P = rng.standard_normal(STATES), rng.standard_normal(STATES), _covariance(rng)
+    of = [GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW]
+    assert learned_torque(x, P, h) == pytest.approx((h[of] @ x[of], np.sqrt(h[of] @ P[np.ix_(of, of)] @ h[of])))
+
+
+@pytest.mark.parametrize(("sigmas", "trusted", "learns"), [(4.9, True, True), (5.1, True, False), (1.0, False, False)])
+def test_a_torque_far_off_or_not_trusted_teaches_nothing(sigmas, trusted, learns):
+    """One that is learned from counts by its variance; contact, stiffness and growth are in what is unexplained already."""
+    rng = np.random.default_rng(6)
+    x, h, P, gain = rng.standard_normal(STATES), rng.standard_normal(STATES), _covariance(rng), np.zeros(STATES)
+    others = [i for i in range(STATES) if i not in (CONTACT, SCALE, GROWTH)]
+    variance = 0.7
+    total = h @ P @ h + variance
+    innovation = sigmas * np.sqrt(total)
+    expected = naive.update_errors(x, P, innovation, h, variance)[:2] if learns else (x.copy(), P.copy())
+    found = learn(x, P, gain, h, innovation + h[others] @ x[others], variance, trusted)
+    assert found == pytest.approx((innovation, total))
+    np.testing.assert_allclose(x, expected[0])
+    np.testing.assert_allclose(P, expected[1], atol=1e-9)
+
+
+def _placed(p, x, contact, scale, growth, warmth, sigma=0.0, factor=0.9, force=5000.0):
+    s = new_state()[0]
+    s["past_contact"], s["force"] = x, force
+    a = s["alternatives"][STIFFNESS_JUMP]
+    a["error"][[CONTACT, SCALE, GROWTH]], a["covariance"][CONTACT, CONTACT] = (contact, scale, growth), sigma**2
+    place(s, a, p, factor, warmth)
+    return a
+
+
+def test_another_contact_or_stiffness_moves_the_force_along_the_curve(p):
+    moved = -0.5 + 0.02 * 30.0
+    before, there = naive.characteristic_curve(10.0, p["curve"]), naive.characteristic_curve(10.0 + moved, p["curve"])
+    a = _placed(p, 10.0, 0.5, 0.2, 0.02, 30.0)
+    assert a["shift"] == pytest.approx(1.2 * (5000.0 + 0.9 * (there[0] - before[0])) - 5000.0)
+    assert a["slope"] == pytest.approx(0.9 * 1.2 * there[1])
+    assert _placed(p, 10.0, 40.0, 0.0, 0.0, 0.0, force=3000.0)["shift"] == -3000.0, "no less than none"
+
+
+def test_the_slope_of_a_contact_that_is_not_known_is_that_of_all_that_may_be(p):
+    """At the kink of the curve, where a local slope would say that the contact angle cannot be seen; of three radians at
+    most."""
+    expected = []
+    for sigma in (2.0, 3.0, 9.0):
+        way = np.linspace(-min(sigma, 3.0), min(sigma, 3.0), 20_001)
+        expected.append(0.9 * np.mean([naive.characteristic_curve(x - 0.2, p["curve"])[1] for x in way]))
+        assert 0.5 * expected[-1] < _placed(p, 0.0, 0.2, 0.0, 0.0, 0.0, sigma)["slope"] < 2.0 * expected[-1]
+    assert _placed(p, 0.0, 0.2, 0.0, 0.0, 0.0)["slope"] == 0.0
+    assert _placed(p, 0.0, 0.2, 0.0, 0.0, 0.0, 3.0)["slope"] == _placed(p, 0.0, 0.2, 0.0, 0.0, 0.0, 9.0)["slope"]
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_what_the_model_takes_over_changes_no_hypothesis(p, opened, linear):
+    """Contact angle, stiffness, growth and force of every one are as before; what was an error is now the model's."""
+    s, warmth, rng = opened[0], 40.0, np.random.default_rng(7)
+    s["contact_angle"], s["past_contact"], s["growth"], s["scale"] = 9.0, 6.0, 1e-3, 1.1
+    s["force"], s["slope"] = 4000.0, 900.0
+    errors = [s["error"], *s["alternatives"]["error"]]
+    for error in errors:
+        error[[CONTACT, SCALE, GROWTH, GAIN]] = rng.uniform(0.01, 0.1, 4)
+    s["alternatives"]["shift"] = rng.uniform(-100.0, 100.0, ALTERNATIVES)
+
+    def states():
+        return [
+            (s["contact_angle"] + x[CONTACT], s["scale"] * (1.0 + x[SCALE]), s["growth"] + x[GROWTH], x[GAIN]) for x in errors
+        ]
+
+    before, x = states(), s["error"].copy()
+    total = s["force"] + s["alternatives"]["shift"]
+    place_ = s["past_contact"] + s["contact_angle"] - s["growth"] * warmth
+    fold(s, warmth, linear)
+    np.testing.assert_allclose(states(), before)
+    assert not s["error"][[CONTACT, SCALE, GROWTH]].any()
+    np.testing.assert_allclose(s["force"] + s["alternatives"]["shift"], total)
+    assert s["past_contact"] + s["contact_angle"] - s["growth"] * warmth == pytest.approx(place_)
+    moved = 900.0 * (x[GROWTH] * warmth - x[CONTACT]) + 4000.0 * x[SCALE]
+    assert s["force"] == pytest.approx(4000.0 + (moved if linear else 0.0))
+
+
+@pytest.mark.parametrize(("scale", "error", "expected"), [(2.9, 0.5, 3.0), (0.31, -0.5, 0.3)])
+def test_no_stiffness_is_beyond_what_pads_can_have(opened, scale, error, expected):
+    s = opened[0]
+    s["scale"], s["error"][SCALE] = scale, error
+    fold(s, 0.0, False)
+    assert s["scale"] == expected
+
+
+def test_a_change_that_is_likelier_than_none_shifts_the_force_by_itself(opened):
+    a = opened[0]["alternatives"]
+    a["shift"] = 10.0, 20.0, 30.0, 40.0, 50.0
+    for odds, shift in (((-1.0, -0.1, -2.0, -np.inf, 9.0), 0.0), ((-1.0, 2.0, 1.0, 3.0, 9.0), 40.0)):
+        a["log_odds"] = odds
+        assert likely_shift(opened[0]) == shift
+
+
+def test_the_contact_angle_is_as_uncertain_as_all_changes_make_it(opened):
+    s, rng = opened[0], np.random.default_rng(8)
+    shares = np.array([0.1, 0.2, 0.05, 0.15])
+    a = s["alternatives"]
+    a["share"][:DRIFT], a["error"][:, CONTACT] = shares, rng.uniform(-1.0, 1.0, ALTERNATIVES)
+    a["covariance"][:, CONTACT, CONTACT], s["covariance"][CONTACT, CONTACT] = rng.uniform(0.01, 0.1, ALTERNATIVES), 0.02
+    square = a["error"][:DRIFT, CONTACT] ** 2 + a["covariance"][:DRIFT, CONTACT, CONTACT]
+    assert contact_sigma(s) == pytest.approx(np.sqrt(shares @ square + 0.5 * 0.02))
 
 
 @pytest.mark.parametrize("stiffness", [0.9, 0.94, 1.1])

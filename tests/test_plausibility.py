@@ -118,6 +118,7 @@ def test_a_current_sensor_that_goes_no_further_is_not_believed_there(share):
     found = np.flatnonzero(estimates["reasons"] & r.STUCK)[0]
     later = clipped[clipped >= found]
     assert len(later) > 20 and np.all(estimates["source"][later] == r.STIFFNESS_ONLY)
+    assert np.all(estimates["reasons"][later] & r.STUCK) and np.all(estimates["reasons"][later] & r.PATHS_DISAGREE)
     assert _honest(estimates, force, slice(25, None))
     assert np.sqrt(np.mean((estimates["force"] - force)[25:] ** 2)) < 100.0
 
@@ -264,7 +265,19 @@ def test_stuck_resolver_and_no_current_leaves_nothing():
     estimates, force = _with(CLAMPING, both)
     dead = slice(CLAMPING + 60, CLAMPING + _LASTING)
     assert np.all(estimates["source"][dead] == r.INVALID) and np.all(estimates["mode"][dead] == r.FAULT)
+    assert np.all(estimates["reasons"][dead] & r.STUCK) and np.all(estimates["reasons"][dead] & r.PATHS_DISAGREE)
     assert _recovered(estimates, force)
+
+
+def test_a_current_that_is_lost_where_only_the_torque_was_left_leaves_nothing():
+    """After a power-on with a large offset, before the brake was seen released; a sender that doubts its current counts as
+    lost."""
+    samples, _ = drive()
+    samples = samples.copy()
+    samples["current_q"] += 6.0
+    samples["has_current"][100:150] = False
+    estimates = estimated(samples)
+    assert np.all(estimates["source"][90:100] == r.TORQUE_ONLY) and np.all(estimates["source"][113:150] == r.INVALID)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

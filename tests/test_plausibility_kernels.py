@@ -207,15 +207,15 @@ def test_a_torque_of_one_sample_may_have_just_begun():
     assert not any(said)
 
 
-def _swings(torques, angles=None, presliding_angle=0.02):
-    """What `hold` makes of smoothed torques (N m) over a force that friction of 0.1 N m holds."""
+def _swings(torques, angles=None, presliding_angle=0.02, force=0.0, load=0.0):
+    """What `hold` makes of smoothed torques (N m) over a force that friction of 0.1 N m and ``load`` m/rad holds."""
     c = np.zeros(1, PLAUSIBILITY)
     stands(c[0], 1.0)
     counted = 0
     for torque, angle in zip(torques, np.ones(len(torques)) if angles is None else angles, strict=True):
         c["torque_mean"] = torque
         if stands(c[0], angle):
-            counted = hold(c[0], 0.0, 0.01, 4e-5, 0.0, 0.1, presliding_angle)
+            counted = hold(c[0], force, 0.01, 4e-5, load, 0.1, presliding_angle)
     return counted
 
 
@@ -241,3 +241,36 @@ def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():
     assert watched.c["still"][0] == 1 and frozen(watched.c[0])
     watched.pass_by(3, speed=0.0, current=1.0)
     assert watched.c["idle"][0] == 2 and not frozen(watched.c[0]), "both repeat: nothing happens at all"
+
+
+def test_a_current_that_repeats_five_times_while_the_motor_turns_is_at_its_sensors_limit():
+    """And is not believed there, on either side, until it goes beyond; one that hardly flickered may just be coarse."""
+    w = Watched()
+    w.pass_by(60, speed=100.0)
+    assert w.pass_by(5, speed=100.0, current=9.0) == AGREE
+    assert w.pass_by(1, speed=100.0, current=9.0) == TORQUE_FROZEN and w.c["limit"][0] == 9.0
+    assert w.pass_by(1, speed=100.0, current=3.0) == AGREE and w.c["limit"][0] == 9.0
+    assert w.pass_by(1, speed=100.0, current=-9.0) == TORQUE_FROZEN
+    assert w.pass_by(1, speed=100.0, current=9.1) == AGREE and w.c["limit"][0] == 0.0
+    new = Watched()
+    new.pass_by(40, speed=100.0)
+    new.pass_by(10, speed=100.0, current=9.0)
+    assert new.c["limit"][0] == 0.0
+
+
+def test_a_current_that_repeats_while_the_motor_hardly_turns_has_no_limit():
+    w = Watched()
+    w.pass_by(60, speed=100.0)
+    w.pass_by(10, speed=1.0, current=9.0)
+    assert w.c["limit"][0] == 0.0
+    for _ in range(4):
+        w.pass_by(4, speed=100.0, current=9.0)
+        w.pass_by(1, speed=1.0, current=9.0)
+    assert w.c["limit"][0] == 0.0, "five in a row"
+
+
+def test_what_friction_carries_grows_with_the_clamp_force():
+    """With 1e-5 m/rad, of the 30 kN that are believed; or of what the torque would balance, if that is more."""
+    for force, most in ((30_000.0, 1.1), (0.0, 0.32 / 0.35)):
+        assert _swings([0.0, 0.99 * most], presliding_angle=1e-4, force=force, load=1e-5) == 0
+        assert _swings([0.0, 1.01 * most], presliding_angle=1e-4, force=force, load=1e-5) == 1

@@ -65,6 +65,10 @@ def drive():
 def reload_now(daemon, seconds=20.0):
     """Read the files again and go over to them, as the loop does from tick to tick."""
     daemon.reload()
+    end_reload(daemon, seconds)
+
+
+def end_reload(daemon, seconds=20.0):
     end = time.monotonic() + seconds
     daemon._follow_reload()
     while daemon._reader is not None or daemon._waiting:
@@ -119,12 +123,17 @@ def learned_store(daemon, folder):
 
 
 def test_what_is_learned_while_a_reload_reads_is_kept(daemon, folder):
-    """The calibration did not change: the corner goes on with what it has learned meanwhile, and so does the file."""
+    """The calibration did not change: the corner goes on with what it has learned meanwhile, and so does the file, though the
+    reader found nothing there yet."""
+    has_read, go_on, read = threading.Event(), threading.Event(), daemon._read_calibrations
+    daemon._read_calibrations = lambda: (read(), has_read.set(), go_on.wait(20.0))
     daemon.reload()
     daemon._follow_reload()
+    assert has_read.wait(20.0)
     learned_store(daemon, folder)
     in_use = daemon.pipeline.parameters.copy()
-    reload_now(daemon)
+    go_on.set()
+    end_reload(daemon)
     assert in_use[0] != to_parameters(SHIPPED)
     assert daemon.pipeline.parameters.tobytes() == in_use.tobytes()
     learned_store(daemon, folder)

@@ -64,6 +64,10 @@ def test_counts_that_are_lost_on_the_way_show_when_the_motor_stands(share):
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < city.BEFORE_RELEASE, "in the first hold"
     assert np.all(estimates["source"][told[0] + 1 :] == r.TORQUE_ONLY)
+    assert estimates["reasons"][told[0]] & r.STUCK and estimates["reasons"][told[0]] & r.PATHS_DISAGREE
+    good, _ = city.changed()
+    strayed = city.changed(lambda samples: _lose_counts(samples, share))[0]["contact_angle"] - good["contact_angle"]
+    assert np.abs(strayed[told[0] + 1]) > 0.1, "the contact angle follows the angle that is missing"
     error = np.abs(estimates["force"] - force)[told[0] :]
     assert np.all(error < 4.0 * np.hypot(estimates["sigma"][told[0] :], 25.0))
 

@@ -4,6 +4,10 @@ import errno
 import hashlib
 import json
 import os
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import adaptkit
 import msgspec
@@ -109,6 +113,32 @@ def test_a_state_directory_is_one_daemons(tmp_path):
         hold(tmp_path / "state")
     os.close(held)
     os.close(hold(tmp_path / "state"))
+
+
+def test_a_second_daemon_on_a_state_directory_does_not_start(tmp_path):
+    """One line, and a status that makes systemd try again."""
+    calibration = Path(__file__).parent.parent / "config" / "calibration.yaml"
+    config = tmp_path / "emb.yaml"
+    config.write_text(f"format: 1\nstate_directory: state\ncorners:\n  FL: {{calibration: {calibration}}}\n")
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "run", "--config", config, "-i", "virtual", "-c", "none"]
+    held = hold(tmp_path / "state")
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
+    finally:
+        os.close(held)
+    assert done.returncode == 1 and "state directory is in use by another running process" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_what_a_killed_writer_left_goes_after_an_hour_and_not_before(tmp_path):
+    """Until then somebody may still be writing it."""
+    now = time.time()
+    for name, age_s in (("old", 3700.0), ("new", 3500.0)):
+        path = tmp_path / f".adaptation-FL.json.{name}"
+        path.write_text("{")
+        os.utime(path, (now - age_s, now - age_s))
+    Memory(tmp_path).load("FL", SHIPPED)
+    assert [path.name for path in tmp_path.iterdir()] == [".adaptation-FL.json.new"]
 
 
 def test_a_file_that_cannot_be_set_aside_stops_nothing(tmp_path, monkeypatch):

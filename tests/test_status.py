@@ -164,6 +164,9 @@ def test_a_force_that_the_monitor_rules_out_is_replaced_by_its_bounds(seen):
     seen.out["force"], seen.out["sigma"] = 3200.0, 10.0
     assert "bounds_contradict" in seen.facts()
     assert (seen.out["force"][0], seen.out["sigma"][0]) == (1500.0, 1700.0)
+    seen.out["force"], seen.out["sigma"] = 1600.0, 10.0
+    assert "bounds_contradict" in seen.facts()
+    assert (seen.out["force"][0], seen.out["sigma"][0]) == (1500.0, 1500.0)
 
 
 def test_a_frozen_current_rules_nothing_out(seen):

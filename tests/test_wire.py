@@ -332,6 +332,7 @@ def test_counter_fifteen_does_not_exist(heard):
 )
 def test_status_of_the_sender(heard, status, verdict):
     assert _receive(_resolver(2, 8 * MS, status), heard)[1] == verdict
+    assert heard[0]["degraded"] == (status == 1)
 
 
 def test_value_out_of_range_changes_nothing_of_its_frame():

@@ -1,6 +1,5 @@
 """Writes requirements-box.lock: the part of requirements.lock that runs in the car, for `pip install --require-hashes`;
-requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead;
-requirements-secoc.lock: what authenticated communication needs besides; and
+requirements-ahead.lock: the same without the compiler, for a daemon whose kernels are compiled ahead; and
 requirements-image.lock: what replay, identification and fleets need.
 
     python tools/lock_box.py [--check]
@@ -21,7 +20,6 @@ ROOT = Path(__file__).resolve().parent.parent
 LOCKS = {
     "requirements-box.lock": (("", "workshop"), ()),
     "requirements-ahead.lock": (("", "workshop"), ("numba", "llvmlite")),
-    "requirements-secoc.lock": (("secoc",), ()),
     "requirements-image.lock": (("", "offline", "mf4", "formats", "fleet"), ()),
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")

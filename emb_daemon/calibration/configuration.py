@@ -58,7 +58,7 @@ class Realtime(Struct, kw_only=True):
 
 
 class Secoc(Struct, kw_only=True):
-    """Authentication of received and sent messages (AUTOSAR SecOC). It needs a state directory and the extra secoc."""
+    """Authentication of received and sent messages (AUTOSAR SecOC). It needs a state directory."""
 
     #: File of keys, relative to this configuration; a systemd credential of that name overrides it. Only its owner may have
     #: permission to read it. A line is the name of an authentication message, such as EMB_FL_Auth, and 32 hexadecimal digits.

@@ -14,7 +14,6 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.journal import log
-from emb_daemon.wire.keys import cmac
 from emb_daemon.wire.secoc import LAST_TRIP, Link, Signer, Verifier
 
 _FORMAT = 1
@@ -89,9 +88,6 @@ class Authentication:
 
     Attributes:
         keyless: links without a key.
-
-    Raises:
-        InputError: the extra `secoc` is not installed.
     """
 
     def __init__(
@@ -103,11 +99,10 @@ class Authentication:
         file: FreshnessFile | None = None,
     ):
         self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]
-        macs = {link.name: cmac(keys[link.name]) for link in (*received, *sent) if link.name in keys}
         self._kept, self._file = kept, file
-        self._verifier = Verifier(received, macs, kept.heard)
+        self._verifier = Verifier(received, keys, kept.heard)
         self.verify: Callable[[np.ndarray], np.ndarray] = self._verifier.verify
-        self.sign: Callable[[np.ndarray], np.ndarray] = Signer(sent, macs, kept.trip).sign
+        self.sign: Callable[[np.ndarray], np.ndarray] = Signer(sent, keys, kept.trip).sign
         self._writer: threading.Thread | None = None
 
     def stale(self) -> bool:
@@ -168,7 +163,7 @@ def secure(bus: Bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[
     """The daemon's end of an authenticated bus, and the corners of which a key is missing.
 
     Raises:
-        InputError: no state directory, all trip counters used up, or the extra `secoc` not installed.
+        InputError: no state directory, or all trip counters used up.
         Unavailable: the trip counter cannot be stored.
     """
     if state is None:

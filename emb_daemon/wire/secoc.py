@@ -14,27 +14,23 @@ increments its trip counter at each start. Therefore no freshness value occurs t
 frames, however many, is in step again with the next freshness frame. Source: AUTOSAR CP R22-11, SWS
 SecureOnboardCommunication: profile 1, secured PDU collection, freshness management.
 
-The CMAC is passed in; this module uses neither keys nor a cryptographic library.
+All frames of a tick are signed, or verified, in one call of compiled code.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import product
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
 
 from emb_daemon.errors import InputErrors
-from emb_daemon.jit import Array, entry
+from emb_daemon.jit import Array, entry, fields, njit
 from emb_daemon.resources import resource
+from emb_daemon.wire.cmac import KEY, cmac, new_key
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.e2e import COUNTER_MODULO, crc
+from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, protect
 from emb_daemon.wire.frames import FRAME, UNAUTHENTIC
 from emb_daemon.wire.layout import CORNERS, OPTIONAL, load_database
-
-#: The 16 bytes of a message's AES-128-CMAC, under one sender's key.
-Mac = Callable[[bytes], bytes]
 
 #: Number of the set that consists of the freshness frame alone.
 FRESHNESS_SET = 15
@@ -42,12 +38,10 @@ FRESHNESS_SET = 15
 #: therefore last 130 days; after that nothing is authenticated until the next start.
 LAST_MESSAGE, LAST_TRIP, LAST_RESET = 0xFF, 0xFF_FFFF, 0xFF_FFFF
 _TAG_BITS = 36
-#: Payloads of a set, as on the wire.
-_ONE, _TWO = Struct("<Q"), Struct("<QQ")
-#: A Counter that no message has.
+#: Most sets of a sender, besides the freshness frame, and most messages of a set.
+_SETS, _MESSAGES = 4, 2
+#: Payload with a Counter that no message has.
 _NO_PAYLOAD = 0xF00
-#: Flag of a frame to be sent whose CRC is not yet computed.
-_BARE = 255
 #: Time for which a frame is held until its authentication arrives: eight cycles, which covers the burst of a delayed bus. If
 #: more than eight frames of one message are waiting, this is a flood.
 _HELD_NS, _MOST_HELD = 8 * CYCLE_NS, 8
@@ -122,38 +116,78 @@ def load_links(path: Path | None = None, corners: Iterable[str] = CORNERS) -> tu
     return received, sent
 
 
-def freshness_value(trip: int, reset: int, message: int) -> bytes:
-    """The 56 bits that are different for each authentication under one key."""
-    return (trip << 32 | reset << 8 | message).to_bytes(7, "big")
+#: One sender's link, for the sender and for the receiver. ``sizes``: number of messages of each set, the freshness frame's
+#: last. ``trip``, ``reset``, ``message``: the freshness value last sent, or last received and found authentic. ``text``,
+#: ``code``: what is authenticated now, and its CMAC. Of the sender ``payloads``: those of sets that are not complete. Of the
+#: receiver ``in_step``: whether the freshness value is known; ``tries``: number of CMACs since ``since_ns``; ``held``: frames
+#: that wait for their authentication, the oldest first, by set and place in the set, and their number ``waiting``.
+LINK = np.dtype(
+    [
+        *fields("?", "keyed in_step"),
+        *fields("i8", "authentication_id freshness_id first_id trip reset message tries since_ns"),
+        ("key", KEY),
+        ("sizes", "i8", (_SETS + 1,)),
+        ("payloads", "u8", (_SETS, _MESSAGES)),
+        ("held", FRAME, (_SETS + 1, _MESSAGES, _MOST_HELD)),
+        ("waiting", "i8", (_SETS + 1, _MESSAGES)),
+        ("text", "u1", (32,)),
+        ("code", "u1", (16,)),
+    ],
+    align=True,
+)
+#: No frames.
+_NONE = -1
+#: By CAN id: its link (-1: none), its set (of an authentication frame -1) and its place in the set.
+_PLACE = np.dtype(fields("i8", "link which position"), align=True)
 
 
-def authenticator(mac: Mac, data_id: int, payloads: Sequence[int], freshness: bytes) -> int:
-    """The first 36 bits of the CMAC, as a whole number; payloads are those of FRAME."""
-    octets = _ONE.pack(*payloads) if len(payloads) == 1 else _TWO.pack(*payloads)
-    return int.from_bytes(mac(b"".join((data_id.to_bytes(2, "big"), octets, freshness)))[:5], "big") >> 4
+def _new_links(links: Iterable[Link], keys: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """LINK records, and _PLACE records by CAN id."""
+    links, places = list(links), np.zeros(2048, _PLACE)
+    records = np.zeros(len(links), LINK)
+    places["link"] = -1
+    for number, (link, record) in enumerate(zip(links, records, strict=True)):
+        record["authentication_id"], record["freshness_id"] = link.authentication_id, link.freshness_id
+        record["first_id"], record["message"], record["payloads"] = link.sets[0][0], LAST_MESSAGE, _NO_PAYLOAD
+        for which, ids in [*enumerate(link.sets), (_SETS, (link.freshness_id,))]:
+            record["sizes"][which] = len(ids)
+            for position, can_id in enumerate(ids):
+                places[can_id] = number, which, position
+        places[link.authentication_id] = number, -1, 0
+        if link.name in keys:
+            record["keyed"] = True
+            new_key(keys[link.name], record["key"])
+    return records, places
 
 
-def _data_id(link: Link, which: int) -> int:
-    return link.authentication_id | which << 11
+@njit
+def _authenticator(link, number, first, second, trip, reset, message):
+    """The first 36 bits of the CMAC of set ``number`` with payloads ``first`` and, if it has two, ``second``."""
+    text, at = link.text, 2
+    data_id = link.authentication_id | number << 11
+    text[0], text[1] = data_id >> 8, data_id & 0xFF
+    for payload in (first, second):
+        if at == 2 or (number != FRESHNESS_SET and link.sizes[number] == 2):
+            for byte in range(8):
+                text[at + byte] = (payload >> np.uint64(8 * byte)) & np.uint64(0xFF)
+            at += 8
+    for counter, octets in ((trip, 3), (reset, 3), (message, 1)):
+        for byte in range(octets):
+            text[at + byte] = counter >> 8 * (octets - 1 - byte) & 0xFF
+        at += octets
+    cmac(link.key, text, at, link.code)
+    tag = 0
+    for byte in range(5):
+        tag = tag << 8 | int(link.code[byte])
+    return tag >> 4
 
 
-@entry(Array(FRAME), int)
-def _protect(frames, count):
-    """Fill in the CRCs of those of ``frames[:count]`` that are marked as lacking it."""
-    for index in range(count):
-        frame = frames[index]
-        if frame.flags == _BARE:
-            frame.flags = 0
-            frame.data |= np.uint64(crc(frame.can_id, frame.data))
-
-
-class _Outgoing:
-    """Sender's side of one link: its counters, and payloads of sets that are not yet complete."""
-
-    def __init__(self, link: Link, mac: Mac):
-        self.link, self.mac = link, mac
-        self.reset, self.message = 0, LAST_MESSAGE
-        self.payloads = [[_NO_PAYLOAD] * len(ids) for ids in link.sets]
+@njit
+def _put(frames, count, time_ns, can_id, data, flags):
+    """Append a frame; returns the new count."""
+    frame = frames[count]
+    frame.time_ns, frame.can_id, frame.data, frame.length, frame.flags = time_ns, can_id, data, 8, flags
+    return count + 1
 
 
 class Signer:
@@ -161,78 +195,75 @@ class Signer:
 
     Args:
         links: those of which the process is the sender; messages of a link without a key are sent without authentication.
-        macs: by the links' names.
+        keys: of 16 bytes, by the links' names.
         trip: trip counter of the process, one more than at its last start.
+
+    Attributes:
+        links: their LINK records, shape (links,).
     """
 
-    def __init__(self, links: Iterable[Link], macs: Mapping[str, Mac], trip: int):
-        self._trip = trip
-        self._places = {}
-        for link in links:
-            if link.name in macs:
-                outgoing = _Outgoing(link, macs[link.name])
-                for which, ids in enumerate(link.sets):
-                    self._places |= {can_id: (outgoing, which, position) for position, can_id in enumerate(ids)}
-        self._frames, self._freshness = np.zeros(64, FRAME), np.zeros(1, FRAME)
+    def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], trip: int):
+        self.links: np.ndarray
+        self.links, self._places = _new_links(links, keys)
+        self.links["trip"] = trip
+        self._frames = np.zeros(64, FRAME)
         # Compile now, not when the first frame is waiting.
-        _protect(self._frames, 0)
+        self.sign(self._frames[:0])
 
     def sign(self, frames: np.ndarray) -> np.ndarray:
         """``frames`` (FRAME array in sending order) with each set's authentication behind it; valid until the next call."""
         if 4 * len(frames) > len(self._frames):
             self._frames = np.zeros(4 * len(frames), FRAME)
-        signed: list[tuple] = []
-        for row in frames.tolist():
-            signed.append(row)
-            place = self._places.get(row[2])
-            if place is None:
-                continue
-            outgoing, which, position = place
-            payloads = outgoing.payloads[which]
-            payloads[position] = row[1]
-            # The set is complete when all of its payloads have the same Counter.
-            if len(payloads) == 1 or not any((payload ^ row[1]) & 0xF00 for payload in payloads):
-                self._authenticate(outgoing, which, row[0], payloads, signed)
-                payloads[:] = [_NO_PAYLOAD] * len(payloads)
-        self._frames[: len(signed)] = signed
-        _protect(self._frames, len(signed))
-        return self._frames[: len(signed)]
-
-    def _authenticate(self, outgoing: _Outgoing, which: int, time_ns: int, payloads: list[int], signed: list[tuple]) -> None:
-        """Add the frames that follow a set; `sign` fills in the CRC of authentication frames."""
-        if outgoing.message == LAST_MESSAGE:
-            if outgoing.reset == LAST_RESET:
-                return
-            outgoing.reset += 1
-            outgoing.message = 0
-            data = outgoing.reset % COUNTER_MODULO << 8 | self._trip << 16 | outgoing.reset << 40
-            self._freshness[0] = (time_ns, data, outgoing.link.freshness_id, 8, _BARE)
-            # Its CRC is needed now, because it is part of what is authenticated.
-            _protect(self._freshness, 1)
-            signed += self._freshness.tolist()
-            self._append(outgoing, FRESHNESS_SET, time_ns, [signed[-1][1]], signed)
-        outgoing.message += 1
-        self._append(outgoing, which, time_ns, payloads, signed)
-
-    def _append(self, outgoing: _Outgoing, which: int, time_ns: int, payloads: list[int], signed: list[tuple]) -> None:
-        link, freshness = outgoing.link, freshness_value(self._trip, outgoing.reset, outgoing.message)
-        tag = authenticator(outgoing.mac, _data_id(link, which), payloads, freshness)
-        data = payloads[0] & 0xF00 | which << 16 | outgoing.message << 20 | tag << 28
-        signed.append((time_ns, data, link.authentication_id, 8, _BARE))
+        return self._frames[: _sign(frames, self.links, self._places, self._frames)]
 
 
-class _Incoming:
-    """Receiver's side of one link: the last authentic freshness value, and the frames that wait for their authentication, as
-    rows of FRAME by set and by place in the set."""
+@entry(Array(FRAME), Array(LINK), Array(_PLACE), Array(FRAME), returns=1)
+def _sign(frames, links, places, signed):
+    count = 0
+    for index in range(len(frames)):
+        frame = frames[index]
+        signed[count] = frame
+        count += 1
+        place = places[frame.can_id & 2047]
+        if place.link < 0 or place.which < 0 or not links[place.link].keyed:
+            continue
+        link = links[place.link]
+        payloads = link.payloads[place.which]
+        payloads[place.position] = frame.data
+        # The set is complete when all of its payloads have the same Counter.
+        complete = True
+        for position in range(link.sizes[place.which]):
+            complete = complete and counter_of(payloads[position]) == counter_of(frame.data)
+        if complete:
+            count = _append(link, place.which, frame.time_ns, payloads[0], payloads[1], signed, count)
+            payloads[:] = np.uint64(_NO_PAYLOAD)
+    return count
 
-    def __init__(self, link: Link, mac: Mac | None, last: tuple[int, int]):
-        self.link, self.mac = link, mac
-        self.trip, self.reset = last
-        self.message = LAST_MESSAGE
-        self.in_step = False
-        self.held = {which: [[] for _ in ids] for which, ids in enumerate(link.sets)}
-        self.held[FRESHNESS_SET] = [[]]
-        self.tries, self.since_ns = 0, 0
+
+@njit
+def _append(link, which, time_ns, first, second, signed, count):
+    """Append the frames that follow a set; returns the new count."""
+    if link.message == LAST_MESSAGE:
+        if link.reset == LAST_RESET:
+            return count
+        link.reset += 1
+        link.message = 0
+        counter = link.reset % COUNTER_MODULO
+        data = protect(
+            link.freshness_id, np.uint64(link.trip) << np.uint64(16) | np.uint64(link.reset) << np.uint64(40), counter, 0
+        )
+        count = _put(signed, count, time_ns, link.freshness_id, data, 0)
+        count = _append_authentication(link, FRESHNESS_SET, time_ns, data, data, signed, count)
+    link.message += 1
+    return _append_authentication(link, which, time_ns, first, second, signed, count)
+
+
+@njit
+def _append_authentication(link, number, time_ns, first, second, signed, count):
+    tag = _authenticator(link, number, first, second, link.trip, link.reset, link.message)
+    payload = np.uint64(number << 16 | link.message << 20) | np.uint64(tag) << np.uint64(28)
+    data = protect(link.authentication_id, payload, counter_of(first), 0)
+    return _put(signed, count, time_ns, link.authentication_id, data, 0)
 
 
 class Verifier:
@@ -245,90 +276,125 @@ class Verifier:
 
     Args:
         links: those of which the process is the receiver; every frame of a link without a key is refused.
-        macs: by the links' names.
+        keys: of 16 bytes, by the links' names.
         last: (trip, reset) by the links' names: the last ones received, so that only later freshness values are accepted.
+
+    Attributes:
+        links: their LINK records, shape (links,).
     """
 
-    def __init__(self, links: Iterable[Link], macs: Mapping[str, Mac], last: Mapping[str, tuple[int, int]]):
-        self._incoming = [_Incoming(link, macs.get(link.name), last.get(link.name, (0, 0))) for link in links]
-        #: By CAN id: the link, and the place where its frames are held; authentication frames are not held.
-        self._places: dict[int, tuple[_Incoming, list[tuple] | None]] = {}
-        for incoming in self._incoming:
-            link = incoming.link
-            for which, ids in [*enumerate(link.sets), (FRESHNESS_SET, (link.freshness_id,))]:
-                self._places |= {can_id: (incoming, held) for can_id, held in zip(ids, incoming.held[which], strict=True)}
-            self._places[link.authentication_id] = incoming, None
+    def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], last: Mapping[str, tuple[int, int]]):
+        links = list(links)
+        self._names = [link.name for link in links]
+        self.links: np.ndarray
+        self.links, self._places = _new_links(links, keys)
+        for name, record in zip(self._names, self.links, strict=True):
+            record["trip"], record["reset"] = last.get(name, (0, 0))
+        self._most_held = len(links) * (_SETS + 1) * _MESSAGES * _MOST_HELD
+        self._known = np.zeros(self._most_held + 256, FRAME)
+        # Compile now, not when the first frame is waiting.
+        self.verify(self._known[:0])
 
     def last(self) -> dict[str, tuple[int, int]]:
         """(trip, reset) last received, by the links' names."""
-        return {incoming.link.name: (incoming.trip, incoming.reset) for incoming in self._incoming}
+        pairs = zip(self.links["trip"].tolist(), self.links["reset"].tolist(), strict=True)
+        return dict(zip(self._names, pairs, strict=True))
 
     def verify(self, frames: np.ndarray) -> np.ndarray:
         """The frames (FRAME array) to pass on now: of ``frames``, in order of arrival, and of those held before."""
-        known: list[tuple] = []
-        for row in frames.tolist():
-            # `receive` refuses what is not a classic data frame of eight bytes.
-            place = self._places.get(row[2]) if row[4] == 0 and row[3] == 8 else None
-            if place is None:
-                known.append(row)
-                continue
-            incoming, held = place
-            if held is None:
-                _judge(incoming, row, known)
-                continue
-            while held and (len(held) >= _MOST_HELD or row[0] - held[0][0] > _HELD_NS):
-                known.append(_refuse(held.pop(0), row[0]))
-            held.append(row)
-        return np.array(known, FRAME)
+        if len(frames) + self._most_held > len(self._known):
+            self._known = np.zeros(len(frames) + self._most_held, FRAME)
+        return self._known[: _verify(frames, self.links, self._places, self._known)].copy()
 
 
-def _judge(incoming: _Incoming, row: tuple, known: list[tuple]) -> None:
+@entry(Array(FRAME), Array(LINK), Array(_PLACE), Array(FRAME), returns=1)
+def _verify(frames, links, places, known):
+    count = 0
+    for index in range(len(frames)):
+        frame = frames[index]
+        place = places[frame.can_id & 2047]
+        # `receive` refuses what is not a classic data frame of eight bytes.
+        if place.link < 0 or frame.flags != 0 or frame.length != 8 or frame.can_id > 2047:
+            known[count] = frame
+            count += 1
+        elif place.which < 0:
+            count = _judge(links[place.link], frame.time_ns, frame.data, known, count)
+        else:
+            count = _hold(links[place.link], place.which, place.position, frame, known, count)
+    return count
+
+
+@njit
+def _hold(link, which, position, frame, known, count):
+    """Let a frame wait, and refuse those before it that are too old or too many."""
+    held, waiting = link.held[which, position], link.waiting[which, position]
+    gone = 0
+    while gone < waiting and (waiting - gone >= _MOST_HELD or frame.time_ns - held[gone].time_ns > _HELD_NS):
+        count = _put(known, count, frame.time_ns, held[gone].can_id, held[gone].data, UNAUTHENTIC)
+        gone += 1
+    for row in range(gone, waiting):
+        held[row - gone] = held[row]
+    held[waiting - gone] = frame
+    link.waiting[which, position] = waiting - gone + 1
+    return count
+
+
+@njit
+def _judge(link, time_ns, data, known, count):
     """Pass on the frames that an authentication frame proves authentic, or refuse it."""
-    time_ns, data = row[:2]
-    slots = incoming.held.get(data >> 16 & 15)
-    genuine = _authentic(incoming, slots, data, time_ns) if slots else None
-    if genuine is None:
-        known.append((time_ns, 0, incoming.link.sets[0][0], 8, UNAUTHENTIC))
-        return
-    if data >> 16 & 15 != FRESHNESS_SET:
-        known += [(time_ns, frame[1], frame[2], 8, 0) for frame in genuine]
-    for slot, frame in zip(slots, genuine, strict=True):
-        if len(slot) == 1:
-            slot.clear()
-            continue
-        known += [_refuse(held, time_ns) for held in slot if held is not frame and not (held[1] ^ data) & 0xF00]
-        slot[:] = [held for held in slot if (held[1] ^ data) & 0xF00]
+    number = np.int64(data >> np.uint64(16) & np.uint64(15))
+    which = _SETS if number == FRESHNESS_SET else number
+    genuine = _find_genuine(link, number, time_ns, data) if number < _SETS or number == FRESHNESS_SET else _NONE
+    if genuine == _NONE:
+        return _put(known, count, time_ns, link.first_id, np.uint64(0), UNAUTHENTIC)
+    if which < _SETS:
+        for position in range(link.sizes[which]):
+            frame = link.held[which, position, genuine >> 8 * position & 0xFF]
+            count = _put(known, count, time_ns, frame.can_id, frame.data, 0)
+    for position in range(link.sizes[which]):
+        held, left = link.held[which, position], 0
+        for row in range(link.waiting[which, position]):
+            if counter_of(held[row].data) != counter_of(data):
+                held[left] = held[row]
+                left += 1
+            elif row != genuine >> 8 * position & 0xFF:
+                count = _put(known, count, time_ns, held[row].can_id, held[row].data, UNAUTHENTIC)
+        link.waiting[which, position] = left
+    return count
 
 
-def _authentic(incoming: _Incoming, slots: list[list[tuple]], data: int, time_ns: int) -> Sequence[tuple] | None:
-    """The held frames that ``data`` authenticates, one for each place of the set; advances the link's freshness."""
-    which, message = data >> 16 & 15, data >> 20 & LAST_MESSAGE
-    freshness_alone = which == FRESHNESS_SET
-    if incoming.mac is None or freshness_alone != (message == 0) or not (freshness_alone or incoming.in_step):
-        return None
-    if abs(time_ns - incoming.since_ns) >= CYCLE_NS:
-        incoming.tries, incoming.since_ns = 0, time_ns
+@njit
+def _find_genuine(link, number, time_ns, data):
+    """Which of the frames that are held ``data`` authenticates: the row of the set's first message, plus 256 times that of its
+    second; _NONE if none. Advances the link's freshness."""
+    message = np.int64(data >> np.uint64(20) & np.uint64(LAST_MESSAGE))
+    freshness_alone = number == FRESHNESS_SET
+    if not link.keyed or freshness_alone != (message == 0) or not (freshness_alone or link.in_step):
+        return _NONE
+    if abs(time_ns - link.since_ns) >= CYCLE_NS:
+        link.tries, link.since_ns = 0, time_ns
+    which = _SETS if freshness_alone else number
     # A message counter that is not larger than the last one belongs to the next reset, whose freshness frame was lost.
-    trip, reset = incoming.trip, incoming.reset + (message <= incoming.message)
-    choices = [[slot[0] for slot in slots if len(slot) == 1]]
-    if len(choices[0]) != len(slots):
-        # The newest first: the frames of this set arrived just before their authentication.
-        choices = product(*[[held for held in slot[::-1] if not (held[1] ^ data) & 0xF00] for slot in slots])
-    for frames in choices:
+    trip, reset = link.trip, link.reset + (message <= link.message)
+    pair = link.sizes[which] == 2
+    # The newest first: the frames of this set arrived just before their authentication.
+    for row in range(link.waiting[which, 0] - 1, -1, -1):
+        first = link.held[which, 0, row].data
+        if counter_of(first) != counter_of(data):
+            continue
         if freshness_alone:
-            trip, reset = frames[0][1] >> 16 & LAST_TRIP, frames[0][1] >> 40
-            if (trip, reset) <= (incoming.trip, incoming.reset):
+            trip = np.int64(first >> np.uint64(16) & np.uint64(LAST_TRIP))
+            reset = np.int64(first >> np.uint64(40))
+            if trip < link.trip or (trip == link.trip and reset <= link.reset):
                 continue
-        if incoming.tries == _MOST_TRIES or reset > LAST_RESET:
-            return None
-        incoming.tries += 1
-        freshness = freshness_value(trip, reset, message)
-        tag = authenticator(incoming.mac, _data_id(incoming.link, which), [frame[1] for frame in frames], freshness)
-        if tag == data >> 28:
-            incoming.trip, incoming.reset, incoming.message, incoming.in_step = trip, reset, message, True
-            return frames
-    return None
-
-
-def _refuse(row: tuple, time_ns: int) -> tuple:
-    return (time_ns, *row[1:4], UNAUTHENTIC)
+        for other in range(link.waiting[which, 1] - 1 if pair else 0, -1, -1):
+            second = link.held[which, 1, other].data if pair else first
+            if counter_of(second) != counter_of(data):
+                continue
+            if link.tries == _MOST_TRIES or reset > LAST_RESET:
+                return _NONE
+            link.tries += 1
+            if _authenticator(link, number, first, second, trip, reset, message) == np.int64(data >> np.uint64(28)):
+                link.trip, link.reset, link.message, link.in_step = trip, reset, message, True
+                return row | other << 8
+    return _NONE

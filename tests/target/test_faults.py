@@ -15,6 +15,7 @@ import pytest
 from bus_tools import CHANNEL
 
 from emb_daemon.runtime.rawcan import RawCanSocket, open_socketcan
+from emb_daemon.wire.frames import ERROR
 
 pytestmark = pytest.mark.target("can")
 
@@ -65,6 +66,17 @@ def test_interface_down_and_up(peer: socket.socket) -> None:
         assert peer.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == errno.ENETDOWN
         _send(peer, 2)
         assert _numbers(bus) == [2] and not bus.down
+    finally:
+        bus.close()
+
+
+def test_bus_off_is_heard_by_the_daemons_socket() -> None:
+    bus = open_socketcan(CHANNEL, [RESOLVER])
+    try:
+        subprocess.run(["cansend", CHANNEL, "20000040#0000000000000000"], check=True)
+        time.sleep(0.05)
+        [frame] = bus.drain()
+        assert frame["flags"] & ERROR and frame["can_id"] == 0x40
     finally:
         bus.close()
 
