@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
-from emb_daemon.diagnose.forms import Form, made_effect
+from emb_daemon.diagnose.forms import Form, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
@@ -34,7 +34,7 @@ from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_kn
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.base import HOOKS
-from emb_daemon.effects.terms import MOST, SIGNALS
+from emb_daemon.effects.terms import MOST, PORTS, SIGNALS
 from emb_daemon.offline.run import held
 from emb_daemon.offline.score import rmse
 
@@ -50,6 +50,8 @@ _OF_HEAT = 2
 _FITTED = 4
 #: Fits after another that such a term is given, and share of the mean square from which another gains nothing.
 _FITS, _LITTLE = 8, 0.98
+#: Further shapes of one place that are fitted beside the first.
+_SHAPES = 3
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 
@@ -84,21 +86,24 @@ def _has_room(selection: Selection, channel: str) -> bool:
 
 
 def _restated(found: Selection, before: Selection, channel: str) -> Selection:
-    """The same, or an earlier term in another shape, if that alone describes the residual as shortly as it does with the last
-    one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    """The same, or an earlier term in another shape or of two shapes, if that alone describes the residual as shortly as it
+    does with the last one beside it: where a shape was only nearly right, the rest of it looks like another term."""
     # Terms of the heat balance were fitted in all their shapes, and a ripple has but one.
     for name in _made(before, channel) if channel != CHANNEL_OF_HEAT else ():
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
         bare = before.without(name, "its shape was chosen again")
-        search = _search(bare.model, channel)
-        prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
-        for prospect in (p for p in prospects if p.evidence.gain > 0.0):
-            effect = made_effect(prospect.form, _name(prospect.form, bare))
-            other = _enter(bare, replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False), prospect.form)
-            if effect.name in other.accepted and _description(other, channel) <= _description(found, channel):
-                found = other
+        for start, most in ((bare, None), (before, _SHAPES)):
+            search = _search(start.model, channel)
+            prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
+            prospects = sorted((p for p in prospects if p.evidence.gain > 0.0), key=lambda p: -p.evidence.gain)
+            for prospect in prospects[:most]:
+                effect = made_effect(prospect.form, _name(prospect.form, start))
+                new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
+                other = _enter(start, new, prospect.form)
+                if effect.name in other.accepted and _description(other, channel) <= _description(found, channel):
+                    found = other
     return found
 
 
@@ -132,7 +137,7 @@ def _with_heat_terms(selection: Selection) -> Selection:
 
 
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
-    """The same, or terms alone if these leave less by what matters and describe it more shortly.
+    """The same, or terms alone if these describe it more shortly, and leave less by what matters or are fewer causes.
 
     An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
     asked again beside the terms."""
@@ -149,7 +154,8 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     both = one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
     matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
-    return both if matters and _description(both, channel) < _description(found, channel) else found
+    fewer = len(_causes(both, channel)) < len(_causes(found, channel))
+    return both if (matters or fewer) and _description(both, channel) < _description(found, channel) else found
 
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
@@ -172,12 +178,24 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
 
 
 def _description(selection: Selection, channel: str) -> float:
-    """Description length of what lasts of a channel's residual, with all numbers of its effects and terms."""
+    """Description length of what lasts of a channel's residual, with all numbers of its effects and terms, and what each is:
+    the name of an effect is one of as many as places of a term, and further shapes of one place have said theirs."""
     model, samples = selection.model, LASTING[channel]
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
     matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
-    return description_length(max(left, matters), numbers, model.bench.episodes)
+    named = len(_causes(selection, channel)) * np.log(places(port for port in PORTS if _acts_on(model, port, channel)))
+    return description_length(max(left, matters), numbers, model.bench.episodes) + named
+
+
+def _acts_on(model: Model, port: str, channel: str) -> bool:
+    return model.bench.channel_of(HOOKS[port].channel) == channel
+
+
+def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
+    """What the effects and terms of a channel are: names, or ports with signals."""
+    own = [c for c in selection.candidates.values() if c.accepted and c.channel == channel]
+    return {(c.effect.hook, *sorted(c.signals)) if c.made else (c.effect.name,) for c in own}
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
@@ -259,7 +277,7 @@ def _with(
         q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
-        undecided_N=search.undecided(best, rivals),
+        alike=tuple((p.form.port, p.form.signals) for p in rivals), undecided_N=search.undecided(best, rivals),
         over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)], signals=best.form.signals,
     )  # fmt: skip
     if against:
