@@ -640,6 +640,52 @@ def test_a_term_is_made_for_what_no_catalogue_holds(calibration, coupled, tmp_pa
     assert errors(Bench(logs[1:], calibration), loaded).rmse("fused") == result.after.rmse("fused")
 
 
+def test_terms_that_logs_cannot_tell_apart_are_named_together(calibration, coupled, monkeypatch):
+    """Which of them is written out is chance: verdict and report name all, and what would tell."""
+    selection, *logs = coupled
+    [name] = selection.accepted
+    unsure = dataclasses.replace(
+        selection.candidates[name], alike=(("thickness", ("disc_speed",)),), manoeuvre=MANOEUVRES["brake_torque"]
+    )
+    monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection.noted([unsure]))
+    result = diagnose(logs[:1], calibration, logs[1:])
+    [entry] = [e for e in report(result)["effects"] if e["accepted"]]
+    assert entry["alike"] == [{"port": "thickness", "signals": ["disc_speed"]}]
+    told = verdict(result)
+    assert f"as likely it is of disc speed at the contact; what would tell: {MANOEUVRES['brake_torque']}" in told
+    assert "brake torque at the stiffness" in told
+
+
+def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves_as_much(coupled, monkeypatch):
+    """Growth with the disc's temperature, and a term beside it, where the term alone is all there is."""
+    selection = coupled[0]
+    [name] = selection.accepted
+    term = selection.candidates[name]
+    [growth] = selection.screening.test(selection.model, [e for e in REGISTRY if e.name == "disc_thermal_expansion"])
+    with_both = selection.entered([growth])
+    assert with_both.accepted == [name, "disc_thermal_expansion"]
+    catalogue = with_both.without(name, "what the catalogue alone had found")
+    monkeypatch.setattr(grammar, "_with_terms", lambda bare, channel: selection)
+    monkeypatch.setattr(grammar, "one_round", lambda terms: terms)
+    assert selection.model.noise("stiffness") > with_both.model.noise("stiffness") and term.made
+    assert grammar._without_shadows(with_both, catalogue, "stiffness").accepted == [name]
+
+
+def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_place(coupled):
+    """Where a term acts and what it follows has to be said once."""
+    selection = coupled[0]
+    [name] = selection.accepted
+    first = selection.candidates[name]
+    further, elsewhere = (
+        dataclasses.replace(first, effect=dataclasses.replace(first.effect, name=f"{name}:2", hook=hook))
+        for hook in (first.effect.hook, "thickness")
+    )
+    with_shape, with_place = (selection.noted([other]) for other in (further, elsewhere))
+    assert grammar._description(with_shape, "stiffness") == grammar._description(selection, "stiffness")
+    more = grammar._description(with_place, "stiffness") - grammar._description(selection, "stiffness")
+    assert np.log(20) < more < np.log(60)
+
+
 def test_a_contact_that_what_was_found_has_moved_is_as_unsure_as_that(calibration):
     """Logs of curves have found their own contact; of a drive, whose contact the fit of a term has moved, it is not known."""
     start = calibration.contact.clearance_rad
@@ -668,6 +714,7 @@ def test_a_term_is_taken_where_its_port_is_sure_though_its_signal_is_not(coupled
     found = grammar._one_more(bare, "stiffness")
     [term] = [c for name, c in found.candidates.items() if name not in bare.candidates]
     assert term.accepted == taken and term.confounded_with == " over ".join(rival).replace("_", " ") and term.manoeuvre
+    assert (port, (offered[-1],)) in term.alike
     undecided = diagnosis.undecided(found)
     before = found.model.bench.calibration
     after = diagnosis._with_noise(before, found).noise.stiffness_relative
@@ -844,6 +891,19 @@ def test_a_change_is_named_as_a_change_of_that_effect_and_no_other(found, change
     assert trial.named is named
 
 
+@pytest.mark.parametrize(
+    ("alike", "among_equals"),
+    [([], False), (["term:gear_gain:disc_temperature"], True), (["term:gear_friction:disc_temperature"], False)],
+)
+def test_truth_counts_among_equals_only_where_the_report_names_it(alike, among_equals):
+    values = {"size": 0.1, "signal": float(PLANT_SIGNALS.index("disc_temperature")), "other": -1.0}
+    found = {"term:gear_gain:pad_temperature": {}}
+    trial = blind.Trial(
+        1, "drawn", {"drawn_gear_gain": values}, 150.0, found, 90.0, 27.0, None, alike={next(iter(found)): alike}
+    )
+    assert not trial.named and trial.named_among_equals is among_equals
+
+
 def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, capsys):
     ran = []
 
@@ -861,7 +921,7 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
     # The line that was cut is run again, and the new plant; nothing else.
     assert ran[:3] == [1000, 1001, 40000] and sorted(ran[3:]) == [1002, 40000]
     table = capsys.readouterr().out
-    assert "| no effect | 3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0 |" in table
+    assert "| no effect | 3 | 3/3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0/1 | 0 |" in table
 
 
 def test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves(calibration):

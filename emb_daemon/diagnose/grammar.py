@@ -40,10 +40,10 @@ from emb_daemon.offline.score import rmse
 
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
-#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: then
-#: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all, unless
-#: they choose its port: all but a fifth must, because what the term follows there is not sure.
-_AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.2, 0.5, 0.8
+#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: what
+#: fewer choose is outside of a confidence of 95 %. What most bootstraps would not choose is not taken at all, unless they
+#: choose its port: all but a fifth must, because what the term follows there is not sure.
+_AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.05, 0.5, 0.8
 #: Terms of the heat balance in a calibration.
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
@@ -114,7 +114,8 @@ def search_heat(bench: warmth.HeatBench) -> Selection:
 
 
 def _with_heat_terms(selection: Selection) -> Selection:
-    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them.
+    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them by what
+    matters than for conductances and capacities that are refitted alone.
 
     They stand as fitted with conductances and capacities to a measured brake torque: in the whole estimator friction and force
     would have a say in them."""
@@ -129,8 +130,9 @@ def _with_heat_terms(selection: Selection) -> Selection:
     terms = msgspec.structs.replace(model.bench.calibration, terms=found.model.bench.calibration.terms)
     bare = model.without([c for c in model.values if c.channel == CHANNEL_OF_HEAT and not c.effect])
     there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
-    if there.noise(CHANNEL_OF_HEAT) >= model.noise(CHANNEL_OF_HEAT):
-        worse = "with a brake torque that is not measured temperatures are no better for it"
+    gained = model.noise(CHANNEL_OF_HEAT) - there.noise(CHANNEL_OF_HEAT)
+    if gained < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
+        worse = "with a brake torque that is not measured, what is recalibrated without it explains the temperatures as well"
         return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
     there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
     return replace(selection, model=there).noted(found.candidates.values())
@@ -223,7 +225,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     shares = _shares(search.screen, prospects)
     if not straight:
         return _best_fitted(selection, search, prospects, shares)
-    for prospect in prospects:
+    for prospect in _most_chosen_first(prospects, shares):
         # Where these logs cannot tell forms apart, one that is more than its port may bear is not the one.
         if prospect.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain:
             name = _name(prospect.form, selection)
@@ -231,6 +233,17 @@ def _one_more(selection: Selection, channel: str) -> Selection:
             if selection.candidates[name].reason != TOO_LARGE:
                 break
     return selection
+
+
+def _most_chosen_first(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """Prospects, before the others the one that most resampled episodes choose of those that gain as much as the first in as
+    few numbers: which of them gains a little more is chance."""
+    first = prospects[0]
+    equal = [
+        p for p in prospects if p.evidence.gain >= _AS_GOOD * first.evidence.gain and p.form.numbers <= first.form.numbers
+    ]
+    lead = max(equal, key=lambda p: shares[p.means])
+    return [lead, *(p for p in prospects if p is not lead)]
 
 
 def _best_fitted(
@@ -254,7 +267,7 @@ def _with(
 ) -> Selection:
     """With one of the ``prospects``, accepted if it is proven, else with what speaks against it; ``shares`` of bootstraps."""
     model, screening, channel = selection.model, selection.screening, search.channel
-    rivals = _as_good(best, [p for p in prospects if p is not best], shares)
+    rivals = _as_good(best, [p for p in prospects if p is not best], shares, model.bench.straight)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
     at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
     made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
@@ -349,11 +362,15 @@ def _arrived(model: Model, channel: str) -> Model:
     return model
 
 
-def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """The best forms of other ports and signals that gain nearly as much, or that resampled episodes would often choose."""
+def _as_good(
+    best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float], straight: bool
+) -> list[Prospect]:
+    """The best forms of other ports and signals that resampled episodes would choose often enough; also those that gain nearly
+    as much where a small step, by which the resampled ones choose, does not tell (not ``straight``)."""
     found: dict[tuple[str, str], Prospect] = {}
     for other in sorted(others, key=lambda p: -p.evidence.gain):
-        close = other.evidence.gain >= _AS_GOOD * best.evidence.gain or shares[other.means] >= _RIVAL
+        close = not straight and other.evidence.gain >= _AS_GOOD * best.evidence.gain
+        close |= shares[other.means] >= _RIVAL
         if other.means != best.means and close:
             found.setdefault(other.means, other)
     return list(found.values())
@@ -369,12 +386,16 @@ def _manoeuvre(form: Form, other: Form) -> str:
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
-    """Share of resampled episodes in which each port and signal would be chosen."""
+    """Share of resampled episodes in which each port and signal would be chosen: by the shortest description, as it is here."""
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     episodes = scores[0].u.shape[1]
     weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
-    chosen = np.argmax(gains, axis=0)
+    alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, episodes)
+    alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
+    left = np.maximum(1.0 - gains / np.maximum(alone, 1e-300), 1e-3)
+    numbers = np.array([prospect.form.numbers for prospect in prospects])
+    chosen = np.argmin(description_length(left, numbers[:, None], episodes), axis=0)
     shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)
     for index, count in zip(*np.unique(chosen, return_counts=True), strict=True):
         shares[prospects[index].means] += count / _BOOTSTRAPS
