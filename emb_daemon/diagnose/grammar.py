@@ -236,12 +236,9 @@ def _one_more(selection: Selection, channel: str) -> Selection:
 
 
 def _most_chosen_first(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """Prospects, before the others the one that most resampled episodes choose of those that gain as much as the first in as
-    few numbers: which of them gains a little more is chance."""
-    first = prospects[0]
-    equal = [
-        p for p in prospects if p.evidence.gain >= _AS_GOOD * first.evidence.gain and p.form.numbers <= first.form.numbers
-    ]
+    """Prospects, before the others the one that most resampled episodes choose of those that gain as much as the first: which
+    of them gains a little more is chance."""
+    equal = [p for p in prospects if p.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain]
     lead = max(equal, key=lambda p: shares[p.means])
     return [lead, *(p for p in prospects if p is not lead)]
 
@@ -386,7 +383,7 @@ def _manoeuvre(form: Form, other: Form) -> str:
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
-    """Share of resampled episodes in which each port and signal would be chosen: by the shortest description, as it is here."""
+    """Share of resampled episodes in which each port and signal would be chosen, by the shortest description as well."""
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     episodes = scores[0].u.shape[1]
     weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
