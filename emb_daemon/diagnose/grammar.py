@@ -30,7 +30,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round
+from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.base import HOOKS
@@ -88,23 +88,31 @@ def _has_room(selection: Selection, channel: str) -> bool:
 def _restated(found: Selection, before: Selection, channel: str) -> Selection:
     """The same, or an earlier term in another shape or of two shapes, if that alone describes the residual as shortly as it
     does with the last one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    last = found
     # Terms of the heat balance were fitted in all their shapes, and a ripple has but one.
     for name in _made(before, channel) if channel != CHANNEL_OF_HEAT else ():
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
         bare = before.without(name, "its shape was chosen again")
-        for start, most in ((bare, None), (before, _SHAPES)):
-            search = _search(start.model, channel)
-            prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
-            prospects = sorted((p for p in prospects if p.evidence.gain > 0.0), key=lambda p: -p.evidence.gain)
-            for prospect in prospects[:most]:
-                effect = made_effect(prospect.form, _name(prospect.form, start))
-                new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
-                other = _enter(start, new, prospect.form)
-                if effect.name in other.accepted and _description(other, channel) <= _description(found, channel):
-                    found = other
+        found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
+        if found is last:
+            further = _in_shapes(before, candidate, channel, _SHAPES)
+            found = min([*further, found], key=lambda s: _description(s, channel))
     return found
+
+
+def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int | None = None) -> list[Selection]:
+    """A selection with a term of the candidate's port and signals in each shape that holds, of at ``most`` so many that gain
+    most."""
+    search, result = _search(start.model, channel), []
+    prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
+    for prospect in sorted(prospects, key=lambda p: -p.evidence.gain)[:most]:
+        effect = made_effect(prospect.form, _name(prospect.form, start))
+        new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
+        other = _enter(start, new, prospect.form) if prospect.evidence.gain > 0.0 else start
+        result += [other] if effect.name in other.accepted else []
+    return result
 
 
 def search_heat(bench: warmth.HeatBench) -> Selection:
@@ -130,12 +138,14 @@ def _with_heat_terms(selection: Selection) -> Selection:
     terms = msgspec.structs.replace(model.bench.calibration, terms=found.model.bench.calibration.terms)
     bare = model.without([c for c in model.values if c.channel == CHANNEL_OF_HEAT and not c.effect])
     there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
-    gained = model.noise(CHANNEL_OF_HEAT) - there.noise(CHANNEL_OF_HEAT)
-    if gained < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
+    there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
+    with_terms = replace(selection, model=there).noted(found.candidates.values())
+    # As they would be applied: a friction of the pads that is not applied helps neither.
+    alone, beside = (settle_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
+    if alone - beside < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
         worse = "with a brake torque that is not measured, what is recalibrated without it explains the temperatures as well"
         return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
-    there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
-    return replace(selection, model=there).noted(found.candidates.values())
+    return with_terms
 
 
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
