@@ -44,6 +44,8 @@ _BOOTSTRAPS = 100
 #: fewer choose is outside of a confidence of 95 %. What most bootstraps would not choose is not taken at all, unless they
 #: choose its port: all but a fifth must, because what the term follows there is not sure.
 _AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.05, 0.5, 0.8
+#: Why a term goes whose gain the fit does not find again.
+_NOT_HELD = "fitted with everything else it no longer holds"
 #: Terms of the heat balance in a calibration.
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
@@ -222,7 +224,7 @@ def _wanted(selection: Selection, channel: str) -> bool:
 
 def _one_more(selection: Selection, channel: str) -> Selection:
     """With the best term for one channel, accepted if it is proven, else with what speaks against it; where that is that it is
-    too large, with the best that is as good."""
+    too large or does not hold, with the best that is as good."""
     model, screening = selection.model, selection.screening
     search = _search(model, channel)
     if search is None:
@@ -235,22 +237,21 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     shares = _shares(search.screen, prospects)
     if not straight:
         return _best_fitted(selection, search, prospects, shares)
-    for prospect in _most_chosen_first(prospects, shares):
-        # Where these logs cannot tell forms apart, one that is more than its port may bear is not the one.
-        if prospect.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain:
-            name = _name(prospect.form, selection)
-            selection = _with(selection, search, prospect, prospects, shares)
-            if selection.candidates[name].reason != TOO_LARGE:
-                break
+    for prospect in _most_chosen(prospects, shares):
+        name = _name(prospect.form, selection)
+        selection = _with(selection, search, prospect, prospects, shares)
+        # Where these logs cannot tell forms apart, one that is more than its port may bear, or that no fit leads to, is not
+        # the one.
+        if selection.candidates[name].reason not in (TOO_LARGE, _NOT_HELD):
+            break
     return selection
 
 
-def _most_chosen_first(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """Prospects, before the others the one that most resampled episodes choose of those that gain as much as the first: which
-    of them gains a little more is chance."""
+def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
+    more is chance."""
     equal = [p for p in prospects if p.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain]
-    lead = max(equal, key=lambda p: shares[p.means])
-    return [lead, *(p for p in prospects if p is not lead)]
+    return sorted(equal, key=lambda p: -shares[p.means])
 
 
 def _best_fitted(
@@ -434,7 +435,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
         gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel, made=True):
-        return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+        return selection.noted([replace(candidate, reason=_NOT_HELD)])
     fitted = next(term for term in bench.calibrated(model.values).terms if term.name == name)
     search = _search(model, channel) if fitted.is_held else None
     if not fitted.is_bounded or not (search is None or search.is_within(fitted)):
