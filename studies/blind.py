@@ -495,6 +495,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--foreign", type=int, default=10, help="plants per effect outside the catalogue")
     parser.add_argument("--drawn", type=int, default=16, help="plants with an effect that a seed draws from a wider family")
     parser.add_argument("--heat", type=int, default=16, help="the same in the heat balance")
+    parser.add_argument("--seeds", type=int, nargs="+", help="only these of the planned trials")
     parser.add_argument("--bare", action="store_true", help="make no terms: does the report say that something is left?")
     parser.add_argument("--output", type=Path, help="trials, one JSON object per line; those already there are not run again")
     parser.add_argument("--calibration", type=Path, help="default: the shipped one")
@@ -504,6 +505,7 @@ def main(argv: list[str] | None = None) -> int:
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     counts = arguments.null, arguments.single, arguments.pairs, arguments.foreign
     planned = plan(*counts, arguments.drawn, arguments.triples, arguments.changed, arguments.heat)
+    planned = [trial for trial in planned if not arguments.seeds or trial[0] in arguments.seeds]
     done = {_key(t.seed, t.kind, t.hidden, t.size): t for t in recorded(arguments.output)}
     trials = []
     for seed, kind, names, size in planned:

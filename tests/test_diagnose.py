@@ -981,6 +981,7 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
     assert blind.main(["--null", "3", *few]) == 0
     # The line that was cut is run again, and the new plant; nothing else.
     assert ran[:3] == [1000, 1001, 40000] and sorted(ran[3:]) == [1002, 40000]
+    assert blind.main(["--null", "5", *none, "--pairs", "0", "--seeds", "1004"]) == 0 and ran[5:] == [1004]
     table = capsys.readouterr().out
     assert "| no effect | 3 | 3/3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0/1 | 0 |" in table
 
