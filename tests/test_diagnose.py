@@ -671,7 +671,7 @@ def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves
     assert grammar._without_shadows(with_both, catalogue, "stiffness").accepted == [name]
 
 
-def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_place(coupled):
+def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_place(coupled, monkeypatch):
     """Where a term acts and what it follows has to be said once."""
     selection = coupled[0]
     [name] = selection.accepted
@@ -684,6 +684,9 @@ def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_plac
     assert grammar._description(with_shape, "stiffness") == grammar._description(selection, "stiffness")
     more = grammar._description(with_place, "stiffness") - grammar._description(selection, "stiffness")
     assert np.log(20) < more < np.log(60)
+    # Where no single shape will do, two of one place are tried before another place is believed.
+    monkeypatch.setattr(grammar, "_in_shapes", lambda start, *_: [with_shape] if start is selection else [])
+    assert grammar._restated(with_place, selection, "stiffness") is with_shape
 
 
 def _prospect(port, signals, numbers, gain, columns=()):
