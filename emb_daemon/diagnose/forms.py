@@ -5,7 +5,7 @@ term is a source of energy; friction is a factor on friction, which always oppos
 lags are stable by construction. Sizes are shares of what the signals cover in these logs.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -194,6 +194,12 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
                 # Of the plain product once is enough.
                 found += [replace(form, straight=True)] if straight and signal < other else []
     return found
+
+
+def places(ports: Iterable[str]) -> int:
+    """How many pairs of port and signal there are at some ports: what says where a term acts and what it follows is one of
+    these."""
+    return sum(len(_TYPED.get(port, ())) for port in ports)
 
 
 def harmonic(port: str, order: float, centre: float, covered: Mapping[str, tuple[float, float]]) -> Form:

@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
-from emb_daemon.diagnose.forms import Form, made_effect
+from emb_daemon.diagnose.forms import Form, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
@@ -30,26 +30,30 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round
+from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.base import HOOKS
-from emb_daemon.effects.terms import MOST, SIGNALS
+from emb_daemon.effects.terms import MOST, PORTS, SIGNALS
 from emb_daemon.offline.run import held
 from emb_daemon.offline.score import rmse
 
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
-#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: then
-#: the one that is named comes out of less than four fifths. What most bootstraps would not choose is not taken at all, unless
-#: they choose its port: all but a fifth must, because what the term follows there is not sure.
-_AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.2, 0.5, 0.8
+#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: what
+#: fewer choose is outside of a confidence of 95 %. What most bootstraps would not choose is not taken at all, unless they
+#: choose its port: all but a fifth must, because what the term follows there is not sure.
+_AS_GOOD, _RIVAL, _MOST, _SAME_PORT = 0.95, 0.05, 0.5, 0.8
+#: Why a term goes whose gain the fit does not find again.
+_NOT_HELD = "fitted with everything else it no longer holds"
 #: Terms of the heat balance in a calibration.
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
 _FITTED = 4
 #: Fits after another that such a term is given, and share of the mean square from which another gains nothing.
 _FITS, _LITTLE = 8, 0.98
+#: Further shapes of one place that are fitted beside the first.
+_SHAPES = 3
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 
@@ -84,22 +88,33 @@ def _has_room(selection: Selection, channel: str) -> bool:
 
 
 def _restated(found: Selection, before: Selection, channel: str) -> Selection:
-    """The same, or an earlier term in another shape, if that alone describes the residual as shortly as it does with the last
-    one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    """The same, or an earlier term in another shape or of two shapes, if that alone describes the residual as shortly as it
+    does with the last one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    last = found
     # Terms of the heat balance were fitted in all their shapes, and a ripple has but one.
     for name in _made(before, channel) if channel != CHANNEL_OF_HEAT else ():
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
         bare = before.without(name, "its shape was chosen again")
-        search = _search(bare.model, channel)
-        prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
-        for prospect in (p for p in prospects if p.evidence.gain > 0.0):
-            effect = made_effect(prospect.form, _name(prospect.form, bare))
-            other = _enter(bare, replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False), prospect.form)
-            if effect.name in other.accepted and _description(other, channel) <= _description(found, channel):
-                found = other
+        found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
+        if found is last:
+            further = _in_shapes(before, candidate, channel, _SHAPES)
+            found = min([*further, found], key=lambda s: _description(s, channel))
     return found
+
+
+def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int | None = None) -> list[Selection]:
+    """A selection with a term of the candidate's port and signals in each shape that holds, of at ``most`` so many that gain
+    most."""
+    search, result = _search(start.model, channel), []
+    prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
+    for prospect in sorted(prospects, key=lambda p: -p.evidence.gain)[:most]:
+        effect = made_effect(prospect.form, _name(prospect.form, start))
+        new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
+        other = _enter(start, new, prospect.form) if prospect.evidence.gain > 0.0 else start
+        result += [other] if effect.name in other.accepted else []
+    return result
 
 
 def search_heat(bench: warmth.HeatBench) -> Selection:
@@ -109,7 +124,8 @@ def search_heat(bench: warmth.HeatBench) -> Selection:
 
 
 def _with_heat_terms(selection: Selection) -> Selection:
-    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them.
+    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them by what
+    matters than for conductances and capacities that are refitted alone.
 
     They stand as fitted with conductances and capacities to a measured brake torque: in the whole estimator friction and force
     would have a say in them."""
@@ -124,15 +140,18 @@ def _with_heat_terms(selection: Selection) -> Selection:
     terms = msgspec.structs.replace(model.bench.calibration, terms=found.model.bench.calibration.terms)
     bare = model.without([c for c in model.values if c.channel == CHANNEL_OF_HEAT and not c.effect])
     there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
-    if there.noise(CHANNEL_OF_HEAT) >= model.noise(CHANNEL_OF_HEAT):
-        worse = "with a brake torque that is not measured temperatures are no better for it"
-        return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
     there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
-    return replace(selection, model=there).noted(found.candidates.values())
+    with_terms = replace(selection, model=there).noted(found.candidates.values())
+    # As they would be applied: a friction of the pads that is not applied helps neither.
+    alone, beside = (settle_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
+    if alone - beside < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
+        worse = "with a brake torque that is not measured, what is recalibrated without it explains the temperatures as well"
+        return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
+    return with_terms
 
 
 def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Selection:
-    """The same, or terms alone if these leave less by what matters and describe it more shortly.
+    """The same, or terms alone if these describe it more shortly, and leave less by what matters or are fewer causes.
 
     An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
     asked again beside the terms."""
@@ -149,7 +168,8 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     both = one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
     matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
-    return both if matters and _description(both, channel) < _description(found, channel) else found
+    fewer = len(_causes(both, channel)) < len(_causes(found, channel))
+    return both if (matters or fewer) and _description(both, channel) < _description(found, channel) else found
 
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
@@ -172,12 +192,24 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
 
 
 def _description(selection: Selection, channel: str) -> float:
-    """Description length of what lasts of a channel's residual, with all numbers of its effects and terms."""
+    """Description length of what lasts of a channel's residual, with all numbers of its effects and terms, and what each is:
+    the name of an effect is one of as many as places of a term, and further shapes of one place have said theirs."""
     model, samples = selection.model, LASTING[channel]
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
     matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
-    return description_length(max(left, matters), numbers, model.bench.episodes)
+    named = len(_causes(selection, channel)) * np.log(places(port for port in PORTS if _acts_on(model, port, channel)))
+    return description_length(max(left, matters), numbers, model.bench.episodes) + named
+
+
+def _acts_on(model: Model, port: str, channel: str) -> bool:
+    return model.bench.channel_of(HOOKS[port].channel) == channel
+
+
+def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
+    """What the effects and terms of a channel are: names, or ports with signals."""
+    own = [c for c in selection.candidates.values() if c.accepted and c.channel == channel]
+    return {(c.effect.hook, *sorted(c.signals)) if c.made else (c.effect.name,) for c in own}
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
@@ -192,7 +224,7 @@ def _wanted(selection: Selection, channel: str) -> bool:
 
 def _one_more(selection: Selection, channel: str) -> Selection:
     """With the best term for one channel, accepted if it is proven, else with what speaks against it; where that is that it is
-    too large, with the best that is as good."""
+    too large or does not hold, with the best that is as good."""
     model, screening = selection.model, selection.screening
     search = _search(model, channel)
     if search is None:
@@ -205,14 +237,21 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     shares = _shares(search.screen, prospects)
     if not straight:
         return _best_fitted(selection, search, prospects, shares)
-    for prospect in prospects:
-        # Where these logs cannot tell forms apart, one that is more than its port may bear is not the one.
-        if prospect.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain:
-            name = _name(prospect.form, selection)
-            selection = _with(selection, search, prospect, prospects, shares)
-            if selection.candidates[name].reason != TOO_LARGE:
-                break
+    for prospect in _most_chosen(prospects, shares):
+        name = _name(prospect.form, selection)
+        selection = _with(selection, search, prospect, prospects, shares)
+        # Where these logs cannot tell forms apart, one that is more than its port may bear, or that no fit leads to, is not
+        # the one.
+        if selection.candidates[name].reason not in (TOO_LARGE, _NOT_HELD):
+            break
     return selection
+
+
+def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
+    more is chance."""
+    equal = [p for p in prospects if p.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain]
+    return sorted(equal, key=lambda p: -shares[p.means])
 
 
 def _best_fitted(
@@ -236,7 +275,7 @@ def _with(
 ) -> Selection:
     """With one of the ``prospects``, accepted if it is proven, else with what speaks against it; ``shares`` of bootstraps."""
     model, screening, channel = selection.model, selection.screening, search.channel
-    rivals = _as_good(best, [p for p in prospects if p is not best], shares)
+    rivals = _as_good(best, [p for p in prospects if p is not best], shares, model.bench.straight)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
     at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
     made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
@@ -259,7 +298,7 @@ def _with(
         q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
-        undecided_N=search.undecided(best, rivals),
+        alike=tuple((p.form.port, p.form.signals) for p in rivals), undecided_N=search.undecided(best, rivals),
         over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)], signals=best.form.signals,
     )  # fmt: skip
     if against:
@@ -331,11 +370,15 @@ def _arrived(model: Model, channel: str) -> Model:
     return model
 
 
-def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """The best forms of other ports and signals that gain nearly as much, or that resampled episodes would often choose."""
+def _as_good(
+    best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float], straight: bool
+) -> list[Prospect]:
+    """The best forms of other ports and signals that resampled episodes would choose often enough; also those that gain nearly
+    as much where a small step, by which the resampled ones choose, does not tell (not ``straight``)."""
     found: dict[tuple[str, str], Prospect] = {}
     for other in sorted(others, key=lambda p: -p.evidence.gain):
-        close = other.evidence.gain >= _AS_GOOD * best.evidence.gain or shares[other.means] >= _RIVAL
+        close = not straight and other.evidence.gain >= _AS_GOOD * best.evidence.gain
+        close |= shares[other.means] >= _RIVAL
         if other.means != best.means and close:
             found.setdefault(other.means, other)
     return list(found.values())
@@ -351,12 +394,16 @@ def _manoeuvre(form: Form, other: Form) -> str:
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
-    """Share of resampled episodes in which each port and signal would be chosen."""
+    """Share of resampled episodes in which each port and signal would be chosen, by the shortest description as well."""
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     episodes = scores[0].u.shape[1]
     weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
-    chosen = np.argmax(gains, axis=0)
+    alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, episodes)
+    alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
+    left = np.maximum(1.0 - gains / np.maximum(alone, 1e-300), 1e-3)
+    numbers = np.array([prospect.form.numbers for prospect in prospects])
+    chosen = np.argmin(description_length(left, numbers[:, None], episodes), axis=0)
     shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)
     for index, count in zip(*np.unique(chosen, return_counts=True), strict=True):
         shares[prospects[index].means] += count / _BOOTSTRAPS
@@ -388,7 +435,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
         gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel, made=True):
-        return selection.noted([replace(candidate, reason="fitted with everything else it no longer holds")])
+        return selection.noted([replace(candidate, reason=_NOT_HELD)])
     fitted = next(term for term in bench.calibrated(model.values).terms if term.name == name)
     search = _search(model, channel) if fitted.is_held else None
     if not fitted.is_bounded or not (search is None or search.is_within(fitted)):

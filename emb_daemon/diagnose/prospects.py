@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -460,8 +461,9 @@ def _length(prospect: Prospect, alone: float, episodes: int) -> float:
     return description_length(left, prospect.form.numbers, episodes)
 
 
-def description_length(left: float, numbers: int, episodes: int) -> float:
-    """Description length of a squared error and the numbers of what left it; an episode counts as one observation."""
+def description_length(left: Any, numbers: Any, episodes: int) -> Any:
+    """Description length of a squared error and the numbers of what left it, or of arrays of these; an episode counts as one
+    observation."""
     return 0.5 * episodes * np.log(left) + 0.5 * numbers * np.log(episodes)
 
 

@@ -106,6 +106,7 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
     }
     if finding.made:
         entry |= {"made": True, "port": effect.hook, "signals": [*finding.signals]}
+        entry |= {"alike": [{"port": port, "signals": [*signals]} for port, signals in finding.alike]}
         terms = {term.name: term for term in diagnosis.calibration.terms}
         if effect.name in terms:
             term = terms[effect.name]

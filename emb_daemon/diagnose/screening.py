@@ -66,7 +66,8 @@ class Candidate:
         contribution: what it takes from the channel's residual, at every sample.
         over: its signal at every sample, for a term; signals: that and what multiplies.
         names: the term in whose place it stands, by which its chance was judged.
-        undecided_N: RMS by which rivals that these logs cannot tell from it do otherwise.
+        alike: port and signals of the terms that these logs cannot tell from it, as good as it first.
+        undecided_N: RMS by which those do otherwise.
     """
 
     effect: Effect
@@ -89,6 +90,7 @@ class Candidate:
     confounded_with: str | None = None
     manoeuvre: str | None = None
     names: str = ""
+    alike: tuple[tuple[str, tuple[str, ...]], ...] = ()
     undecided_N: float = 0.0
     contribution: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     over: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)

@@ -41,9 +41,22 @@ def number(value: float, sigma: float = 0.0) -> str:
 
 def title(finding: Candidate) -> str:
     if finding.made:
-        follows = " times ".join(finding.signals).replace("_", " ")
-        return f"a term of {follows} at {_PORTS.get(finding.effect.hook, finding.effect.hook)}"
+        return f"a term of {_place(finding.effect.hook, finding.signals)}"
     return finding.effect.name.replace("_", " ")
+
+
+def _place(port: str, signals: tuple[str, ...]) -> str:
+    """What a term follows, and where it acts."""
+    return f"{' times '.join(signals).replace('_', ' ')} at {_PORTS.get(port, port)}"
+
+
+def _told(finding: Candidate) -> str:
+    """A finding with its numbers; a term with all that these logs cannot tell from it, which is as much a finding as it is."""
+    if not finding.made:
+        return f"{title(finding)} ({size(finding)})"
+    others = " or ".join(_place(*place) for place in finding.alike)
+    equals = f"; as likely it is of {others}; what would tell: {finding.manoeuvre}" if others else ""
+    return f"{title(finding)} ({finding.effect.equation}{equals})"
 
 
 def size(finding: Candidate) -> str:
@@ -73,8 +86,8 @@ def verdict(diagnosis: Diagnosis) -> str:
     change = f"error {before:.1f} N → {after:.1f} N {where}"
     if not diagnosis.bench.has_current:
         change += "; no motor current was recorded, so the stiffness path alone was diagnosed"
-    found = [f"{title(f)} ({f.effect.equation if f.made else size(f)})" for f in diagnosis.accepted if not f.in_calibration]
-    changed = [f"{title(f)} ({size(f)})" for f in diagnosis.accepted if f.in_calibration]
+    found = [_told(f) for f in diagnosis.accepted if not f.in_calibration]
+    changed = [_told(f) for f in diagnosis.accepted if f.in_calibration]
     sentences = [f"Found: {' and '.join(found)}"] if found else []
     if changed:
         sentences.append(f"{'n' if found else 'N'}ot as calibrated: {' and '.join(changed)}")
