@@ -7,7 +7,7 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import common
+from emb_daemon.estimator import common, restart
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.unknown import GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.models.fusion import GAIN, INERTIA
@@ -101,20 +101,35 @@ def test_what_a_stop_has_shown_of_pads_and_rotor_is_remembered(p):
     assert [state[name] for name in ("pads_odds", "rotor_odds", "unit_odds")] == shown
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_another_unit_with_the_calibration_of_this_is_covered(p, seed):
-    """Pads 3.5 % stiffer, a motor 1.2 % weaker and a rotor 11 % heavier: the torque constant explains the most of it."""
-    path = brake.stops(p, 12, seed)
-    own, force = brake.samples(p, path)
-    as_calibrated = estimate(brake.noisy(own, p, seed), p)
+def _of_another_unit(p):
+    """Pads 3.5 % stiffer, a motor 1.2 % weaker and a rotor 11 % heavier."""
     true = p.copy()
     true["curve"] *= 1.035
     true["torque_constant"] *= 0.988
     true["inertia"] *= 1.11
-    rows, other_force = brake.samples(true, path)
+    return true
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_another_unit_with_the_calibration_of_this_is_covered(p, seed):
+    """The torque constant explains most of its pads."""
+    path = brake.stops(p, 12, seed)
+    own, force = brake.samples(p, path)
+    as_calibrated = estimate(brake.noisy(own, p, seed), p)
+    rows, other_force = brake.samples(_of_another_unit(p), path)
     estimates = estimate(brake.noisy(rows, p, seed), p)
     clamped = (other_force > 5000.0) & (np.arange(len(rows)) > len(rows) // 2)
     assert np.mean(np.abs(estimates["force"] - other_force)[clamped] > 3.0 * estimates["sigma"][clamped]) < 0.005
     # Without making every brake uncertain.
     assert np.median(as_calibrated["sigma"][clamped]) < 0.012 * np.median(force[clamped])
     assert np.all(as_calibrated["mode"][clamped] == RUNNING)
+
+
+def test_after_a_restart_it_counts_from_the_first_sample(p):
+    rows, _ = brake.samples(_of_another_unit(p), brake.stops(p, 12, 1))
+    rows, state, restarted, snapshot = brake.noisy(rows, p), new_state(), new_state(), np.zeros(1, restart.SNAPSHOT)[0]
+    estimate(rows, p, state)
+    assert restart.take_snapshot(state[0], p, snapshot)
+    restart.resume(restarted[0], p, snapshot, 0.1)
+    estimate(rows[:1], p, restarted)
+    assert common.common_sigma(restarted[0], p) > 0.8 * common.common_sigma(state[0], p) > 0.01

@@ -802,6 +802,21 @@ def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves
     assert grammar._without_shadows(with_both, catalogue, "stiffness").accepted == [name]
 
 
+def test_an_effect_gives_way_to_no_more_terms_than_stood_beside_it(coupled, monkeypatch):
+    """Two shapes of one term are one cause, as an effect is, but the effect has a name."""
+    selection = coupled[0]
+    [name] = selection.accepted
+    first = selection.candidates[name]
+    further = dataclasses.replace(first, effect=dataclasses.replace(first.effect, name=f"{name}:2"))
+    [growth] = selection.screening.test(selection.model, [e for e in REGISTRY if e.name == "disc_thermal_expansion"])
+    with_both, two_shapes = selection.entered([growth]), selection.noted([further])
+    monkeypatch.setattr(grammar, "_with_terms", lambda bare, channel: two_shapes)
+    monkeypatch.setattr(grammar, "one_round", lambda terms: terms)
+    assert grammar._description(two_shapes, "stiffness") < grammar._description(with_both, "stiffness")
+    catalogue = with_both.without(name, "what the catalogue alone had found")
+    assert grammar._without_shadows(with_both, catalogue, "stiffness") is with_both
+
+
 def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_place(coupled, monkeypatch):
     """Where a term acts and what it follows has to be said once."""
     selection = coupled[0]

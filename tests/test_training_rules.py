@@ -537,12 +537,20 @@ def applied(kept, moved=0.02, sigma=0.03):
     state["alternatives"]["error"], state["alternatives"]["covariance"] = state["error"], 2.0 * state["covariance"]
     state["contact_angle"], state["past_contact"], state["scale"], state["winding"], state["housing"] = 8.0, 2.0, 1.1, 0.3, 0.2
     state["contact_anchor"], state["contact"]["lost"], state["resumed"] = 7.9, True, True
+    state["rotor_odds"] = state["unit_odds"] = 1e-9
     reached["contact_angle"], reached["past_contact"], reached["force"] = 8.0 + moved, 2.0 - moved, 900.0
     a["contact_angle"], a["contact_sigma"], a["torque_error"], a["torque_error_sigma"] = 8.0 + moved, sigma, 0.04, 0.01
     a["inertia_error"], a["inertia_sigma"] = 0.05, 0.02
     before = state.copy()
     training.apply_learned(state, p, reached, np.zeros(0, r.TRAINING), learned, a)
     return before, state, a, learned
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_was_shown_of_the_unit_holds_for_the_curve_that_showed_it(kept):
+    """What motor, rotor and the new values leave open of the force is weighed at once."""
+    _, state, *_ = applied(kept)
+    assert state["common"] > 0.0 and (state["rotor_odds"] == 1e-9) == (state["unit_odds"] == 1e-9) == kept
 
 
 OF_THE_MOTOR = [GAIN, OFFSET, FADE, HOUSING, INERTIA]

@@ -41,8 +41,8 @@ from emb_daemon.offline.score import rmse
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
 #: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: what
-#: fewer choose is outside of a confidence of 95 %. A term whose port a fifth of them does not choose is not taken: in the
-#: EMPS benchmark, three quarters choose one that takes half of the published offset.
+#: fewer choose is outside of a confidence of 95 %. Four fifths must choose the port of a term that is taken, which is in the
+#: upper half of what stability selection uses (Meinshausen and Bühlmann, J. Royal Statistical Society B 72, 2010: 0.6 to 0.9).
 _AS_GOOD, _RIVAL, _SAME_PORT = 0.95, 0.05, 0.8
 #: Why a term goes whose gain the fit does not find again.
 _NOT_HELD = "fitted with everything else it no longer holds"
