@@ -4,6 +4,8 @@ Run as ``python tests/fuzz/files.py {yaml,candump} [COUNT] [SEED]``; prints how 
 time of one.
 """
 
+import contextlib
+import io
 import math
 import random
 import sys
@@ -73,7 +75,9 @@ def run(good: bytes, name: str, read: Callable[[Path], None], count: int, seed: 
             path.write_bytes(content := edited(good, draw))
             began = time.perf_counter()
             try:
-                read(path)
+                # What a reader says of a log that is cut off is no finding.
+                with contextlib.redirect_stderr(io.StringIO()):
+                    read(path)
                 taken += 1
             except InputError as error:
                 assert str(error), content
