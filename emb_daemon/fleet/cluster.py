@@ -54,17 +54,25 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
                 yield client
             return
         count = workers or len(os.sched_getaffinity(0))
-        with (
-            LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.ERROR,
-            ) as local,
-            Client(local) as client,
-        ):
-            yield client
+        local = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.ERROR,
+        )
+        try:
+            with Client(local) as client:
+                try:
+                    yield client
+                finally:
+                    # Distributed cannot close a worker that it is just starting again after its death.
+                    with contextlib.suppress(TimeoutError):
+                        client.wait_for_workers(count, timeout=_PATIENCE_S)
+        finally:
+            # What the work gave is in files; a worker that could not be closed ends with this process.
+            with contextlib.suppress(AssertionError):
+                local.close()
 
 
 _Item = TypeVar("_Item")
