@@ -86,6 +86,19 @@ def test_lost_frames_are_counted_across_turns_of_the_counter(lost):
     assert (corner.missing, corner.damaged) == (lost, 0)
 
 
+@pytest.mark.parametrize("catches_up", [True, False])
+@pytest.mark.parametrize("stalled", [5, 8, 10.5, 14, 20, 100])
+def test_a_sender_that_stands_still_has_lost_no_frames(stalled, catches_up):
+    """Its counter goes on where it was, whether it makes up for the time or leaves it out."""
+    frames = [_force(c) for c in range(60)]
+    for cycle, frame in enumerate(frames[20:], 20):
+        back = 20 + stalled
+        late = max(back - cycle, 0) if catches_up else stalled
+        frame["time_ns"] += np.int64(late * 4_000_000)
+    corner = _hear(*frames).corners[0]
+    assert (corner.missing, corner.damaged, corner.streams[0].received) == (0, 0, 60)
+
+
 def test_a_damaged_or_repeated_frame_changes_nothing():
     bad = _force(1, 9.0)
     bad["data"] ^= np.uint64(1 << 20)

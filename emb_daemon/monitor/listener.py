@@ -25,6 +25,8 @@ from emb_daemon.wire.layout import (
 )
 
 HISTORY_S = 60
+#: Share of a cycle by which a sender that keeps its schedule may be early or late: 1 ms for the force.
+_JITTER_CYCLES = 0.25
 SECOND_NS = 1_000_000_000
 
 
@@ -34,7 +36,8 @@ class Stream:
 
     Attributes:
         values: signals of the last good frame in the DBC's order and units; empty before the first.
-        received, missing, damaged: good frames; frames missing by the counter; frames with a wrong CRC or a repeated counter.
+        received, missing, damaged: good frames; frames missing by the counter, whose complete turns the time tells; frames
+        with a wrong CRC or a repeated counter.
     """
 
     cycle_ns: int
@@ -62,8 +65,11 @@ class Stream:
             if step == 0 and elapsed < COUNTER_MODULO / 2:
                 self.damaged += 1
                 return False
-            # The elapsed time gives the number of complete turns of the counter.
-            step += COUNTER_MODULO * max(0, round((elapsed - step) / COUNTER_MODULO))
+            # Complete turns of the counter show only in the elapsed time, and only of a sender that kept its schedule
+            # meanwhile: one that stood still has sent no more than its counter says.
+            turns = max(0, round((elapsed - step) / COUNTER_MODULO))
+            if abs(elapsed - step - COUNTER_MODULO * turns) <= _JITTER_CYCLES:
+                step += COUNTER_MODULO * turns
             self.missing += max(step - 1, 0)
         self.values, self.status, self.counter, self.time_ns = values, status, counter, time_ns
         self.received += 1
