@@ -314,6 +314,32 @@ def test_a_change_is_logged_as_its_corners(driven, caplog, corner, name):
     assert caplog.text.count("corner") == caplog.text.count(f"corner {name}: degraded (signal stuck)") == 1
 
 
+def test_of_many_changes_the_first_and_the_last_are_logged(driven, caplog):
+    """A machine that is too slow changes the reasons at nearly every tick. Nothing is lost but what came between: the last
+    state is in the log when ten seconds are over, and another corner's are not held up."""
+    estimate = driven.daemon.pipeline.estimates[0]
+
+    def change(corner, reasons, after_s):
+        estimate["corner"], estimate["mode"], estimate["reasons"] = corner, r.DEGRADED, reasons
+        driven.pacer.last_tick_ns = begin_ns + round(1e9 * after_s)
+        driven.daemon._follow(1, driven.pacer)
+
+    begin_ns = driven.pacer.last_tick_ns + 20_000_000_000
+    for number in range(500):
+        change(1, r.RESOLVER_LOST if number % 2 else r.RESOLVER_LOST | r.CURRENT_LOST, 0.01 * number)
+    change(1, r.STUCK, 5.0)
+    change(2, r.STUCK, 5.1)
+    assert caplog.text.count("corner FR") == 10 and caplog.text.count("corner RL: degraded (signal stuck)") == 1
+    change(1, r.STUCK, 9.9)
+    assert caplog.text.count("corner FR") == 10
+    for after_s in (10.0, 10.1, 30.0):
+        change(1, r.STUCK, after_s)
+    assert caplog.text.count("corner FR") == 11
+    assert "corner FR: degraded (signal stuck), after 491 changes that were not logged" in caplog.text
+    change(1, r.CURRENT_LOST, 30.1)
+    assert "corner FR: degraded (current lost)\n" in caplog.text
+
+
 def test_a_loop_that_misses_most_of_its_ticks_is_not_well(driven, caplog):
     driven.run(20)
     assert _pinged(driven.daemon)

@@ -45,6 +45,9 @@ _TOGETHER_NS = 400_000
 #: Time for which a disturbance of bus or loop is reported with the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
+#: Changes of a corner's mode or reasons that are logged within this time, ns. A machine that is too slow makes hundreds a
+#: second, and writing them would make it slower.
+_LOGGED_CHANGES, _CHANGES_NS = 10, 10_000_000_000
 #: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
@@ -166,6 +169,9 @@ class Daemon:
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
         self._reported = np.full(len(CORNERS), -1, np.int64)
+        #: By corner: begin of the time in which changes are counted, and changes in it.
+        self._changes_from_ns = [-_CHANGES_NS] * len(CORNERS)
+        self._changes = [0] * len(CORNERS)
         self._arrivals = np.zeros(len(CORNERS), np.int64)
 
     def stop(self) -> None:
@@ -285,10 +291,26 @@ class Daemon:
         for corner in range(len(CORNERS)):
             if self._arrivals[corner]:
                 pacer.arrived(corner, int(self._arrivals[corner]))
-            if changed >> corner & 1:
-                self._report(corner, int(self._reported[corner]))
+        if changed or max(self._changes) > _LOGGED_CHANGES:
+            self._report_changes(changed, pacer.last_tick_ns)
 
-    def _report(self, corner: int, state: int) -> None:
+    def _report_changes(self, changed: int, now_ns: int) -> None:
+        """Log the states of ``changed`` corners. Of those that change too often, the last state follows when their time is
+        over."""
+        for corner in range(len(CORNERS)):
+            unlogged = max(self._changes[corner] - _LOGGED_CHANGES, 0)
+            if now_ns - self._changes_from_ns[corner] >= _CHANGES_NS and (unlogged or changed >> corner & 1):
+                self._changes_from_ns[corner], self._changes[corner] = now_ns, 0
+                if unlogged:
+                    self._report(corner, f", after {unlogged} changes that were not logged")
+                    continue
+            if changed >> corner & 1:
+                self._changes[corner] += 1
+                if self._changes[corner] <= _LOGGED_CHANGES:
+                    self._report(corner)
+
+    def _report(self, corner: int, after: str = "") -> None:
+        state = int(self._reported[corner])
         mode, reasons = state >> 16, state & 0xFFFF
         words = contract.reason_words(reasons)
         amiss = mode in (contract.DEGRADED, contract.FAULT)
@@ -296,7 +318,7 @@ class Daemon:
         # Disturbances of bus and loop are logged once for all corners; here they are only mentioned.
         none = "bus or loop" if amiss else "none"
         fields = {"corner": CORNERS[corner], "mode": contract.MODES[mode], "reasons": ", ".join(words) or none}
-        log.log(level, "corner %(corner)s: %(mode)s (%(reasons)s)", fields, extra={"fields": fields})
+        log.log(level, f"corner %(corner)s: %(mode)s (%(reasons)s){after}", fields, extra={"fields": fields})
 
     def _count(self, now_ns: int, pacer: Pacer) -> None:
         late = (now_ns - pacer.last_tick_ns) / CYCLE_NS - 1.0
