@@ -49,7 +49,7 @@ PAIRING_S = 0.002
 
 COLD_START_S = 780  # all kernels compiled: 290 to 410 s seen, by what other guests left of the CPU
 WARM_START_S = 120  # 12 to 17 s seen, and more than 30
-MAXIMAL_EXPOSURE = 3.0
+MAXIMAL_EXPOSURE = 1.1
 
 
 def wait_for_another(pid: int) -> float:
