@@ -18,6 +18,7 @@ from time import thread_time_ns
 
 import numpy as np
 
+from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
@@ -70,14 +71,16 @@ def _taken(frames, strange, receptions, layout):
     return count
 
 
-def _drive(seconds: float, seed: int) -> np.ndarray:
+def drive(seconds: float, seed: int) -> np.ndarray:
+    """Frames of one corner in the city."""
     plant = np.array([plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed)])
     schedule = city_drive().first(seconds)
     return Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)[0]
 
 
-def _estimates(frames: np.ndarray) -> np.ndarray:
-    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 17)
+def estimated(frames: np.ndarray, adaptation: Adaptation | None = None) -> np.ndarray:
+    """ESTIMATE rows of a corner with the shipped calibration."""
+    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 17, adaptation=adaptation)
     pipeline.begin(int(frames["time_ns"][0]))
     _, count = pipeline.consume(frames, predictions=False)
     return pipeline.estimates[:count].copy()
@@ -235,14 +238,14 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
     keys, nobody = keys_of(seed)
     genuine = signed(frames, keys)
     keys["nobody"] = nobody
-    good = _estimates(Verifier(_RECEIVED, keys, {}).verify(genuine))
+    good = estimated(Verifier(_RECEIVED, keys, {}).verify(genuine))
     totals = {name: np.zeros(4, int) for name in FORGERIES}
     turn = 0
     while sum(total[0] for total in totals.values()) < count:
         for number, (name, total) in enumerate(totals.items()):
             foreign = forged(name, genuine, np.random.default_rng((seed, turn, number)), keys)
             heard, missing, others = believed(genuine, foreign, keys)
-            estimates = _estimates(heard)
+            estimates = estimated(heard)
             changed = np.sum(estimates["force"] != good["force"]) if len(estimates) == len(good) else len(good)
             total += (len(foreign), others, missing, changed)
         turn += 1
@@ -260,14 +263,14 @@ def _cost(seed: int) -> None:
     calibration = load_calibration(resource("config/calibration.yaml"))
     plants = np.array([plant_from_calibration(calibration, seed + k) for k in range(4)])
     schedule = city_drive().first(20.0)
-    drive = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]
+    frames = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]
     received, sent = load_links()
     keys = {link.name: link.name.encode().ljust(16)[:16] for link in (*received, *sent)}
     car, verifier, signer = Signer(received, keys, 1), Verifier(received, keys, {}), Signer(sent, keys, 1)
     pipeline = Pipeline(np.repeat(to_parameters(calibration), 4), CORNERS)
     pipeline.begin(_START_NS)
     spent, answers = {"verify": [], "sign": []}, 0
-    for cycle in np.split(drive, np.flatnonzero(np.diff((drive["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
+    for cycle in np.split(frames, np.flatnonzero(np.diff((frames["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
         authentic = car.sign(cycle)
         began = thread_time_ns()
         heard = verifier.verify(authentic)
@@ -280,7 +283,7 @@ def _cost(seed: int) -> None:
     figures = [f"{name} {1e-3 * np.median(times):.0f} µs" for name, times in spent.items()]
     ticks = len(spent["sign"])
     print(
-        f"\nA tick of four corners: {figures[0]} of {len(drive) / ticks:.1f} frames and their authentication that are heard,"
+        f"\nA tick of four corners: {figures[0]} of {len(frames) / ticks:.1f} frames and their authentication that are heard,"
     )
     print(f"{figures[1]} of {answers / ticks:.1f} that are sent")
 
@@ -291,8 +294,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--frames", type=int, default=1_000_000, help="foreign frames among authenticated ones, at least")
     arguments = parser.parse_args()
-    rng, frames = np.random.default_rng(arguments.seed), _drive(arguments.seconds, arguments.seed)
-    good = _estimates(frames)
+    rng, frames = np.random.default_rng(arguments.seed), drive(arguments.seconds, arguments.seed)
+    good = estimated(frames)
     attacks = [(f"forged, {ahead} ms ahead of the genuine frame", forged_ahead(frames, ahead)) for ahead in _AHEAD_MS]
     attacks += [(f"played back after {old} s, 0.5 ms ahead", played_back(frames, old)) for old in _OLD_S]
     attacks.append((f"{_FLOOD_PER_S} valid frames/s of any counter on one id", flood(frames, rng)))
@@ -303,7 +306,7 @@ def main() -> None:
         mixed = np.concatenate([frames, foreign])
         order = np.argsort(mixed["time_ns"], kind="stable")
         taken = _taken(mixed[order], order >= len(frames), new_reception(), default_layout())
-        estimates = _estimates(mixed[order])
+        estimates = estimated(mixed[order])
         estimates = estimates[estimates["time_ns"] >= foreign["time_ns"][0]]
         usable = estimates[estimates["mode"] != FAULT]
         off = np.abs(usable["force"] - np.interp(usable["time_ns"], good["time_ns"], good["force"]))

@@ -9,12 +9,20 @@ from fuzz import promises
 from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
+from emb_daemon.adapt.adaptation import Adaptation
+from emb_daemon.adapt.memory import Memory
+from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator import restart
+from emb_daemon.estimator.records import new_state
 from emb_daemon.logs.read import read_frames
+from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import default_layout
 from emb_daemon.wire.receive import ACCEPTED, new_reception, receive
+from studies import attacks
 
 _CYCLES = 400
 
@@ -76,6 +84,35 @@ def test_who_contradicts_a_sender_at_the_right_time_makes_the_force_a_fault(car,
     assert set(status) == {r.STATUS_FAULT} and np.all(estimates["mode"][:150] != r.FAULT)
     told = [wirekit.decode(frame)[1] for frame in sent if frame["can_id"] == 0x220]
     assert max(frame["DegradedReasons"] for frame in told) < 1 << 16 and {frame["Mode"] for frame in told} >= {r.FAULT}
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_what_was_learned_from_two_senders_is_forgotten(learns, tmp_path):
+    """Samples of 3 s ago instead of the genuine ones teach the filter a contact that is not there. When they end, the brake
+    is estimated as after a start."""
+
+    def estimated(frames, folder):
+        calibrations = {"FL": Setup(resource("config/emb.yaml")).calibrations["FL"]}
+        return attacks.estimated(frames, Adaptation(calibrations, Memory(folder), int) if learns else None)
+
+    for name in ("good", "bad"):
+        (tmp_path / name).mkdir()
+    frames = attacks.drive(48.0, 1)
+    forged = attacks.played_back(frames, 3.0)
+    good, bad = estimated(frames, tmp_path / "good"), estimated(_merged(frames, forged), tmp_path / "bad")
+    after = bad[(bad["mode"] != r.FAULT) & (bad["time_ns"] > forged["time_ns"][-1])]
+    off = np.abs(after["force"] - np.interp(after["time_ns"], good["time_ns"], good["force"]))
+    assert len(after) > 1500 and np.all(off < 3.0 * after["sigma"])
+    assert np.all(after["sigma"] < 300.0), "it is of use again at once"
+
+
+def test_nothing_is_kept_of_a_brake_with_two_senders():
+    calibration = Setup(resource("config/emb.yaml")).calibrations["FL"]
+    state, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+    state["started"] = True
+    assert restart.take_snapshot(state, to_parameters(calibration), snapshot)
+    state["contested"] = True
+    assert not restart.take_snapshot(state, to_parameters(calibration), snapshot)
 
 
 def test_a_frame_that_comes_twice_contradicts_nobody(car, undisturbed):  # noqa: F811

@@ -11,7 +11,7 @@ import numpy as np
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
-from emb_daemon.estimator.answer import answer_row
+from emb_daemon.estimator.answer import answer_row, forget_contested
 from emb_daemon.estimator.common import forget_common, weigh_common
 from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
@@ -354,6 +354,7 @@ def answer_adapting(
     for number in range(first, count):
         m, estimate = samples[number], estimates[number]
         k = m.corner
+        forget_contested(states, k, m)
         answer_row(m, states[k], parameters[k], estimate)
         a, own, hold = adapters[k], parameters[k : k + 1], others_hold(adapters, limits, k, estimate.time_ns)
         begun = remembered[k : k + 1]

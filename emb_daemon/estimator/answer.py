@@ -1,9 +1,11 @@
 """A sample in, an estimate out: the one place from which the estimator is run."""
 
-from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE, new_state
 from emb_daemon.estimator.step import predict, step
 from emb_daemon.jit import Array, Record, Records, entry, njit
 from emb_daemon.wire.contract import CONTESTED, CYCLE_S, DEGRADED, FAULT, INIT, INVALID, RUNNING
+
+_NOTHING = new_state()
 
 
 @entry(Array(SAMPLE), int, Array(STATE), Array(PARAMETERS), Array(ESTIMATE))
@@ -14,7 +16,17 @@ def answer(samples: Records, count: int, states: Records, parameters: Records, e
     """
     for number in range(count):
         corner = samples[number].corner
+        forget_contested(states, corner % len(states), samples[number])
         answer_row(samples[number], states[corner % len(states)], parameters[corner % len(parameters)], estimates[number])
+
+
+@njit
+def forget_contested(states: Records, index: int, row: Record) -> None:
+    """Start a STATE anew when two senders no longer contradict each other: nobody knows which of its samples were forged."""
+    if row.reasons & CONTESTED:
+        states[index].contested = True
+    elif states[index].contested:
+        states[index] = _NOTHING[0]
 
 
 @njit

@@ -84,6 +84,8 @@ SAMPLE = np.dtype(
 STATE = np.dtype(
     [
         ("started", "?"),
+        # Whether some of the last samples may be forged.
+        ("contested", "?"),
         # Whether the contact angle is unknown since the start, and what the release that ends it is known by.
         ("unknown", "?"),
         ("seen", "?"),

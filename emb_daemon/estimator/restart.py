@@ -67,8 +67,9 @@ def _copy_pads(to, pads):
 
 @entry(STATE, PARAMETERS, SNAPSHOT, returns=1)
 def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
-    """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or uncertain."""
-    if not s.started or s.unknown or s.contact.lost:
+    """Fill a SNAPSHOT from a STATE; False, and nothing changed, while contact is unknown or uncertain, or samples may be
+    forged."""
+    if not s.started or s.unknown or s.contact.lost or s.contested:
         return False
     snapshot.clearance = p.clearance + s.contact_angle - s.contact_anchor
     snapshot.clearance_sigma = s.covariance[CONTACT, CONTACT] ** 0.5
