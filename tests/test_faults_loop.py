@@ -338,6 +338,12 @@ def test_of_many_changes_the_first_and_the_last_are_logged(driven, caplog):
     assert "corner FR: degraded (signal stuck), after 491 changes that were not logged" in caplog.text
     change(1, r.CURRENT_LOST, 30.1)
     assert "corner FR: degraded (current lost)\n" in caplog.text
+    caplog.clear()
+    for number in range(20):
+        change(1, r.RESOLVER_LOST if number % 2 else r.STUCK, 50.0 + 0.01 * number)
+    change(1, r.CURRENT_LOST, 61.0)
+    assert caplog.text.count("corner FR") == 11, "one line, although it changed when the time was over"
+    assert "corner FR: degraded (current lost), after 10 changes that were not logged" in caplog.text
 
 
 def test_a_loop_that_misses_most_of_its_ticks_is_not_well(driven, caplog):
