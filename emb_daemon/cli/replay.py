@@ -182,7 +182,7 @@ def _print(report: dict) -> None:
         print(f"  of the samples: {', '.join(told)}")
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
-        print("  no reference signals in this log")
+        print("  no clamp force and no temperature reference in this log to judge by")
     for unit, group in (("N", {k: v for k, v in forces.items() if isinstance(v, dict)}), ("K", temperatures)):
         for name, figures in group.items():
             _line(name, figures, unit)

@@ -217,7 +217,8 @@ class Mapping:
         try:
             factor, shift = conversion(unit, ours.unit or "")
         except InputError as error:
-            return self._fault(name, f"{mapped.signal} {error}{'' if unit else '; state `unit:`'}")
+            hint = "; state `unit:`" if not unit else "" if ours.unit else '; of a number without one state `unit: "1"`'
+            return self._fault(name, f"{mapped.signal} {error}{hint}")
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
@@ -229,7 +230,10 @@ class Mapping:
     def _like(self, bus: str | None, signal: str) -> str:
         """The most similar names in the rig's DBC, in words; empty if there are none."""
         known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
-        like = get_close_matches(signal, known, 3)
+        # The same signal in another message comes first: a name of the same message is longer alike.
+        own = signal.rpartition(".")[2]
+        same = [name for name in known if name.rpartition(".")[2].lower() == own.lower()]
+        like = (same or get_close_matches(signal, known, 3))[:3]
         return f"; did you mean {' or '.join(like)}?" if like else ""
 
     def _their_unit(self, bus: str | None, signal: str) -> str:
