@@ -218,7 +218,7 @@ def _joint(presliding_rad: float, inertia: float):
 @pytest.mark.parametrize("inertia", [4e-3, 2e-4])
 def test_friction_that_turns_over_at_once_and_a_light_rotor_are_found_from_a_brakes_numbers(inertia):
     """Far from where the search begins: a hundred times the presliding angle, twenty times the inertia. What refitting gains
-    is asked about where it ended: along the line that touches the start it is two thirds of that, in other machines nothing."""
+    is asked about where it ended: the line that touches the start shows two thirds of it, in other machines nothing."""
     stated, log = _joint(presliding_rad=0.3, inertia=inertia)
     found = diagnose([log], stated)
     assert found.selection.recalibrated and not found.accepted
