@@ -236,6 +236,24 @@ def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path
     assert "too rare" not in capsys.readouterr().err and np.median(samples["dt"]) == pytest.approx(0.004)
 
 
+def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, capsys):
+    """With other lines between them; a table whose cells hold times of day is none of these."""
+    columns = _joint()
+    pairs = zip(1e3 * columns["time_s"], columns["angle_rad"], columns["current_A"], strict=True)
+    lines = [f"Time: {t:.3f}, Angle = {a:.5f} rad Current:{c:.2f}" for t, a, c in pairs]
+    lines.insert(900, "DONE POSITIONING")
+    (tmp_path / "serial.txt").write_text("\n".join(lines))
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
+        "  EMB_FL_Resolver.MotorAngle: {signal: Angle, unit: rad}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: column 3, unit: A, mean_ms: 0}\n"
+    )
+    samples = load_log(tmp_path / "serial.txt", read=Mapping(tmp_path / "m.yaml").read).samples
+    assert "1 rows with another number of cells than 3 left out" in capsys.readouterr().err
+    assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
+    assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
+
+
 def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
     time_s = 0.004 * np.arange(1000)
     still = 0.0 * time_s
