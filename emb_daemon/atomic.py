@@ -17,7 +17,7 @@ def naming(path: Path):
         raise
 
 
-def write_atomically(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """Replace ``path`` by ``content``: a reader, or a kill at any moment, finds the old file or the new one.
 
     Raises:
@@ -30,7 +30,7 @@ def write_atomically(path: Path, content: bytes) -> None:
         _write_beside(path, content)
 
 
-def _write_beside(path: Path, content: bytes) -> None:
+def _write_beside(path: Path, content: bytes | memoryview) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -148,6 +148,12 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
             "is in no unit; expected rad, deg, °, mrad, rev, turn; state `unit:`",
         ),
         ("{signal: Actuator.Position}", "{signal: Actuator.Place}", "no such message and signal"),
+        ("{signal: Actuator.Position}", "{signal: Inverter.Position}", "did you mean Actuator.Position?"),
+        (
+            "VEH_WheelSpeed.WheelSpeedFL: {value: 0.0}",
+            "VEH_Status.ParkBrake: {signal: Inverter.Iq}",
+            "is in 'mA'; expected none, 1, -; of a number without one state `unit: \"1\"`",
+        ),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, unit: furlong}", "is in 'furlong'; expected rad"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, value: 3.0}", "either signal"),
         ("{signal: Actuator.Position}", "{signal: Actuator.Position, factor: 3.0}", "unknown key"),
@@ -285,6 +291,36 @@ def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, te
         assert recorded.payloads(np.array([3]))[0] == bytes(range(1, 13)) and frames["flags"][4] == REMOTE
     (tmp_path / name).write_text(text + "what is this\n")
     with pytest.raises(InputError, match=r"x\.\w+:\d: not a candump line"):
+        read_log(tmp_path / name)
+
+
+_BUSMASTER = """***BUSMASTER Ver 3.2.0***
+***PROTOCOL CAN***
+***[START LOGGING SESSION]***
+***{0}***
+***<Time><Tx/Rx><Channel><CAN ID><Type><DLC><DataBytes>***
+23:59:59:9950 Rx 1 {1} s 8 {2}
+0:0:0:0050 Tx 2 {3} x 2 {4}
+00:00:00:015 Rx 1 {1} sr 8
+***END DATE AND TIME 2:3:2024 0:0:1:0***
+***[STOP LOGGING SESSION]***
+"""
+
+
+@pytest.mark.parametrize("name", ["x.log", "x.txt"])
+@pytest.mark.parametrize("base", ["HEX", "DEC"])
+def test_busmaster_logs_are_read_over_midnight_in_either_base(tmp_path, name, base):
+    words = {"HEX": ("0x123", "11 22 33 44 55 66 77 88", "0x18FEF131", "AB CD")}
+    words["DEC"] = ("291", "17 34 51 68 85 102 119 136", "419361073", "171 205")
+    (tmp_path / name).write_text(_BUSMASTER.format(base, *words[base]))
+    recorded = read_log(tmp_path / name)
+    frames = recorded.frames
+    assert frames["can_id"].tolist() == [0x123, 0x18FEF131, 0x123] and frames["flags"].tolist() == [0, EXTENDED, REMOTE]
+    assert frames["data"][:2].tolist() == [0x8877665544332211, 0xCDAB] and frames["length"][:2].tolist() == [8, 2]
+    assert np.diff(frames["time_ns"]).tolist() == [10_000_000, 10_000_000]
+    assert recorded.channels.tolist() == ["1", "2", "1"]
+    (tmp_path / name).write_text(_BUSMASTER.format(base, *words[base]) + "what is this\n")
+    with pytest.raises(InputError, match=r"x\.\w+:11: not a candump line"):
         read_log(tmp_path / name)
 
 

@@ -197,6 +197,48 @@ def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
         moved(found, {"contact.clearance_rad": 2.0}, checked=True)
 
 
+def _joint(presliding_rad: float, inertia: float):
+    """A calibration to begin with, and half a minute of what a joint of 0.13 N m and 2e-4 kg m² draws that turns free, whose
+    friction turns over within 2e-3 rad."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    values = {"motor.torque_constant_Nm_per_A": 1.0, "motor.inertia_kg_m2": inertia, "friction.load_m_per_rad": 0.0}
+    stated = moved(stated, values | {"friction.offset_Nm": 0.2, "friction.presliding_angle_rad": presliding_rad})
+    random, time_s = np.random.default_rng(3), 0.004 * np.arange(8000)
+    angle = np.repeat(random.uniform(1.0, 5.0, 8), 1000) * (1.0 - np.cos(2.0 * np.pi * time_s / 1.0))
+    speed, friction = np.gradient(angle, time_s), np.zeros(len(time_s))
+    for row, way in enumerate(np.diff(angle), 1):
+        friction[row] = np.clip(friction[row - 1] + way / 2e-3, -1.0, 1.0)
+    torque = 0.13 * friction + 2e-4 * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
+    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque, "force_N": 0.0 * time_s}
+    return stated, _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+
+@pytest.mark.parametrize("inertia", [4e-3, 2e-4])
+def test_friction_that_turns_over_at_once_and_a_light_rotor_are_found_from_a_brakes_numbers(inertia):
+    """Far from where the search begins: a hundred times the presliding angle, twenty times the inertia. What refitting gains
+    is asked about where it ended: the line that touches the start shows two thirds of it, in other machines nothing."""
+    stated, log = _joint(presliding_rad=0.3, inertia=inertia)
+    found = diagnose([log], stated)
+    assert found.selection.recalibrated and not found.accepted
+    assert found.calibration.friction.presliding_angle_rad < 1e-2
+    assert found.calibration.friction.offset_Nm == pytest.approx(0.13, rel=0.1)
+    assert found.calibration.motor.inertia_kg_m2 < 4e-4
+    scale = stated.motor.torque_constant_Nm_per_A / stated.motor.gear_gain_m_per_rad
+    before, after = found.before.rmse("torque"), found.after.rmse("torque")
+    assert after < 1.3 * 0.02 * scale < before
+    assert found.selection.recalibrated["torque"] == pytest.approx(np.sqrt(before**2 - after**2), rel=0.05)
+
+
+def test_saturation_takes_half_of_the_constant_at_most_at_the_largest_current_of_the_logs():
+    """Where a motor hardly pulls at all, friction over the load looked like iron that saturates at an ampere."""
+    stated, *_, fit, _ = _on_a_dynamometer(scatter=0.9, load=1.0)
+    bench = Bench([fit], stated)
+    largest = np.abs(fit.samples["current_q"]).max()
+    assert bench.reach["1/A²"] * largest**2 == pytest.approx(0.5)
+
+
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
     stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
     found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A

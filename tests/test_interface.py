@@ -162,6 +162,15 @@ def test_outputs_are_replays_columns(drive):
         assert np.array_equal(values, columns[name], equal_nan=True), name
 
 
+def test_a_rows_texts_take_no_more_room_than_its_numbers():
+    """A week of thermocouples has half a million rows; the reasons, written out, take half a kilobyte in each."""
+    estimates = np.zeros(100, ESTIMATE)
+    estimates["reasons"] = 0xFFFF
+    columns = table_columns(estimates, 0.004 * np.arange(100))
+    assert columns["reasons"][0].count("; ") == 15 and columns["mode"][0] and columns["corner"][0] == "FL"
+    assert max(values.dtype.itemsize for values in columns.values()) == 8
+
+
 def test_each_number_of_the_calibration_has_its_place():
     """One that is set there is the one that `to_parameters` sets; a term's are not named."""
     calibration = adaptkit.shipped()

@@ -203,6 +203,57 @@ def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):
     assert "does it start anew? Then state its `period`" in capsys.readouterr().err
 
 
+def _joint(period_rad: float = 0.0, jitter_ms: float = 0.0) -> dict:
+    """A joint that turns to and fro at 48 Hz, as an angle that starts anew at a period, if one is given."""
+    time_s = np.arange(2400) / 48.0 + 1e-3 * jitter_ms * np.random.default_rng(1).uniform(-1.0, 1.0, 2400)
+    angle = 40.0 * (1.0 - np.cos(2.0 * np.pi * time_s / 25.0))
+    speed = 40.0 * 2.0 * np.pi / 25.0 * np.sin(2.0 * np.pi * time_s / 25.0)
+    return {
+        "time_s": time_s - time_s[0],
+        "angle_rad": (angle + 12.5) % period_rad - 12.5 if period_rad else angle,
+        "speed_rad_per_s": speed,
+        "current_A": 0.5 * np.sign(speed),
+        "plate_C": 22.0 + 0.0 * speed,
+        "force_N": 0.0 * speed,
+    }
+
+
+def test_an_angle_of_few_samples_that_starts_anew_is_told_from_a_fast_motion(tmp_path, capsys):
+    _read(tmp_path, _joint(period_rad=25.0))
+    told = capsys.readouterr().err
+    jump = float(re.search(r"MotorAngle jumps by about ([\d.]+) rad and back to and fro", told)[1])
+    assert jump == pytest.approx(25.0, abs=0.1) and "too rare" not in told
+    still = _joint()
+    # A motor that really goes as far between two samples goes anywhere.
+    still["angle_rad"] = np.repeat(np.random.default_rng(2).choice([0.0, 20.0, 30.0], 240), 10)
+    _read(tmp_path, still | {"speed_rad_per_s": np.gradient(still["angle_rad"], still["time_s"])})
+    assert "start anew" not in capsys.readouterr().err
+
+
+def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path, capsys):
+    """Ten radians a second, stamped up to six milliseconds early or late, as it was sampled."""
+    samples = _read(tmp_path, _joint(jitter_ms=6.0)).samples
+    assert "too rare" not in capsys.readouterr().err and np.median(samples["dt"]) == pytest.approx(0.004)
+
+
+def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, capsys):
+    """With other lines between them; a table whose cells hold times of day is none of these."""
+    columns = _joint()
+    pairs = zip(1e3 * columns["time_s"], columns["angle_rad"], columns["current_A"], strict=True)
+    lines = [f"Time: {t:.3f}, Angle = {a:.5f} rad Current:{c:.2f}" for t, a, c in pairs]
+    lines.insert(900, "DONE POSITIONING")
+    (tmp_path / "serial.txt").write_text("\n".join(lines))
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
+        "  EMB_FL_Resolver.MotorAngle: {signal: Angle, unit: rad}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: column 3, unit: A, mean_ms: 0}\n"
+    )
+    samples = load_log(tmp_path / "serial.txt", read=Mapping(tmp_path / "m.yaml").read).samples
+    assert "1 rows with another number of cells than 3 left out" in capsys.readouterr().err
+    assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
+    assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
+
+
 def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
     time_s = 0.004 * np.arange(1000)
     still = 0.0 * time_s

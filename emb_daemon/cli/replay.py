@@ -156,12 +156,13 @@ def _write_table(path: Path, results: list) -> None:
         tables.append(table | reference_columns(result.reference, result.estimates["time_ns"], result.force_N))
     names = dict.fromkeys(name for table in tables for name in table)
     empty = [np.full(len(table["time_s"]), np.nan) for table in tables]
-    columns = {
-        name: np.concatenate([table.get(name, none) for table, none in zip(tables, empty, strict=True)]) for name in names
-    }
     # The corners of a log follow one another; the drive's clock gives the order of all rows.
     order = np.argsort(np.concatenate([result.estimates["time_ns"] for result in results]), kind="stable")
-    write_table(path, {name: values[order] for name, values in columns.items()})
+    columns = {}
+    for name in names:
+        parts = [table.pop(name, none) for table, none in zip(tables, empty, strict=True)]
+        columns[name] = np.concatenate(parts)[order]
+    write_table(path, columns)
 
 
 def _write_report(arguments: argparse.Namespace, results: list, corner: str, calibration) -> None:
@@ -182,7 +183,7 @@ def _print(report: dict) -> None:
         print(f"  of the samples: {', '.join(told)}")
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
-        print("  no reference signals in this log")
+        print("  no clamp force and no temperature reference in this log to judge by")
     for unit, group in (("N", {k: v for k, v in forces.items() if isinstance(v, dict)}), ("K", temperatures)):
         for name, figures in group.items():
             _line(name, figures, unit)

@@ -191,14 +191,15 @@ class Bench:
     @cached_property
     def reach(self) -> dict[str, float]:
         """Of a machine that clamps nothing the most that its effects may be, by unit: a current as large as the largest of
-        these logs, all the torque that makes, at any speed or at the largest, and the whole torque constant lost at it."""
+        these logs, all the torque that makes, at any speed or at the largest, and half of the torque constant lost at it: what
+        is quadratic in the current holds no further."""
         if self.clamps or not self.has_current:
             return {}
         samples = np.concatenate([trial.log.samples for trial in self.trials])
         current = float(np.abs(samples["current_q"][samples["has_current"]]).max())
         torque = current * self.calibration.motor.torque_constant_Nm_per_A
         speed = float(np.abs(samples["speed"]).max())
-        found = {"A": current, "N·m": torque, "N·m·s/rad": torque / max(speed, 1e-9), "1/A²": 1.0 / max(current, 1e-9) ** 2}
+        found = {"A": current, "N·m": torque, "N·m·s/rad": torque / max(speed, 1e-9), "1/A²": 0.5 / max(current, 1e-9) ** 2}
         return {unit: found[unit] for unit in OF_THE_MOTOR}
 
     @property

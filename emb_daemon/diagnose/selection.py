@@ -162,9 +162,13 @@ def find_recalibrated(selection: Selection, start: Model) -> dict[str, float]:
         # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
         if not own or channel == "innovation":
             continue
-        moments = model.moments(channel, [model.columns[c] for c in own], start.residual[channel])
+        # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
+        columns = [model.columns[c] for c in own]
+        moved = np.array([model.values[c] - model.centre.get(c, c.start) for c in own])
+        moments = model.moments(channel, columns, model.residual[channel] + np.column_stack(columns) @ moved)
         left_out = leave_out(moments, model.penalty(own, channel)).left_out
-        gain = model.rms(float((moments.products[:, -1, -1] - left_out).sum()), channel)
+        before = float(start.residual[channel] @ start.residual[channel])
+        gain = model.rms(before - float(left_out.sum()), channel)
         if gain > 0.0 and gain >= selection.screening.floor(model, channel):
             result[channel] = gain
     return result

@@ -55,7 +55,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     if angle is not None:
-        if not angle.is_sparse and np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := _starts_anew(angle.values)):
+        if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _find_too_fast(angle)
@@ -166,11 +166,18 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | None)
     ]
 
 
-def _starts_anew(values: np.ndarray) -> float:
-    """Size of the jumps of a value that wraps around; 0 if it does not."""
-    jumps = np.abs(np.diff(values))
-    jumps = jumps[jumps > _ANEW * np.ptp(values)]
-    return float(np.median(jumps)) if len(jumps) >= _LEAST_JUMPS else 0.0
+def starts_anew(angle: Series) -> float:
+    """What an angle that wraps around jumps by; 0 if it does not. The step before a jump stands for the motion in it."""
+    steps = np.diff(angle.values)
+    is_jump = np.abs(steps) > _ANEW * np.ptp(angle.values)
+    before = np.append(0.0, np.where(is_jump, 0.0, steps)[:-1])
+    jumps = np.abs(steps - before)[is_jump]
+    if len(jumps) < _LEAST_JUMPS:
+        return 0.0
+    jump = float(np.median(jumps))
+    # Between samples that are far apart a motor may move as far; but not always by the same.
+    alike = bool(np.all(np.abs(jumps - jump) < _ABOUT * jump)) and bool(np.all(np.abs(steps[~is_jump]) < _ANEW * jump))
+    return jump if alike or not angle.is_sparse else 0.0
 
 
 def _by_travel(angle: Series, other: Series) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """Frames in other tools' text formats, converted to can-utils' log format, which is read in bulk."""
 
 import re
+from collections.abc import Iterator
 
 #: What candump shows on a terminal with its option for times: ``(seconds)  interface  id   [length]  bytes``.
 _SHOWN = re.compile(
@@ -9,6 +10,14 @@ _SHOWN = re.compile(
 )
 #: How SavvyCAN's tables (GVRET) begin, times in microseconds.
 _GVRET = b"Time Stamp,ID,Extended,Dir,Bus,LEN"
+#: How BUSMASTER's logs begin, and a frame in one: ``hh:mm:ss:fraction Rx|Tx channel id type length bytes``, of type s(tandard)
+#: or (e)x(tended), with r where it is remote. All other lines begin with stars.
+_BUSMASTER = b"***BUSMASTER"
+_BUSMASTER_FRAME = re.compile(
+    rb"(\d+):(\d+):(\d+):(\d+)\s+[RT]x\s+(\d+)\s+(?:0x)?([0-9A-Fa-f]+)\s+([sx]r?)(?:-fd)?\s+(\d+)((?:\s+[0-9A-Fa-f]+)*)", re.I
+)
+_DECIMAL = b"***DEC***"
+_HALF_A_DAY_S = 43_200
 
 
 def as_candump(content: bytes) -> bytes | None:
@@ -18,6 +27,8 @@ def as_candump(content: bytes) -> bytes | None:
     if first.startswith(_GVRET):
         # The header becomes an empty line, so that the line numbers stay the same.
         return b"\n".join([b"", *map(_of_gvret, content.split(b"\n")[1:])])
+    if first.startswith(_BUSMASTER):
+        return b"\n".join(_of_busmaster(content.split(b"\n")))
     if _SHOWN.fullmatch(first.strip()):
         return b"\n".join(map(_of_terminal, content.split(b"\n")))
     return None
@@ -48,3 +59,29 @@ def _of_gvret(line: bytes) -> bytes:
         return line
     width = b"%08X" if cells[2].lower() == b"true" else b"%03X"
     return b"(%d.%06d) %s %s%s%s" % (*divmod(micros, 1_000_000), bus, width % can_id, b"##0" if length > 8 else b"#", data)
+
+
+def _of_busmaster(lines: list[bytes]) -> Iterator[bytes]:
+    """Times count from midnight before the first frame; a log of more than a day goes on, session by session."""
+    base, day, last = 16, 0, 0
+    for line in lines:
+        found = _BUSMASTER_FRAME.fullmatch(line.strip())
+        if not found:
+            base = 10 if line.strip() == _DECIMAL else base
+            yield b"" if line.startswith(b"***") else line
+            continue
+        hours, minutes, seconds, fraction, channel, can_id, kind, length, data = found.groups()
+        second = 3600 * int(hours) + 60 * int(minutes) + int(seconds)
+        # Back by more than half a day is another day; by less it is what `stamps` makes of it.
+        day += last - second > _HALF_A_DAY_S
+        last = second
+        extended, remote = kind[:1] in b"xX", len(kind) > 1
+        octets = b"R" if remote else b"".join(b"%02X" % int(octet, base) for octet in data.split()[: int(length)])
+        yield b"(%d.%s) %s %s%s%s" % (
+            second + 2 * _HALF_A_DAY_S * day,
+            fraction,
+            channel,
+            (b"%08X" if extended else b"%03X") % int(can_id, base),
+            b"##0" if int(length) > 8 else b"#",
+            octets,
+        )

@@ -17,7 +17,7 @@ from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
-from emb_daemon.logs.contradictions import contradictions
+from emb_daemon.logs.contradictions import contradictions, starts_anew
 from emb_daemon.logs.read import Recorded, ids_in, read_log
 from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages, standing
 from emb_daemon.logs.stamps import held_rows, in_time
@@ -217,7 +217,8 @@ class Mapping:
         try:
             factor, shift = conversion(unit, ours.unit or "")
         except InputError as error:
-            return self._fault(name, f"{mapped.signal} {error}{'' if unit else '; state `unit:`'}")
+            hint = "; state `unit:`" if not unit else "" if ours.unit else '; of a number without one state `unit: "1"`'
+            return self._fault(name, f"{mapped.signal} {error}{hint}")
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
@@ -229,7 +230,10 @@ class Mapping:
     def _like(self, bus: str | None, signal: str) -> str:
         """The most similar names in the rig's DBC, in words; empty if there are none."""
         known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
-        like = get_close_matches(signal, known, 3)
+        # The same signal in another message comes first: a name of the same message is longer alike.
+        own = signal.rpartition(".")[2]
+        same = [name for name in known if name.rpartition(".")[2].lower() == own.lower()]
+        like = (same or get_close_matches(signal, known, 3))[:3]
         return f"; did you mean {' or '.join(like)}?" if like else ""
 
     def _their_unit(self, bus: str | None, signal: str) -> str:
@@ -482,7 +486,7 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
     angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
     if angle is None and isinstance(speed, Series):
         angle = speed.integral()
-    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or not angle.way_is_unknown:
+    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or not angle.way_is_unknown or starts_anew(angle):
         return []
     return [
         f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "

@@ -130,7 +130,9 @@ class Series:
         the straight line between samples misses the way."""
         if not self.is_sparse or self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
             return self.is_sparse
-        missed = 0.25 * np.abs(self.values[1:-1] - 0.5 * (self.values[2:] + self.values[:-2]))
+        # Samples of a busy computer are not evenly apart.
+        share = (self.time_ns[1:-1] - self.time_ns[:-2]) / np.maximum(self.time_ns[2:] - self.time_ns[:-2], 1)
+        missed = 0.25 * np.abs(self.values[1:-1] - self.values[:-2] - share * (self.values[2:] - self.values[:-2]))
         # Long standstill does not show how stops are sampled.
         moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
         return bool(moving.any()) and float(np.quantile(missed[moving], _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD

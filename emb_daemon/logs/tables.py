@@ -56,6 +56,9 @@ _IN_GROUP, _BUS = " group ", "CAN_DataFrame"
 _MARK = 200
 #: Number of column names listed if one was not found.
 _LISTED = 20
+#: A value that its line names, as a serial port's text does: ``Time: 5001 Force=3.2 N``; share of the first lines that must
+#: name the same values.
+_LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: Cells that mean that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -301,6 +304,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     content = _as_utf8(content)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
+    content = _unlabelled(content)
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
@@ -392,6 +396,21 @@ def _as_utf8(content: bytes) -> bytes:
     except UnicodeDecodeError:
         return content.decode("latin-1").encode()
     return content.removeprefix(b"\xef\xbb\xbf")
+
+
+def _unlabelled(content: bytes) -> bytes:
+    """A serial port's lines that name each value in it (``Time: 5001 Position: 594``) as a table with these names as header;
+    any other text as it is. A line that has not the same names stays as it is."""
+    lines = content.split(b"\n")
+    told = [tuple(name for name, _ in _LABELLED.findall(line)) for line in lines[:_PREAMBLE] if line.strip()]
+    names = max(told, key=told.count, default=())
+    if len(set(names)) < 2 or told.count(names) < _MOSTLY * len(told):
+        return content
+    result = [b",".join(names)]
+    for line in lines:
+        found = _LABELLED.findall(line)
+        result.append(b",".join(value for _, value in found) if tuple(name for name, _ in found) == names else line)
+    return b"\n".join(result)
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

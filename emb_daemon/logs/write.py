@@ -4,6 +4,7 @@ import datetime
 import os
 import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +36,21 @@ def ending_of(path: Path) -> str:
 
 def table_columns(estimates: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of the command-line contract, from ESTIMATE rows."""
-    columns: dict[str, np.ndarray] = {"time_s": time_s, "corner": np.array(CORNERS)[estimates["corner"]]}
+    columns: dict[str, np.ndarray] = {"time_s": time_s, "corner": _texts(CORNERS, estimates["corner"])}
     for signal in OUTPUTS:
         if signal.name not in _NOT_WRITTEN:
             name, *indices = re.findall(r"\w+", signal.field)
             columns[signal.name] = estimates[name][:, *map(int, indices)]
-    columns["mode"] = np.array(MODES)[columns["mode"]]
-    columns["source"] = np.array([SOURCES.get(code, "") for code in range(16)])[columns["source"]]
+    columns["mode"] = _texts(MODES, columns["mode"])
+    columns["source"] = _texts([SOURCES.get(code, "") for code in range(16)], columns["source"])
     raised, codes = np.unique(estimates["reasons"], return_inverse=True)
-    columns["reasons"] = np.array(["; ".join(reason_words(value)) for value in raised])[codes]
+    columns["reasons"] = _texts(["; ".join(reason_words(value)) for value in raised], codes)
     return columns
+
+
+def _texts(known: Sequence[str], codes: np.ndarray) -> np.ndarray:
+    """The text of each code, shape (n,), as references: written out, the reasons of a week take a gigabyte."""
+    return np.array(known, dtype=object)[codes]
 
 
 def reference_columns(reference: References, time_ns: np.ndarray, force_N: np.ndarray) -> dict[str, np.ndarray]:
@@ -75,7 +81,7 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
         pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(quoting_style="none"))
     else:
         pyarrow.parquet.write_table(table, sink)
-    write_atomically(path, sink.getvalue().to_pybytes())
+    write_atomically(path, memoryview(sink.getvalue()))
 
 
 def _unit_and_comment(name: str) -> tuple[str, str]:
