@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def naming(path: Path):
+def name_in_errors(path: Path):
     """Inside this context an OSError, such as for a full disk, names ``path`` and not the temporary file."""
     try:
         yield
@@ -26,7 +26,7 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "expected a regular file or none", str(path))
-    with naming(path):
+    with name_in_errors(path):
         _write_beside(path, content)
 
 

@@ -60,10 +60,10 @@ def _false_alarms(state, releases, p, contact_sigma, rng):
     return alarms, samples
 
 
-def false_alarms(calibration: Calibration, releases: int = 100_000, contact_sigma: float = 0.1, seed: int = 1) -> dict:
-    """False engagements in the clearance; simulated."""
+def false_alarms(calibration: Calibration, releases: int = 100_000) -> dict:
+    """False engagements in the clearance, with a contact angle known to 0.1 rad; simulated."""
     p = to_parameters(calibration)
-    alarms, samples = _false_alarms(np.zeros(1, CONTACT)[0], releases, p, contact_sigma, np.random.default_rng(seed))
+    alarms, samples = _false_alarms(np.zeros(1, CONTACT)[0], releases, p, 0.1, np.random.default_rng(1))
     return {"releases": releases, "samples": int(samples), "false_alarms": int(alarms)}
 
 

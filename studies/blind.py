@@ -198,10 +198,10 @@ def campaign(plant: np.void, rng: np.random.Generator, stops: int) -> Schedule:
     return schedule + random_angle(plant, 10.0 * longer, rng) + rest(0.5)
 
 
-def heat_campaign(plant: np.void, rng: np.random.Generator) -> Schedule:
-    """Training, then drags, stops and a turning disc that cools: six minutes."""
+def heat_campaign(plant: np.void, rng: np.random.Generator, drags: int = 4) -> Schedule:
+    """Training, then drags, each with stops and a turning disc that cools: six minutes with four drags."""
     schedule = training(plant, 21.0)
-    for _ in range(4):
+    for _ in range(drags):
         schedule += rig_drag(rng.uniform(1500.0, 5000.0), rng.uniform(15.0, 45.0), 30.0)
         schedule += rest(rng.uniform(20.0, 50.0), wheel_speed=rng.uniform(0.0, 50.0))
         for _ in range(3):

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from emb_daemon.fleet.dataset import ingested
+from emb_daemon.fleet.dataset import read_results
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
@@ -99,7 +99,7 @@ def main() -> int:
             subprocess.run(command(stage, logs, rough), check=True, capture_output=True)
             same &= content(calm) == content(rough)
             print(f"{stage}: killed {told}; resumed: {'the same bytes' if same else 'NOT the same bytes'}", flush=True)
-        listed = sum(bool(known["fault"]) for known in ingested(rough))
+        listed = sum(bool(known["fault"]) for known in read_results(rough))
         print(f"{damaged} of {_UNITS * _DAYS} logs damaged, {listed} listed")
     return 0 if same and listed == damaged else 1
 

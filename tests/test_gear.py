@@ -25,7 +25,7 @@ from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
-from emb_daemon.plant.brake import motor_angle, turned
+from emb_daemon.plant.brake import equivalent_angle, motor_angle
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
@@ -190,7 +190,7 @@ def test_a_training_is_learned_from_through_the_gear(shipped, tmp_path):
 def test_the_brakes_motor_finds_its_way_back_through_the_gear(shipped):
     plant = plant_from_calibration(ramp(shipped))
     for x in (0.5, 7.0, 20.0, 33.0):
-        assert turned(plant, motor_angle(plant, x)) == pytest.approx(x, rel=1e-9)
+        assert equivalent_angle(plant, motor_angle(plant, x)) == pytest.approx(x, rel=1e-9)
     assert sc.angle_at(plant, 10e3) != pytest.approx(sc.angle_at(plant_from_calibration(shipped), 10e3), rel=0.03)
 
 

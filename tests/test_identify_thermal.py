@@ -13,11 +13,11 @@ from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import grammar
 from emb_daemon.diagnose.grammar import search_heat
-from emb_daemon.diagnose.warmth import HeatBench
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.identify.calibration import nominal
+from emb_daemon.identify.steps import thermal
 from emb_daemon.identify.steps.cooling import cooling_law
 from emb_daemon.identify.steps.friction import fit_friction
 from emb_daemon.identify.steps.heat import UNKNOWNS, check_excitation, fit_heat
@@ -360,17 +360,15 @@ def _hidden(law, rng):
     return found
 
 
-def test_a_term_is_made_for_a_cooling_that_is_no_line_over_the_speed_and_none_for_one_that_is():
-    rng = np.random.default_rng(5)
-    bent = search_heat(HeatBench(_hidden(lambda speed: speed**2 / 18.0, rng), START))
-    [name] = bent.accepted
-    term = bent.model.bench.calibrated(bent.model.values).terms[0]
-    assert (name, term.port, term.signal) == ("term:disc_cooling:disc_speed", "disc_cooling", "disc_speed")
-    assert np.sqrt(bent.model.noise("temperature")) < 0.4
-    assert not search_heat(HeatBench(_hidden(lambda speed: speed, rng), START)).accepted
-    # In the campaign's own step it stands in the calibration, with its standard deviation and where it was found.
-    [kept], _, follows = find_terms(_hidden(lambda speed: speed**2 / 18.0, rng), START)
-    assert kept.port == "disc_cooling" and kept.sigma > 0.0 and "plant" in kept.provenance and not follows
+def test_a_term_is_made_for_a_cooling_that_is_no_line_over_the_speed_and_none_for_one_that_is(monkeypatch):
+    """In the campaign's own step, with its standard deviation and where it was found."""
+    searches, rng = [], np.random.default_rng(5)
+    monkeypatch.setattr(thermal, "search_heat", lambda bench: searches.append(search_heat(bench)) or searches[-1])
+    [term], _, follows = find_terms(_hidden(lambda speed: speed**2 / 18.0, rng), START)
+    assert (term.name, term.port, term.signal) == ("term:disc_cooling:disc_speed", "disc_cooling", "disc_speed")
+    assert term.sigma > 0.0 and "plant" in term.provenance and not follows
+    assert np.sqrt(searches[0].model.noise("temperature")) < 0.4
+    assert not find_terms(_hidden(lambda speed: speed, rng), START)[0]
 
 
 def test_what_is_left_of_the_temperatures_is_said_where_no_term_is_made(monkeypatch):

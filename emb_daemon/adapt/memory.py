@@ -146,14 +146,14 @@ class Memory:
         files.write(self.path(store.corner), store)
 
     def reset(self, corner: str) -> bool:
-        """Delete a corner's file, and keep a copy (`forgotten`); False if there was none."""
+        """Delete a corner's file, and keep a copy (`path_of_forgotten`); False if there was none."""
         try:
-            self.path(corner).replace(self.forgotten(corner))
+            self.path(corner).replace(self.path_of_forgotten(corner))
         except FileNotFoundError:
             return False
         return True
 
-    def forgotten(self, corner: str) -> Path:
+    def path_of_forgotten(self, corner: str) -> Path:
         """Path of the copy that the last reset kept."""
         return self.path(corner).with_suffix(".forgotten")
 

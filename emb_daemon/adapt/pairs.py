@@ -38,7 +38,7 @@ def _turn(rows, p, gear_zero, turned):
 
 
 @entry(Array(TRAINING), PARAMETERS, Array(STATE), Array(np.float64), Array(np.float64), Array(np.float64))
-def _sliding(rows, p, states, direction, torque, force):
+def _run_passes(rows, p, states, direction, torque, force):
     """``direction``: +1 where friction has fully developed in clamping, -1 in releasing, else 0. ``torque``: motor torque (N
     m) without inertia and release spring, over the gear's slope. ``force``: of the stiffness path, N. All with the
     calibration's effects."""
@@ -76,7 +76,7 @@ def pairs_of_passes(rows: np.ndarray, p: np.void, state: np.void | None = None) 
     width = max(angle.max() - low, 1e-9) / _BINS
     sigma, _ = torque_sigma(p["torque_constant"] * p["current_sigma"], p["inertia"] * p["speed_sigma"] / CYCLE_S)
     direction, torque, force = np.zeros((3, len(rows)))
-    _sliding(rows, p, states, direction, torque, force)
+    _run_passes(rows, p, states, direction, torque, force)
     middle = 0.5 * (angle + np.concatenate([angle[:1], angle[:-1]]))
     # Clamping passes in the first half of the bins, releasing ones in the second.
     bins = np.minimum((middle - low) / width, _BINS - 1).astype(int) + np.where(direction > 0.0, 0, _BINS)

@@ -157,7 +157,7 @@ def _replace(s, state, error, sigma):
 
 
 @njit
-def _restart_fitted(x, P):
+def _reset_fitted(x, P):
     """Zero the errors that the stroke has fitted anew (friction and the stiffness path), and all correlations with states
     other than those of motor and current sensor. Variances stay, except that of FAST, which becomes the stationary one."""
     for i in range(len(x)):
@@ -194,7 +194,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     s.drive, s.drive_slope, s.force, s.slope = reached.drive, reached.drive_slope, reached.force, reached.slope
     s.friction_state, s.friction_variance, s.slid_angle = reached.friction_state, reached.friction_variance, reached.slid_angle
     s.effects = reached.effects
-    _restart_fitted(s.error, s.covariance)
+    _reset_fitted(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
     if not kept:
         # A new curve depends on the torque constant and the inertia of the stroke.
@@ -207,7 +207,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     s.contact.confirmed, s.contact.lost = True, False
     drift = s.alternatives[DRIFT]
     if kept:
-        _restart_fitted(drift.error, drift.covariance)
+        _reset_fitted(drift.error, drift.covariance)
         known = drift.covariance[CONTACT, CONTACT]
         share = known / (known + a.contact_sigma**2)
         drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - weight * moved

@@ -70,7 +70,7 @@ class _Child:
 
 
 @contextmanager
-def _configured(corners: int) -> Iterator[list]:
+def _temporary_configuration(corners: int) -> Iterator[list]:
     """Configuration and state folder, as arguments of `bench.served`."""
     with tempfile.TemporaryDirectory() as folder:
         yield [shipped_configuration(Path(folder), CORNERS[:corners], "log_level: error"), Path(folder) / "state"]
@@ -95,7 +95,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     )
     served = None
     try:
-        with _configured(each) as arguments:
+        with _temporary_configuration(each) as arguments:
             served = _Child(
                 "served",
                 *arguments,
@@ -135,7 +135,7 @@ def held_up(late_ns: int, worked_ns: int) -> bool:
 def measure_start(cold: bool = False) -> dict[str, float]:
     """``wall_s`` and ``cpu_s`` from start to ready with numba, with cached kernels or, if ``cold``, without."""
     ours, theirs = connected_sockets()
-    with ours, theirs, _configured(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
+    with ours, theirs, _temporary_configuration(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
         served = _Child("served", *arguments, "", ours.fileno(), inherited=[ours], environment=environment)
         try:

@@ -66,8 +66,8 @@ class Ledger:
     def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
         self._daemons = daemons
         self._ticks = [daemon.tick for daemon in daemons]
-        self._rows = _shared(_ROOM, len(_PARTS) + 1)
-        self._late = _shared(_ROOM)
+        self._rows = _allocate_shared(_ROOM, len(_PARTS) + 1)
+        self._late = _allocate_shared(_ROOM)
         self._used = self._woken = 0
         self._spent = [0] * len(_PARTS)
         self._missed = self._held_up = 0
@@ -151,7 +151,7 @@ def _quantiles(us: np.ndarray) -> dict[str, float]:
     return {"p50_us": float(np.median(us)), "p99_us": float(np.percentile(us, 99))}
 
 
-def _shared(*shape: int) -> np.ndarray:
+def _allocate_shared(*shape: int) -> np.ndarray:
     """Zeros in shared memory, ns. It does not count as the daemon's memory, and unwritten pages cost nothing."""
     return np.frombuffer(mmap.mmap(-1, 8 * math.prod(shape)), np.int64).reshape(shape)
 

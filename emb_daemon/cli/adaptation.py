@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     for corner in corners:
         if arguments.action == "reset":
             if memory.reset(corner):
-                kept = memory.forgotten(corner)
+                kept = memory.path_of_forgotten(corner)
                 print(f"{corner}: deleted, a copy is in {kept}; a running daemon uses its values until it is restarted")
                 found = True
             continue

@@ -28,7 +28,7 @@ def _run(samples, parameters, states, heat, out, signals):
     for row in range(len(samples)):
         m, h, o = samples[row], heat[row], out[row]
         s.disc, s.power, s.temperature_known = h.disc, h.power, h.temperature_known
-        s.mean[:] = h.mean
+        s.mean[0], s.mean[1] = h.mean[0], h.mean[1]
         s.pads[0, 0], s.pads[1, 0] = h.surface[0], h.surface[1]
         s.winding, s.housing = h.winding, h.housing
         rise = 0.5 * (h.mean[0] + h.mean[1]) - p.thermal.reference

@@ -136,7 +136,7 @@ def drives(root: Path) -> list[Drive]:
     Raises:
         InputError: nothing was ingested.
     """
-    found = [Drive(**entry) for known in ingested(root) for entry in known["drives"]]
+    found = [Drive(**entry) for known in read_results(root) for entry in known["drives"]]
     if not found:
         raise InputError(f"{root}: holds no drives, expected a data set of emb-daemon fleet ingest")
     return sorted(found)
@@ -150,7 +150,7 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
     return groups
 
 
-def ingested(root: Path) -> list[dict[str, Any]]:
+def read_results(root: Path) -> list[dict[str, Any]]:
     """Result for each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged file: of its path), ``notes``,
     ``fault`` (empty if the file is good) and its ``drives``."""
     return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]

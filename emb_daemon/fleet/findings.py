@@ -252,7 +252,7 @@ class _Study:
             slopes, uneven, own = self.read(name)
             shared = shared_causes(slopes, {ALL: self.masks[ALL]}, prints, own, beside=False)
             shared += shared_causes(slopes, self.groups, prints, own, beside=True)
-            over[name] = self._shared(shared, _ACTIONS[name])
+            over[name] = self._list_shared(shared, _ACTIONS[name])
             if name == "day":
                 ageing = self._outliers(uneven, own, _ACTIONS["ageing"])
         unlike = self._outliers(apart, readings, _ACTIONS["unit"])
@@ -265,12 +265,12 @@ class _Study:
             left_out=left_out,
             directions=prints.shape[1],
             causes=len(self.causes),
-            groups=self._shared(groups, _ACTIONS["level"]),
+            groups=self._list_shared(groups, _ACTIONS["level"]),
             drifts=over["day"],
             seasons=over["warmth"],
             outliers=unlike,
             ageing=ageing,
-            units=self._placed(apart, readings, {finding.where for finding in (*unlike, *ageing)}),
+            units=self._place_units(apart, readings, {finding.where for finding in (*unlike, *ageing)}),
             population=self._population(level, readings),
             trends=self._trends([*groups][:3], over["day"], readings),
         )
@@ -283,7 +283,7 @@ class _Study:
             rivals=tuple(dict.fromkeys(self.causes[r].name for r in one.rivals if self.causes[r].name != own.name)),
         )  # fmt: skip
 
-    def _shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
+    def _list_shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
         found = [self._finding(one.group, int(self.masks[one.group].sum()), one, action) for one in shared]
         return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
@@ -291,7 +291,7 @@ class _Study:
         found = [self._finding(" ".join(self.keys[one.row]), 1, one, action) for one in outliers(deviations, readings)]
         return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
 
-    def _placed(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
+    def _place_units(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
         amounts, rows = readings.of(deviations), readings.ordinary
         spread = np.sqrt((amounts[rows] ** 2).mean(axis=0))
         worst = np.argmax(np.abs(amounts) / spread, axis=1)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.fleet.dataset import DIGEST, About, Drive, day_of, forget, ingested, note, write_drive
+from emb_daemon.fleet.dataset import DIGEST, About, Drive, day_of, forget, note, read_results, write_drive
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_with_digest
 from emb_daemon.offline import corner_index
@@ -53,7 +53,7 @@ def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping
         raise InputError(f"--unit {pattern}: not a regular expression: {error}") from None
     if "unit" not in compiled.groupindex:
         raise InputError(f"--unit {pattern}: expected a group (?P<unit>…)")
-    known = {entry["source"]: entry for entry in ingested(root)}
+    known = {entry["source"]: entry for entry in read_results(root)}
     result = []
     for path in paths:
         path = Path(path).absolute()
@@ -90,7 +90,7 @@ def give_up(root: Path, job: Job, reason: str) -> dict[str, Any]:
 
 
 def _nothing_of(job: Job) -> dict:
-    """Result for a file before it is read, see `dataset.ingested`; it is named by its path, because its content is unknown."""
+    """Result for a file before it is read, see `dataset.read_results`; named by its path, as its content is unknown."""
     size, mtime_ns = _stamp(job.path)
     digest = hashlib.sha256(str(job.path).encode()).hexdigest()
     return {
@@ -107,7 +107,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def ingest(root: Path, job: Job) -> dict[str, Any]:
-    """Ingest one log file; returns the result, see `dataset.ingested`."""
+    """Ingest one log file; returns the result, see `dataset.read_results`."""
     known, words = _nothing_of(job), io.StringIO()
     try:
         with contextlib.redirect_stderr(words):
@@ -140,12 +140,12 @@ def ingest_frames(
         index = corner_index(corner)
         log = make_log(samples[samples["corner"] == index], frames, corner, Path(source))
         drive = Drive(unit, corner, day or day_of(begin_ns), begin_ns, digest)
-        write_drive(root, drive, About(source, _refused(pipeline, index), notes), log.samples, log.force_N)
+        write_drive(root, drive, About(source, _count_refused(pipeline, index), notes), log.samples, log.force_N)
         result.append(drive)
     return result
 
 
-def _refused(pipeline: Pipeline, index: int) -> dict[str, int]:
+def _count_refused(pipeline: Pipeline, index: int) -> dict[str, int]:
     """Number of refused frames by verdict: those of the corner and of the car."""
     own = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
     counts = own + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)

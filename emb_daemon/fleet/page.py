@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.fleet.dataset import ingested
+from emb_daemon.fleet.dataset import read_results
 from emb_daemon.fleet.findings import PER_DAYS, PER_K, Finding, Findings, Placed, load
 from emb_daemon.report.figures import ACCENT, GRID, INK, Panel, Style, Trace, xy_figure
 from emb_daemon.report.page import Page, Section
@@ -175,7 +175,7 @@ def _population(page: Page, found: Findings) -> None:
 
 
 def _data(page: Page, root: Path, found: Findings) -> None:
-    files = ingested(root)
+    files = read_results(root)
     damaged = [known for known in files if known["fault"]]
     figures = [json.loads(path.read_bytes()) for path in sorted(Path(root, "figures").rglob("*.json"))]
     seconds = sum(one["seconds"] for one in figures)

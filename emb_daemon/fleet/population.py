@@ -240,7 +240,7 @@ def shared_causes(
         gain, group, cause = best
         amount = readings.of(left)[:, cause]
         inside, outside = amount[groups[group] & rows], amount[~groups[group] & rows]
-        p_value, value, sigma = _compared(inside, outside if beside else None)
+        p_value, value, sigma = _compare(inside, outside if beside else None)
         chance = min(1.0, p_value * (len(gains) * len(prints) - len(chosen)))
         if chance > SURE:
             break
@@ -252,7 +252,7 @@ def shared_causes(
     return [replace(one, amount=float(amount)) for one, amount in zip(found, amounts, strict=True) if one]
 
 
-def _compared(inside: np.ndarray, outside: np.ndarray | None) -> tuple[float, float, float]:
+def _compare(inside: np.ndarray, outside: np.ndarray | None) -> tuple[float, float, float]:
     """(p-value, difference, its standard deviation) of two sets of units by Welch's test, or of one set against zero."""
     from scipy.stats import ttest_1samp, ttest_ind
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.atomic import naming, write_atomically
+from emb_daemon.atomic import name_in_errors, write_atomically
 from emb_daemon.interface.signals import OUTPUTS
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import DEPTHS_MM, References, latest
@@ -112,7 +112,7 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
         signals.append(
             Signal(values, columns["time_s"] - start_s, name=name, unit=unit, comment=comment, conversion=conversion)
         )
-    with naming(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with name_in_errors(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
         with MDF(version="4.10") as file:
             file.header.start_time = datetime.datetime.fromtimestamp(start_s, datetime.UTC)
             file.append(signals, acq_name="emb_daemon", comment="estimates of emb_daemon replay", common_timebase=True)
@@ -126,7 +126,7 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
         return write_atomically(path, format_candump(frames).encode())
     import can
 
-    with naming(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with name_in_errors(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
         # python-can takes everything after the first dot of a name for the format.
         part = Path(folder) / f"frames{path.suffix.lower()}"
         try:

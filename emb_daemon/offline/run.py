@@ -101,7 +101,7 @@ def _run_step(samples, parameters, states, estimate, out, heat):
         if len(heat) > 0:
             h = heat[row]
             h.winding, h.housing = winding, housing
-            h.mean[:] = s.mean
+            h.mean[0], h.mean[1] = s.mean[0], s.mean[1]
             h.surface[0], h.surface[1] = s.pads[0, 0], s.pads[1, 0]
             h.history, h.contact_angle = s.history, s.contact_angle
             h.power, h.disc, h.temperature_known = s.power, s.disc, s.temperature_known

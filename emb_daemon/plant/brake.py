@@ -21,7 +21,7 @@ POWER, SATURATION, ONSET = range(3)
 
 
 @njit
-def turned(p: Record, angle: float) -> float:
+def equivalent_angle(p: Record, angle: float) -> float:
     """Angle (rad) by which a constant gear would have moved the pads as far; everything behind the gear depends on it."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
         return angle
@@ -30,20 +30,20 @@ def turned(p: Record, angle: float) -> float:
 
 @njit
 def slope_at(p: Record, angle: float) -> float:
-    """Slope of `turned`, by differences over two intervals of the table; 1 for a constant gear."""
+    """Slope of `equivalent_angle`, by differences over two intervals of the table; 1 for a constant gear."""
     reach = p.travel_angle[1]
-    return (turned(p, angle + reach) - turned(p, angle - reach)) / (2.0 * reach) if reach > 0.0 else 1.0
+    return (equivalent_angle(p, angle + reach) - equivalent_angle(p, angle - reach)) / (2.0 * reach) if reach > 0.0 else 1.0
 
 
 @njit
 def gear_load(p: Record, s: Record) -> float:
     """Force (N) of pads and release spring on the gear's output."""
-    return s.force + p.release_spring * p.gear_gain * max(turned(p, s.angle), 0.0)
+    return s.force + p.release_spring * p.gear_gain * max(equivalent_angle(p, s.angle), 0.0)
 
 
 @njit
 def motor_angle(p: Record, x: float) -> float:
-    """Motor angle (rad) at which `turned` is ``x``."""
+    """Motor angle (rad) at which `equivalent_angle` is ``x``."""
     if p.travel[TRAVEL_POINTS - 1] == 0.0:
         return x
     return _along(x * p.gear_gain, p.travel, p.travel_angle)
@@ -110,7 +110,7 @@ def _signal(s, which):
 
 
 @njit
-def _shaped(e, x):
+def _apply_shape(e, x):
     if e.shape == SATURATION:
         return 1.0 - exp(-x)
     if e.shape == ONSET:
@@ -123,7 +123,7 @@ def drawn(e: Record, s: Record, place: int, dt: float) -> float:
     """Amount that one drawn effect adds, asked for every ``dt`` s."""
     if e.size == 0.0:
         return 0.0
-    value = e.size * _shaped(e, _signal(s, int(e.signal)))
+    value = e.size * _apply_shape(e, _signal(s, int(e.signal)))
     if e.other >= 0.0:
         value *= _signal(s, int(e.other))
     if e.lag_s > 0.0:
@@ -234,7 +234,7 @@ def clamp(p: Record, s: Record) -> None:
     motor than it took. It describes measured forces, not a passive material.
     """
     e = p.effects
-    angle = turned(p, s.angle)
+    angle = equivalent_angle(p, s.angle)
     if e.spindle_lead_error.amplitude_um != 0.0:
         error = sin(e.spindle_lead_error.order_per_turn * angle + e.spindle_lead_error.phase_rad)
         angle += 1e-6 * e.spindle_lead_error.amplitude_um / p.gear_gain * error

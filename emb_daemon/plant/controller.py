@@ -36,8 +36,8 @@ def set_target(p: Record, s: Record, mode: int, target: float, rate: float) -> N
         if abs(error) > band and abs(s.position_target - s.angle) < 0.5:
             correction = s.force_correction + CYCLE_S * _FORCE_INTEGRAL * error / slope
             s.force_correction = min(max(correction, -_LARGEST_CORRECTION_RAD), _LARGEST_CORRECTION_RAD)
-        # The controller follows wear and growth, as if it found contact at each application. It does not follow the disc's
-        # thickness over the turn is not, or it would not show in the force.
+        # The controller follows wear and growth, as if it found contact at each application. It does not follow how the disc's
+        # thickness varies over the turn: that would then not show in the force.
         thicker = 1e-6 * p.effects.disc_thermal_expansion.growth_um_per_K * (s.disc - p.curve_temperature) - s.wear
         s.position_target = motor_angle(p, p.contact_angle - thicker / p.gear_gain + goal) + s.force_correction
     else:

@@ -3,8 +3,8 @@
 Sources: FIPS 197 (AES), RFC 4493 (CMAC). A state of 16 bytes is held bit-sliced: word i consists of bit i of all bytes, byte n
 at bit n. The S-box is then Boolean arithmetic, and no address or branch depends on the key or on a message. A table would tell
 other processes of the machine, through the cache, which of its lines were read; only the round keys, once at the start, are
-made with one. The inverse of the S-box is computed in the
-tower GF(((2^2)^2)^2) with w^2 = w + 1, x^2 = x + w + 1, y^2 = y + wx + w; the change of basis was found by search.
+made with one. The inverse in the S-box is computed in the tower GF(((2^2)^2)^2) with w^2 = w + 1, x^2 = x + w + 1,
+y^2 = y + wx + w; the change of basis was found by search.
 """
 
 import numpy as np
