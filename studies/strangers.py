@@ -33,7 +33,7 @@ from emb_daemon.offline.score import first_known, rmse, share_inside, temperatur
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
-from studies.blind import DRAWN, draw, draw_foreign, sized
+from studies.blind import DRAWN, draw, draw_sized
 
 _THICKNESSES_MM = (3.5, 6.5, 9.5)
 #: RMS of the effect that no catalogue lists, as a share of the brake's force: 300 N at 30 kN.
@@ -106,7 +106,7 @@ def draw_stranger(seed: int) -> Stranger:
     size = _FOREIGN_SHARE * calibration.stiffness.maximum_force_N
     schedule = sc.random_angle(base, 20.0, np.random.default_rng(seed), 0.5 * calibration.stiffness.maximum_force_N)
     drive = _drive(calibration, np.random.default_rng(seed), 4)
-    foreign = sized(base, schedule + drive, calibration, draw_foreign(rng), size, seed)
+    foreign = draw_sized(base, schedule + drive, calibration, rng, size, seed)
     stranger = Stranger(calibration, effects | foreign)
     plan(stranger, seed, rng)
     return stranger

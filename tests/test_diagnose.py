@@ -49,10 +49,12 @@ from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import EpisodeErrors, rmse
+from emb_daemon.plant.brake import ONSET, POWER
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import random_angle, simulate_log, training
+from emb_daemon.plant.scenarios import random_angle, rig_drag, simulate_log, training
 from emb_daemon.resources import resource
+from emb_daemon.wire.contract import CYCLE_S
 from studies import blind
 from studies.blind import campaign, run_trial
 
@@ -1135,6 +1137,47 @@ def test_the_blind_test_goes_on_where_it_was_stopped(monkeypatch, tmp_path, caps
     assert blind.main(["--null", "5", *none, "--pairs", "0", "--seeds", "1004"]) == 0 and ran[5:] == [1004]
     table = capsys.readouterr().out
     assert "| no effect | 3 | 3/3 | 3/3 | 0 |" in table and "| two effects | 1 | 0/1 | 0/1 | 0 |" in table
+
+
+def test_the_blind_test_counts_how_often_the_report_is_right_that_something_is_left():
+    rest = {
+        "something": blind.Rest(60.0, 30.0, 30.0, True),
+        "unsaid": blind.Rest(60.0, 30.0, 30.0, False),
+        "nothing": blind.Rest(31.0, 30.0, 30.0, False),
+        "between": blind.Rest(40.0, 30.0, 30.0, True),
+    }
+    trial = blind.Trial(1, "null", {}, 0.0, {}, 90.0, 27.0, None, left=rest)
+    assert "`unexplained.present`: right on 2 of 3 paths; on 1 more either is." in blind.summary([trial])
+
+
+def _hidden(port, signal, size=1.0, shape=POWER, other=None, exponent=1.0, lag_s=0.0):
+    which = {key: float(PLANT_SIGNALS.index(name)) if name else -1.0 for key, name in (("signal", signal), ("other", other))}
+    return {f"drawn_{port}": {"size": size, "shape": shape, "exponent": exponent, "lag_s": lag_s} | which}
+
+
+def test_a_drawn_effect_that_no_brake_can_have_is_drawn_again(calibration, monkeypatch):
+    """A drag at 4 kN: what begins at 10 kN does nothing there at any size, and what a steep power of the disc's speed adds
+    while the disc runs up is more than pads can be stiffer, if it is to be felt where it turns slowly."""
+    plant = plant_from_calibration(calibration, seed=5)
+    schedule = rig_drag(4000.0, 20.0, 8.0) + rig_drag(200.0, 60.0, 2.0)
+    nothing = _hidden("gear_gain", "clamp_force", shape=ONSET)
+    beyond = _hidden("stiffness", "disc_speed", exponent=2.6, other="disc_speed")
+    usual = _hidden("stiffness", "brake_torque", exponent=0.7)
+    ask = lambda effect: blind.sized(plant, schedule, calibration, effect, 150.0, seed=5)  # noqa: E731
+    assert ask(nothing) is None and ask(beyond) is None
+    draws = iter([nothing, beyond, usual])
+    monkeypatch.setattr(blind, "draw_foreign", lambda rng, family: next(draws))
+    drawn = blind.draw_sized(plant, schedule, calibration, np.random.default_rng(0), 150.0, seed=5)
+    assert drawn == ask(usual) and 0.0 < drawn["drawn_stiffness"]["size"] < 0.5
+
+
+def test_what_a_drawn_effect_adds_is_what_the_plant_says(calibration):
+    effect = _hidden("gear_gain", "brake_torque", size=0.1, exponent=2.0, other="clamp_force", lag_s=0.5)
+    plant = plant_from_calibration(calibration, seed=5)
+    truth = simulate_log(plant, rig_drag(4000.0, 20.0, 2.0), seed=5)[1][:, 0]
+    at_once = 0.1 * (truth["brake_torque"] / 1000.0) ** 2 * truth["force"] / 10000.0
+    share = CYCLE_S / 0.5
+    np.testing.assert_allclose(blind.amounts(effect, truth), lfilter([share], [1.0, share - 1.0], at_once), rtol=1e-6)
 
 
 def test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves(calibration):
