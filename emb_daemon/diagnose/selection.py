@@ -308,17 +308,31 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
         return None
     over_grammar = candidate.made or candidate.names
     floor = selection.screening.floor(model, candidate.channel, candidate.made)
+    whole = len(groups(candidate.effect, amplitudes)) == 1
     gone, gains = [], []
     for group in groups(candidate.effect, amplitudes):
         evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
-        little = model.rms(evidence.gain, candidate.channel) < floor
+        gain = model.rms(evidence.gain, candidate.channel)
+        if over_grammar and whole and 0.0 < gain < floor:
+            # From where a far fit ended a line does not lead back: what it gains, a fit without it says.
+            without = model.without(model.of_effect(name)).refined({candidate.channel})
+            more = _left_out(without, candidate.channel) - _left_out(model, candidate.channel)
+            gain = model.rms(more, candidate.channel)
+        little = gain < floor
         # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so must
         # what is gained where a prior alone says how large it is.
         chance = evidence.p_value > Q_VALUE and not over_grammar
         if evidence.gain <= 0.0 or chance or (little and (over_grammar or not _is_carried(model, group))):
             gone += group
-            gains.append(model.rms(evidence.gain, candidate.channel) / floor)
+            gains.append(gain / floor)
     return (max(gains), name, gone) if gone else None
+
+
+def _left_out(model: Model, channel: str) -> float:
+    """Squared error of means of a channel's residual over left-out episodes, everything in it refitted."""
+    own = model.own(channel)
+    moments = model.moments(channel, [model.columns[c] for c in own], samples=LASTING[channel])
+    return float(leave_out(moments, model.penalty(own, channel)).left_out.sum())
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:
