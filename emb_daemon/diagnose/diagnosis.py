@@ -25,7 +25,7 @@ from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import LASTING, Progress, Selection
-from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond
+from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond, least_dependence
 from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
@@ -346,7 +346,10 @@ def _left(
             # What a calibration's own data left is in its noise already, sample by sample.
             gains = screening.dependence(model, channel, 1 if model.bench.own_data else LASTING[channel])
             gains = {name: pair for name, pair in gains.items() if name not in NO_RIVALS.get(channel, ())}
-            found = dependences(channel, gains, model.counted(channel), screening.floor(model, channel))
+            least = screening.floor(model, channel)
+            if not model.bench.own_data:
+                least = max(least, least_dependence(model.residual[channel], LASTING[channel]))
+            found = dependences(channel, gains, model.counted(channel), least)
         first, last = _rms(before[channel]), _rms(after[channel])
         known = screening.achieved(model, channel, force, rise)
         if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):

@@ -13,8 +13,9 @@ _SURE = 2.5
 #: Share of the residual's mean square from which a dependence is worth a word.
 _LEAST_SHARE = 0.05
 #: Residual over what the calibration achieved on its own data from which something is left: its figures scatter by a quarter
-#: from log to log and pad to pad, units by less.
-CLEARLY = 1.5
+#: from log to log and pad to pad, units by less. A dependence that adds less to what noise leaves of the means it is seen in
+#: is within that scatter.
+CLEARLY, _SCATTER = 1.5, 1.25
 #: Heat without a brake torque sensor is as uncertain as pads' friction, which no table knows better from one day to the next.
 _FRICTION_SHARE = 0.08
 
@@ -95,6 +96,11 @@ class Left:
 def is_beyond(rms: float, known: float) -> bool:
     """Whether a residual is clearly above what the calibration achieved; not where it does not say."""
     return rms > CLEARLY * known
+
+
+def least_dependence(residual: np.ndarray, samples: int) -> float:
+    """RMS from which a dependence of means over ``samples`` of a residual is more than their usual scatter."""
+    return float(np.sqrt((_SCATTER**2 - 1.0) / samples)) * sample_noise(residual)
 
 
 def sample_noise(residual: np.ndarray, places: int = 1) -> float:
