@@ -1,6 +1,8 @@
 """What has jumped: each change of an ideal brake is attributed to its path, ends in a small error with a sigma that covers
 it, and nothing is proven where nothing has changed."""
 
+import itertools
+
 import brake
 import naive
 import numpy as np
@@ -548,26 +550,40 @@ def test_what_is_not_suspected_is_looked_for_anew(p, opened):
 
 @pytest.mark.parametrize("since", [None, "resumed", "braked"])
 def test_a_brake_that_was_never_seen_may_come_from_a_workshop(p, since):
-    """With other pads: more likely than that they changed between two stops, until it was seen to brake."""
+    """With other pads or another gear: more likely than that they changed between two stops, until it was seen to brake."""
     s = new_state()[0]
     set_priors(s["covariance"], p)
     s["scale"] = 1.0
     if since:
         s[since] = True
     open_all(s, p)
-    odds = s["alternatives"]["log_odds"]
-    assert odds[TORQUE_JUMP] == PRIOR_ODDS
-    assert odds[STIFFNESS_JUMP] == PRIOR_ODDS if since else odds[STIFFNESS_JUMP] > PRIOR_ODDS
-    assert not suspected(s) and s["alternatives"]["least"][STIFFNESS_JUMP] == PRIOR_ODDS
+    for jump in (STIFFNESS_JUMP, TORQUE_JUMP):
+        odds = s["alternatives"]["log_odds"][jump]
+        assert odds == PRIOR_ODDS if since else odds > PRIOR_ODDS
+        assert s["alternatives"]["least"][jump] == PRIOR_ODDS
+    assert not suspected(s)
+
+
+def test_first_strokes_with_other_pads_are_covered(p):
+    """While the motor closes for the first time, its friction explains them as well."""
+    beyond = []
+    for pads, seed in itertools.product((0.88, 0.92, 0.95, 1.05, 1.1), (1, 2, 3)):
+        other = p.copy()
+        other["curve"] *= pads
+        rows, force = brake.samples(other, brake.stops(p, 1, seed))
+        estimates = estimate(brake.noisy(rows, p, seed), p)
+        beyond.append(np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0))
+    assert np.mean(np.concatenate(beyond)) < 0.03
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_first_stroke_with_softer_pads_is_covered(p, seed):
-    other = p.copy()
-    other["curve"] *= 0.9
-    rows, force = brake.samples(other, brake.stops(p, 1, seed))
-    estimates = estimate(brake.noisy(rows, p), p)
-    assert np.mean(np.abs(estimates["force"] - force) < 2.0 * estimates["sigma"]) > 0.95
+def test_a_first_stroke_as_calibrated_is_no_sign_of_other_pads(p, seed):
+    rows, force = brake.samples(p, brake.stops(p, 1, seed))
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    pressed = force > 2000.0
+    assert not np.any(estimates["reasons"] & PATHS_DISAGREE)
+    assert np.sqrt(np.mean((estimates["force"] - force)[pressed] ** 2)) < 50.0
+    assert np.median(estimates["sigma"][pressed] / force[pressed]) < 0.02
 
 
 def test_what_is_only_suspected_is_given_up_after_some_stops(p, opened):

@@ -11,7 +11,7 @@ shown that they are the calibration's; a motor may fade.
 from math import exp, sqrt
 
 from emb_daemon.estimator.hypotheses import PRIOR_ODDS
-from emb_daemon.estimator.unknown import GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
+from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
 
@@ -23,8 +23,11 @@ _ANOTHER_ROTOR, _ANOTHER_MOTOR = 0.1, 0.1
 #: (--faults nominal,pads_thickness,pads_compound,tolerance,torque_constant,current_gain,gear_wear --count 10, seeds 22 and
 #: 23) 41 fail without this and 26 with it.
 PADS_ODDS, OTHERS_ODDS = exp(-2.0), exp(-3.5)
+#: Standard deviation of the stiffness of pads that are the calibration's, that differ in small ways, and that are others,
+#: shares; odds of each over those of the second.
+_PADS_SIGMA, _PADS_SHARE = (0.0, DRIFT_SCALE, SCALE_JUMP), (1.0, 1.0, OTHERS_ODDS / PADS_ODDS)
 #: Kind that is another unit, after the combinations of the three; least error of a calibration's stiffness, share.
-_UNIT, _LEAST = 8, 1e-4
+_UNIT, _LEAST = 12, 1e-4
 
 
 @njit
@@ -42,13 +45,15 @@ def common_variance(
     total = square = of_pads = of_rotor = of_unit = 0.0
     for kind in range(_UNIT + 1):
         unit = kind == _UNIT
-        pads, motor, rotor = unit or kind & 1 != 0, unit or kind & 2 != 0, unit or kind & 4 != 0
-        odds = (pads_odds if pads else 1.0) * (OTHERS_ODDS if motor else 1.0) * (rotor_odds if rotor else 1.0)
+        pads = 2 if unit else kind % 3
+        motor, rotor = unit or (kind // 3) & 1 != 0, unit or kind >= 6
+        odds = (pads_odds if pads else 1.0) * _PADS_SHARE[pads]
+        odds *= (OTHERS_ODDS if motor else 1.0) * (rotor_odds if rotor else 1.0)
         gain_sigma = _ANOTHER_MOTOR if motor else GAIN_SIGMA
         if unit:
             # Its torque constant is within the datasheet's tolerance.
             odds, gain_sigma = unit_odds, GAIN_JUMP
-        a = 1.0 / (stiffness_variance + (SCALE_JUMP * SCALE_JUMP if pads else 0.0))
+        a = 1.0 / (stiffness_variance + _PADS_SIGMA[pads] * _PADS_SIGMA[pads])
         b = 1.0 / (gain_sigma * gain_sigma)
         c = 1.0 / (inertia_variance + (_ANOTHER_ROTOR if rotor else INERTIA_SIGMA) ** 2)
         information = a + b + c

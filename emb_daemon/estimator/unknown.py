@@ -76,7 +76,7 @@ _CONTACT_REACH_M, _SCALE_REACH, _GAIN_REACH = 100e-6, 0.3, 0.05
 #: it stands, m per root of a second; stiffness, which gains some 4 % with each millimetre that a lining wears, and its walk,
 #: shares.
 _DRIFT_CONTACT_M, _DRIFT_WALK_M_PER_SQRT_S, _DRIFT_STANDING = 10e-6, 3e-6, 0.3
-_DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S = 0.05, 0.02 / 60.0
+DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S = 0.05, 0.02 / 60.0
 #: Bounds of what can be learned: beyond them it is a fault.
 LEAST_SCALE, MOST_SCALE = 0.3, 3.0
 
@@ -220,7 +220,7 @@ def add_growth(P: Floats, p: Record) -> None:
 def add_drift(P: Floats, p: Record) -> None:
     """What a brake in service may differ by from its calibration without anything having happened to it."""
     P[CONTACT, CONTACT] += (_DRIFT_CONTACT_M / p.gear_gain) ** 2
-    P[SCALE, SCALE] += _DRIFT_SCALE**2
+    P[SCALE, SCALE] += DRIFT_SCALE**2
     add_growth(P, p)
 
 
