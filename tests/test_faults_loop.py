@@ -29,6 +29,8 @@ from emb_daemon.wire.frames import ERROR, FRAME
 
 CONFIG = Path(__file__).parent.parent / "config" / "emb.yaml"
 _SHOWN_CYCLES = 250
+#: By how much two clocks may seem apart where the machine interrupts their reading, ns: a fifth of what is to be seen.
+_CLOCKS_NS = 1_000_000
 
 
 class Bus:
@@ -97,6 +99,8 @@ def _reasons(estimates):
 
 def test_bus_off_and_recovery(driven, caplog):
     """An error frame of the controller: Bus disturbed for a second, the force goes on."""
+    # Until then a brake that was never seen before is not certain to 300 N.
+    driven.run(10)
     off = np.zeros(1, FRAME)
     off["time_ns"], off["can_id"], off["flags"], off["length"] = driven.cycle * CYCLE_NS, 0x40, ERROR, 8
     driven.bus.waiting.append(off)
@@ -245,7 +249,7 @@ def test_a_frame_that_comes_while_the_loop_is_held_up_keeps_its_stamp(monkeypatc
         monkeypatch.setattr(bus, "_take", take)
         assert len(bus.drain()) == 1
         monkeypatch.undo()
-        assert bus.drain()["time_ns"][0] <= sent[0]
+        assert bus.drain()["time_ns"][0] <= sent[0] + _CLOCKS_NS
 
 
 def test_a_peer_that_is_gone_sends_nothing():

@@ -22,6 +22,7 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import DEGRADED, E2E_ERROR, PATHS_DISAGREE, TORQUE_ONLY
+from studies.phases import LEARNED_RMSE_N
 
 LIMIT_N = 5000.0
 SENSOR = ForceSensor(
@@ -66,12 +67,14 @@ def _rmse(estimates, force_N, rows):
 
 @pytest.mark.parametrize("change", [{"curve": 0.85}, {"curve": 1.15}, {"clearance": 0.9}, {"clearance": 1.1}])
 def test_it_carries_the_force_beyond_its_limit(ideal, change):
-    """In the first application of a brake that is not as calibrated; the promise is 60 %."""
+    """In the first application of a brake that is not as calibrated; the promise is 60 %, or the 100 N that are promised of a
+    brake which has learned."""
     without, mounted = ideal
     rows, force_N = _drive(without, 1, **change)
     above = force_N > LIMIT_N
     alone = _rmse(estimate(rows, without), force_N, above)
-    assert _rmse(estimate(_with_sensor(rows, _measured(force_N)), mounted), force_N, above) <= 0.6 * alone
+    with_sensor = _rmse(estimate(_with_sensor(rows, _measured(force_N)), mounted), force_N, above)
+    assert with_sensor <= max(0.6 * alone, LEARNED_RMSE_N) and with_sensor < alone
 
 
 def test_what_it_is_off_by_within_its_tolerances_does_not_harm(ideal):
