@@ -162,6 +162,26 @@ def test_workers_may_die(tmp_path, monkeypatch, lives):
     assert told == [(number, 8) for number in range(1, 9)]
 
 
+def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monkeypatch):
+    """Distributed fails to close one."""
+    from distributed import LocalCluster
+
+    def end(number: int) -> None:
+        os.kill(os.getpid(), 9)
+
+    workers, close = [], LocalCluster.close
+
+    def count_and_close(local, *arguments, **named):
+        workers.append(len(local.scheduler.workers))
+        return close(local, *arguments, **named)
+
+    monkeypatch.setattr("emb_daemon.fleet.cluster._LIVES", 0)
+    monkeypatch.setattr(LocalCluster, "close", count_and_close)
+    with cluster(workers=2) as client:
+        run(client, end, [1], failed=lambda item, reason: None)
+    assert workers[0] == 2
+
+
 def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, calibration):
     for name in ("at_once", "resumed"):
         _ingested(tmp_path / name, logs)
