@@ -109,6 +109,10 @@ _TOLD_CYCLES = 2.0
 #: Time for which an unexplained error of the torque is constant, s: until temperature and force of the brake are others, which
 #: takes some stops.
 _LASTS_S = 10.0
+#: Way of a whole stroke, over which counts are lost in the same direction, as time at the motor's maximum speed, s.
+_STROKE_S = 0.25
+#: Share of what the angle gains over the speed that may be wrong: it may be the speed that is.
+_UNSURE = 0.5
 #: Share of the clearance that the motor must have gone back through before a jump is proven.
 _BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
@@ -149,6 +153,17 @@ def _spread(s, p, m):
 
 
 @njit
+def _wandered(s, p, m):
+    """Variance (rad²) that the contact angle gains with this sample from a resolver whose zero wanders."""
+    w = s.wander
+    drifted = (_UNSURE * w.rate) ** 2 * _LASTS_S * m.dt
+    lost = (_UNSURE * w.loss) ** 2 * _STROKE_S * p.maximum_speed * abs(m.angle - s.angle)
+    variance = s.gear_slope * s.gear_slope * (drifted + lost + w.unseen * w.unseen)
+    w.unseen = 0.0
+    return variance
+
+
+@njit
 def _predict(s, p, m, spread, warmth, known):
     """Time update of all hypotheses, then of the motor's heat."""
     current_torque = p.torque_constant * p.current_sigma
@@ -158,6 +173,7 @@ def _predict(s, p, m, spread, warmth, known):
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
     walked[OFFSET] += s.offset_walk * m.dt
+    walked[CONTACT] += _wandered(s, p, m)
     if s.offset_age_s > 0.0:
         s.offset_age_s += m.dt
     # New uncertainty of the pads' temperature adds to that of the stiffness.
@@ -297,6 +313,9 @@ def fuse(
         out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
         # Error of the travel from the released position by a resolver with a wrong gain.
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
+        # What the zero strays by until torque has shown it.
+        strays = abs(s.wander.rate) * _LASTS_S + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
+        out.sigma = hypot(out.sigma, s.slope * s.gear_slope * strays)
         out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
     # Not max(), which may return the number if the other is NaN, so that a broken estimate would look like an open brake.
     if out.force < 0.0:

@@ -16,6 +16,7 @@ from emb_daemon.models.gear import GEAR
 from emb_daemon.models.lateness import LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
+from emb_daemon.models.wander import WANDER
 
 CURVE_TERMS = 5
 FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID = 6, 6, 8
@@ -116,6 +117,7 @@ STATE = np.dtype(
         # Age of the angle beside the speed, and beyond what the calibration knows, s.
         ("lateness", LATENESS),
         ("late", "f8"),
+        ("wander", WANDER),
         # Fusion.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),

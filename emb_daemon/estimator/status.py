@@ -34,6 +34,7 @@ class Fact(NamedTuple):
 
 TABLE = {
     "zero_moved": Fact("the motor angle changed although the motor did not move so far", OUT_OF_RANGE, FUSED),
+    "zero_wanders": Fact("the motor angle drifts or loses counts beside the motor speed", OUT_OF_RANGE, FUSED),
     "current_implausible": Fact("the current is frozen while the motor must turn", PATHS_DISAGREE | STUCK, STIFFNESS_ONLY),
     "paths_contradict": Fact("the paths contradict each other, and either may be wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
     "torque_old": Fact("the torque path has given no force for some time", 0, STIFFNESS_ONLY),
@@ -61,7 +62,7 @@ TABLE = {
 
 #: Bit of each fact.
 (
-    ZERO_MOVED, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
+    ZERO_MOVED, ZERO_WANDERS, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
     DISC_UNEVEN, ANGLE_LATE, FORCE_SENSOR_WRONG, RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT,
     FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK, WHEEL_CONTRADICTED, BOUNDS_CONTRADICT,
     BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,

@@ -32,6 +32,7 @@ from emb_daemon.estimator.status import (
     THERMOCOUPLE_STUCK,
     WHEEL_CONTRADICTED,
     ZERO_MOVED,
+    ZERO_WANDERS,
     tell_status,
 )
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
@@ -39,9 +40,10 @@ from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import follow, interrupt
-from emb_daemon.models.plausibility import disbelieve_resolver, frozen, watch
+from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
+from emb_daemon.models.wander import leave_stretch, watch_wander
 from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
@@ -146,11 +148,17 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
 
 @njit
 def _follow_age(s, p, m, moved_zero):
-    """Age of the angle beyond the calibration's."""
-    if moved_zero or not 0.0 < m.dt <= ONE_CYCLE_S or s.drifting_s > 0.0 or frozen(s.plausibility):
+    """Age of the angle beyond the calibration's, and whether its zero wanders."""
+    travel, turned, gained = m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed
+    seen = 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero and s.drifting_s == 0.0
+    if seen and s.plausibility.verdict != STIFFNESS_WRONG:
+        watch_wander(s.wander, travel, turned, m.speed, gained, s.speed_sigma, m.dt)
+    else:
+        leave_stretch(s.wander)
+    if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
         return
-    follow(s.lateness, m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed, m.dt)
+    follow(s.lateness, travel, turned, gained, m.dt)
     s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
 
 
@@ -183,6 +191,8 @@ def _look(s, p, m, facts, out):
         facts |= THERMOCOUPLE_STUCK
     if s.wheel.contradicted:
         facts |= WHEEL_CONTRADICTED
+    if s.wander.found and p.clearance_sigma > 0.0:
+        facts |= ZERO_WANDERS
     if not LEAST_SCALE < s.scale < MOST_SCALE:
         facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:

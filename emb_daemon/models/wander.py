@@ -1,0 +1,133 @@
+"""A resolver whose zero wanders: its angle drifts, or counts of one direction are lost, a little in each sample.
+
+Over strokes and stops the angle must gain what the integrated speed says. What it gains beyond that is explained by a drift with
+time, a loss with the way whatever its direction, and two errors that come to nothing when the motor returns: the resolver's gain
+with the way, and the angle's age with the speed. All four are fitted together over some stops, so that the noise of the speed
+averages out. Which of angle and speed is wrong the fit cannot tell; the contact angle becomes uncertain by the difference.
+"""
+
+from math import exp, sqrt
+
+import numpy as np
+
+from emb_daemon.jit import Record, fields, njit
+from emb_daemon.wire.contract import CYCLE_S
+
+#: What explains the angle less integrated speed, over integrated speed (1), gained speed (s), time (rad/s), and way (1).
+_GAIN, _AGE, _RATE, _LOSS, _CAUSES = 0, 1, 2, 3, 4
+
+#: The present stretch: its duration, angle less integrated speed (``slip``, rad), integrated speed (``net`` rad), the same
+#: without sign while the motor turned (``way`` rad), and gained speed (rad/s). ``normal``, ``right``: weighted normal equations,
+#: which forget; ``lower``, ``half``: scratch. ``offset_weight``, ``offset_sum``: what the speed's offset was so far.
+#: ``strayed`` rad: slip of late. ``rate`` rad/s and ``loss``: drift with time and share of the way, where they are likely, else
+#: 0; ``found``: whether one is certain; ``unseen`` rad: what had strayed when that was found, until it has been taken into account.
+WANDER = np.dtype(
+    [
+        *fields("f8", "seconds slip net way gained"),
+        ("normal", "f8", (_CAUSES, _CAUSES)),
+        ("right", "f8", (_CAUSES,)),
+        ("lower", "f8", (_CAUSES, _CAUSES)),
+        ("half", "f8", (_CAUSES,)),
+        *fields("f8", "offset_weight offset_sum strayed rate loss unseen"),
+        ("found", "?"),
+    ],
+    align=True,
+)
+
+#: A stretch lasts at least this long, s, and ends where the motor stands, so that an age of the angle does not show; or at
+#: latest after the second time.
+_LEAST_S, _MOST_S = 0.5, 2.0
+#: Time over which evidence is kept, s: some stops.
+_KEPT_S = 40.0
+#: A motor stands below this speed, rad/s: ten times the noise of a resolver's speed.
+_STANDING_RAD_PER_S = 3.0
+#: What may be at all, as weights: gain (share) and age (s) as `models.lateness` has them, any drift (rad/s) and loss (share).
+_POSSIBLE = np.array([1.0 / 0.02**2, 1.0 / 0.01**2, 1.0 / 1.0**2, 1.0 / 0.1**2])
+#: Noise of a stretch beside the speed's: two counts of a 12-bit resolver, rad; and share of the way that the trapezoidal rule
+#: may miss (`models.lateness`).
+_COUNTS_RAD, _MISSED = 0.003, 0.001
+#: Offset of a healthy resolver's speed when nothing is known of it, rad/s, standard deviation: one count of the wire, which a
+#: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
+#: is learned from what differs from it by less than so many standard deviations. Time in which it becomes another, s.
+_OFFSET_RAD_PER_S, _OFFSET_OF_NOISE, _LIKE_BEFORE, _OFFSET_CHANGES_S = 0.02, 0.1, 2.0, 600.0
+#: Standard deviations from which a drift or a loss counts in the force's sigma, and from which it is told: of evidence that
+#: renews itself in 40 s, one in a few hours of driving has so much by chance, and one in a week.
+_LIKELY, _SURELY = 3.0, 4.0
+
+
+@njit
+def watch_wander(a: Record, travel: float, turned: float, speed: float, gained: float, noise: float, dt: float) -> None:
+    """Take one sample: ``travel`` rad by the angle, ``turned`` rad by the speed in ``dt`` s, which is now ``speed`` rad/s and
+    ``gained`` rad/s more than before; ``noise`` rad/s of the speed."""
+    a.seconds += dt
+    a.slip += travel - turned
+    a.net += turned
+    a.gained += gained
+    if abs(speed) > _STANDING_RAD_PER_S:
+        a.way += abs(turned)
+    if a.seconds >= _MOST_S or (a.seconds >= _LEAST_S and abs(speed) < _STANDING_RAD_PER_S):
+        _take_stretch(a, noise)
+        leave_stretch(a)
+
+
+@njit
+def leave_stretch(a: Record) -> None:
+    """Begin a new stretch, also after a missing sample."""
+    a.seconds = a.slip = a.net = a.way = a.gained = 0.0
+
+
+@njit
+def _take_stretch(a, noise):
+    variance = noise * noise * CYCLE_S * a.seconds + _COUNTS_RAD * _COUNTS_RAD + (_MISSED * a.way) ** 2
+    keep = exp(-a.seconds / _KEPT_S)
+    causes = a.half
+    causes[_RATE], causes[_LOSS], causes[_GAIN], causes[_AGE] = a.seconds, a.way, a.net, a.gained
+    for i in range(_CAUSES):
+        a.right[i] = keep * a.right[i] + causes[i] * a.slip / variance
+        for j in range(_CAUSES):
+            a.normal[i, j] = keep * a.normal[i, j] + causes[i] * causes[j] / variance
+    _factorise(a)
+    loss_sigma = 1.0 / a.lower[_LOSS, _LOSS]
+    loss = a.half[_LOSS] * loss_sigma
+    rate = (a.half[_RATE] - a.lower[_LOSS, _RATE] * loss) / a.lower[_RATE, _RATE]
+    rate_sigma = sqrt(1.0 + (a.lower[_LOSS, _RATE] * loss_sigma) ** 2) / a.lower[_RATE, _RATE]
+    offset, offset_sigma = _offset(a, noise)
+    a.strayed = keep * a.strayed + a.slip - offset * a.seconds
+    apart = rate - offset
+    apart_sigma = sqrt(rate_sigma * rate_sigma + offset_sigma * offset_sigma)
+    a.rate = apart if abs(apart) > _LIKELY * apart_sigma else 0.0
+    a.loss = loss if abs(loss) > _LIKELY * loss_sigma else 0.0
+    was, a.found = a.found, abs(apart) > _SURELY * apart_sigma or abs(loss) > _SURELY * loss_sigma
+    if a.found and not was:
+        a.unseen = a.strayed
+    if abs(apart) < _LIKE_BEFORE * apart_sigma:
+        # Evidence that renews itself in `_KEPT_S` counts once in that time.
+        told = a.seconds / (_KEPT_S * rate_sigma * rate_sigma)
+        a.offset_weight += told
+        a.offset_sum += told * rate
+
+
+@njit
+def _offset(a, noise):
+    """Drift that the speed's offset causes, rad/s, and its standard deviation."""
+    keep = exp(-a.seconds / _OFFSET_CHANGES_S)
+    a.offset_weight *= keep
+    a.offset_sum *= keep
+    weight = a.offset_weight + 1.0 / (_OFFSET_RAD_PER_S**2 + (_OFFSET_OF_NOISE * noise) ** 2)
+    return a.offset_sum / weight, 1.0 / sqrt(weight)
+
+
+@njit
+def _factorise(a):
+    """Cholesky factor of the normal equations with what is possible, and their right side solved by it."""
+    for i in range(_CAUSES):
+        for j in range(i + 1):
+            total = a.normal[i, j] + (_POSSIBLE[i] if i == j else 0.0)
+            for k in range(j):
+                total -= a.lower[i, k] * a.lower[j, k]
+            a.lower[i, j] = sqrt(total) if i == j else total / a.lower[j, j]
+    for i in range(_CAUSES):
+        total = a.right[i]
+        for k in range(i):
+            total -= a.lower[i, k] * a.half[k]
+        a.half[i] = total / a.lower[i, i]
