@@ -173,9 +173,11 @@ def _predict(s, p, m, spread, warmth, known):
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
     walked[OFFSET] += s.offset_walk * m.dt
-    walked[CONTACT] += _wandered(s, p, m)
+    walked[CONTACT] += _wandered(s, p, m) + s.contact_walk * m.dt
     if s.offset_age_s > 0.0:
         s.offset_age_s += m.dt
+    if s.contact_age_s > 0.0:
+        s.contact_age_s += m.dt
     # New uncertainty of the pads' temperature adds to that of the stiffness.
     walked[SCALE] += max(softening - s.softening, 0.0) * (softening + s.softening)
     s.softening = softening
