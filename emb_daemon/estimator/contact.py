@@ -52,6 +52,8 @@ _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
 #: that counts as none, because a clamped brake would have gained more over that travel; share of the Coulomb friction that an
 #: open brake may need.
 _SLIDING, _PASSED, _FREE, _OPEN = 0.9, 0.3, 0.02, 0.5
+#: Angle by which a motor that closes has turned since the start, rad: three counts of a resolver of 12 bit.
+_CLOSES_RAD = 0.005
 #: Force at power-on, as a share of the largest, from which the brake counts as clamped.
 _CLAMPED = 0.1
 
@@ -163,9 +165,10 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
-        # At a request the brake may still be open: a clamped one needs more torque than friction. Frames at a reduced rate
-        # tell no torque, and such logs begin with an open brake.
-        easy = torque < _OPEN * p.offset_friction or m.dt > ONE_CYCLE_S
+        # At a request the brake may still be open: a clamped one needs more torque than friction to close, though friction
+        # may hold it without. Frames at a reduced rate tell no torque, and such logs begin with an open brake.
+        closes = m.angle > s.start_angle + _CLOSES_RAD
+        easy = (closes and torque < _OPEN * p.offset_friction) or m.dt > ONE_CYCLE_S
         open_yet = m.has_status and m.park_brake == 0.0 and easy
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
