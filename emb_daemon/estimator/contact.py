@@ -49,11 +49,10 @@ _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: times over which a start is observed, for which a released motor must stand, and after which it must be off, s.
 _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
 #: Friction state from which the motor slides; share of the clearance that must be passed; share of the largest force's torque
-#: that counts as none, because a clamped brake would have gained more over that travel; share of the Coulomb friction that an
-#: open brake may need.
-_SLIDING, _PASSED, _FREE, _OPEN = 0.9, 0.3, 0.02, 0.5
-#: Angle by which a motor that closes has turned since the start, rad: three counts of a resolver of 12 bit.
-_CLOSES_RAD = 0.005
+#: that counts as none, because a clamped brake would have gained more over that travel.
+_SLIDING, _PASSED, _FREE = 0.9, 0.3, 0.02
+#: Angle by which a motor that is on its way has turned since the start, rad: three counts of a resolver of 12 bit.
+_MOVES_RAD = 0.005
 #: Force at power-on, as a share of the largest, from which the brake counts as clamped.
 _CLAMPED = 0.1
 
@@ -165,19 +164,19 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
-        # At a request the brake may still be open: a clamped one needs more torque than friction to close, though friction
-        # may hold it without. Frames at a reduced rate tell no torque, and such logs begin with an open brake.
-        closes = m.angle > s.start_angle + _CLOSES_RAD
-        easy = (closes and torque < _OPEN * p.offset_friction) or m.dt > ONE_CYCLE_S
-        open_yet = m.has_status and m.park_brake == 0.0 and easy
+        # At a request the brake may be clamped, which friction may hold without torque, or on its way, from where nobody knows.
+        # Frames at a reduced rate tell nothing of it, and such logs begin with an open brake.
+        open_yet = m.has_status and m.park_brake == 0.0 and m.dt > ONE_CYCLE_S
+        if not released and abs(m.angle - s.start_angle) > _MOVES_RAD:
+            s.start_angle = np.inf
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
 
 
 @njit
 def _passed_clearance(s, p, m):
-    """Whether the motor has closed from where it started, or from where it has stood lower since, by a good part of the
-    clearance, and no force opposed it: then it was released there, whatever was requested."""
+    """Whether the motor has closed from where it stood at the start, or from where it has stood lower since, by a good part of
+    the clearance, and no force opposed it: then it was released there, whatever was requested."""
     if m.angle <= s.start_angle:
         # A torque while opening does not count against the closing motion.
         s.passed = s.opposing = 0.0
