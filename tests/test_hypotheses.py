@@ -814,3 +814,21 @@ def test_a_noisy_angle_is_no_change(p, noise_rad, seed):
     error = estimates["force"] - force
     assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.97
     assert np.sqrt(np.mean(error**2)) < 40.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_contact_that_moves_from_stop_to_stop_is_covered_after_a_few(p, seed):
+    """Knock-back by 20 um, each time by another amount."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for stop in range(20):
+        moved = p.copy()
+        moved["clearance"] += 20e-6 / p["gear_gain"] * rng.standard_normal()
+        parts.append(brake.samples(moved, brake.stops(p, 1, 100 * seed + stop)))
+    rows, force = (np.concatenate(column) for column in zip(*parts, strict=True))
+    rows["dt"] = 0.004
+    rows["dt"][0] = 0.0
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    beyond = np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0)
+    first = len(rows) // 4
+    assert np.mean(beyond[first:]) < 0.01

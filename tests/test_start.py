@@ -174,3 +174,29 @@ def test_nothing_is_learned_while_the_contact_is_unknown(p):
     rows["park_brake"] = 1.0
     estimates = estimate(rows, p)
     assert np.all(estimates["stiffness_factor"] == estimates["stiffness_factor"][0])
+
+
+def test_a_brake_that_friction_holds_at_a_request_may_be_clamped(p):
+    """A drag of 1.6 kN with hardly any current: less torque than friction alone, from a motor that stands."""
+    rows, force = _clamped(p, 4.0, current=False)
+    rows["brake_request"] = 1.0
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates)) and np.all(estimates["source"] == r.TORQUE_ONLY)
+    assert _covered(estimates, force)
+
+
+@pytest.mark.parametrize("seen", [0.3, 0.6, 0.9])
+def test_a_motor_that_closes_at_power_on_comes_from_where_nobody_knows(p, seen):
+    """Power comes in the middle of a stroke through the clearance: the contact is nearer than from a released position."""
+    up = brake.clamp(p, 15.0, 0.6)
+    first = int(np.flatnonzero(up >= seen * p["clearance"])[0])
+    down = up[::-1]
+    rows, force = brake.samples(p, np.concatenate([up, np.full(250, up[-1]), down, np.zeros(500), up]))
+    rows, force = rows[first:].copy(), force[first:]
+    rows["dt"][0] = 0.0
+    rows["brake_request"] = 1.0
+    released = slice(len(up) + 250 + len(down) - first, len(up) + 750 + len(down) - first)
+    rows["brake_request"][released] = 0.0
+    estimates = estimate(rows, p)
+    assert _covered(estimates, force)
+    assert np.all(_unknown(estimates)[: released.start]) and not np.any(_unknown(estimates)[released.start + 100 :])

@@ -1,0 +1,101 @@
+"""A motor angle that gains, over many stops, what its speed does not say: drifts and lost counts too slow for one standstill."""
+
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.models.wander import WANDER, leave_stretch, watch_wander
+from emb_daemon.offline import estimate
+from emb_daemon.wire import contract as r
+
+_DT = 0.004
+_COUNT = 2.0 * np.pi / 4096
+#: Stops of three seconds each.
+_STOPS = 40
+
+
+@pytest.fixture
+def p(parameters):
+    return brake.ideal(parameters)
+
+
+def _watched(p, drift=0.0, loss=0.0, gain=1.0, late=0, offset=0.0, seed=1, gap=False):
+    """WANDER record after the stops, with a ``drift`` (rad/s) from their middle on; ``late`` samples, ``offset`` rad/s of the
+    speed."""
+    angle = brake.stops(p, _STOPS, seed)
+    speed = np.gradient(angle, _DT) + offset + 0.3 * np.random.default_rng(seed).standard_normal(len(angle))
+    time = _DT * np.arange(len(angle))
+    read = gain * np.concatenate((np.zeros(late), angle[: len(angle) - late])) + drift * np.maximum(time - 0.5 * time[-1], 0.0)
+    read -= loss * np.cumsum(np.maximum(np.diff(angle, prepend=0.0), 0.0))
+    read = np.round(read / _COUNT) * _COUNT
+    a = np.zeros(1, WANDER)[0]
+    for i in range(1, len(read)):
+        if gap and i % 700 == 0:
+            leave_stretch(a)
+            continue
+        watch_wander(a, read[i] - read[i - 1], 0.5 * (speed[i] + speed[i - 1]) * _DT, speed[i], speed[i] - speed[i - 1], 0.3, _DT)
+    return a
+
+
+@pytest.mark.parametrize("drift", [-0.05, 0.05])
+@pytest.mark.parametrize("gap", [False, True])
+def test_a_drift_is_found_at_its_size(p, drift, gap):
+    a = _watched(p, drift=drift, gap=gap)
+    assert a["found"] and a["rate"] == pytest.approx(drift, abs=0.02)
+
+
+def test_counts_lost_in_one_direction_are_found_at_their_size(p):
+    """They are half a share of the whole way, and a gain error that returns with the motor."""
+    a = _watched(p, loss=0.006)
+    assert a["found"] and a["loss"] == pytest.approx(-0.003, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "healthy", [{}, {"gain": 0.98}, {"gain": 1.02}, {"late": 2}, {"offset": 0.02}, {"offset": -0.02, "gain": 1.01, "late": 1}]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_returns_with_the_motor_or_was_always_there_is_no_drift(p, healthy, seed):
+    a = _watched(p, seed=seed, **healthy)
+    assert not a["found"] and a["rate"] == 0.0 and a["loss"] == 0.0
+
+
+def _estimated(p, change, seed):
+    rows, force = brake.samples(p, brake.stops(p, _STOPS, seed))
+    rows = brake.noisy(rows, p, seed)
+    change(rows)
+    return estimate(rows, p), force
+
+
+def _beyond(estimates, force):
+    return np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
+def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, rad_per_s, seed):
+    begin = 7500
+
+    def drift(rows):
+        rows["angle"] += rad_per_s * _DT * np.maximum(np.arange(len(rows)) - begin, 0)
+
+    estimates, force = _estimated(p, drift, seed)
+    told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
+    assert len(told) and begin < told[0] < begin + 30 / _DT
+    assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
+    def lose(rows):
+        rows["angle"] -= 0.005 * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))
+
+    estimates, force = _estimated(p, lose, seed)
+    told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
+    assert len(told) and told[0] < 60 / _DT
+    assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
+
+
+def test_without_drift_nothing_is_told(p):
+    estimates, force = _estimated(p, lambda rows: None, 1)
+    assert not np.any(estimates["reasons"] & r.OUT_OF_RANGE)
+    assert np.mean(_beyond(estimates, force)) < 0.01
