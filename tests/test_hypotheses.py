@@ -816,7 +816,28 @@ def test_a_noisy_angle_is_no_change(p, noise_rad, seed):
     assert np.sqrt(np.mean(error**2)) < 40.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+def test_a_contact_angle_that_moved_is_expected_to_move_again(p, opened):
+    """As far in the same time; and no more after some stops in which it stayed."""
+    s = opened[0]
+
+    def touch(moved):
+        s["contact_angle"] += moved
+        s["contact"]["engaged"], s["braked"] = True, False
+        settle(s, p, False, 0.0)
+        s["contact_age_s"] = 10.0
+
+    for _ in range(10):
+        touch(0.0)
+    assert s["contact_walk"] == 0.0
+    for stop in range(10):
+        touch(1.0 if stop % 2 else -1.0)
+    assert s["contact_walk"] == pytest.approx(1.0 / 10.0, rel=0.1)
+    for _ in range(10):
+        touch(0.0)
+    assert s["contact_walk"] < 0.001
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_a_contact_that_moves_from_stop_to_stop_is_covered_after_a_few(p, seed):
     """Knock-back by 20 um, each time by another amount."""
     rng = np.random.default_rng(seed)
