@@ -1,4 +1,4 @@
-"""A motor angle that gains, over many stops, what its speed does not say: drifts and lost counts too slow for one standstill."""
+"""A motor angle that gains, over stops, what its speed does not say: drifts and lost counts too slow for one standstill."""
 
 import brake
 import numpy as np
@@ -33,7 +33,9 @@ def _watched(p, drift=0.0, loss=0.0, gain=1.0, late=0, offset=0.0, seed=1, gap=F
         if gap and i % 700 == 0:
             leave_stretch(a)
             continue
-        watch_wander(a, read[i] - read[i - 1], 0.5 * (speed[i] + speed[i - 1]) * _DT, speed[i], speed[i] - speed[i - 1], 0.3, _DT)
+        watch_wander(
+            a, read[i] - read[i - 1], 0.5 * (speed[i] + speed[i - 1]) * _DT, speed[i], speed[i] - speed[i - 1], 0.3, _DT
+        )
     return a
 
 

@@ -164,8 +164,8 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
-        # At a request the brake may be clamped, which friction may hold without torque, or on its way, from where nobody knows.
-        # Frames at a reduced rate tell nothing of it, and such logs begin with an open brake.
+        # At a request the brake may be clamped, which friction may hold without torque, or on its way, from where nobody
+        # knows. Frames at a reduced rate tell nothing of it, and such logs begin with an open brake.
         open_yet = m.has_status and m.park_brake == 0.0 and m.dt > ONE_CYCLE_S
         if not released and abs(m.angle - s.start_angle) > _MOVES_RAD:
             s.start_angle = np.inf
