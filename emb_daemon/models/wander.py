@@ -19,10 +19,10 @@ _GAIN, _AGE, _RATE, _LOSS, _CAUSES = 0, 1, 2, 3, 4
 
 #: The present stretch: its duration, angle less integrated speed (``slip``, rad), integrated speed (``net`` rad), the same
 #: without sign while the motor turned (``way`` rad), and gained speed (rad/s). ``normal``, ``right``: weighted normal
-#: equations, which forget; ``lower``, ``half``: scratch. ``offset_weight``, ``offset_sum``: what the speed's offset was so far.
-#: ``strayed`` rad: slip of late. ``rate`` rad/s and ``loss``: drift with time and share of the way, where they are likely,
-#: else 0; ``found``: whether one is certain; ``unseen`` rad: what had strayed when that was found, until it has been taken
-#: into account.
+#: equations, which forget; ``lower``, ``half``: scratch. ``offset_weight``, ``offset_sum``: what the speed's offset was so
+#: far. ``strayed`` rad: slip of late. ``rate`` rad/s and ``loss``: drift with time and share of the way, where they are
+#: likely, else 0; ``found``: whether one is certain; ``unseen`` rad: what had strayed when that was found, until it has been
+#: taken into account.
 WANDER = np.dtype(
     [
         *fields("f8", "seconds slip net way gained"),
@@ -46,8 +46,8 @@ _STANDING_RAD_PER_S = 3.0
 #: What may be at all, as weights: gain (share) and age (s) as `models.lateness` has them, any drift (rad/s) and loss (share).
 _POSSIBLE = np.array([1.0 / 0.02**2, 1.0 / 0.01**2, 1.0 / 1.0**2, 1.0 / 0.1**2])
 #: Noise of a stretch beside the speed's: two counts of a 12-bit resolver, rad; and share of the way that the trapezoidal rule
-#: misses: what it misses while a motor speeds up and slows down cancels but for a third of what `models.lateness` allows. Of 30
-#: logs of simulated rigs no loss exceeds 2.7 of the standard deviations that follow.
+#: misses: what it misses while a motor speeds up and slows down cancels but for a third of what `models.lateness` allows. In
+#: 30 logs of simulated rigs no loss exceeds 2.7 of the standard deviations that follow.
 _COUNTS_RAD, _MISSED = 0.003, 0.001
 #: Offset of a healthy resolver's speed when nothing is known of it, rad/s, standard deviation: one count of the wire, which a
 #: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
