@@ -46,6 +46,12 @@ def test_a_drift_is_found_at_its_size(p, drift, gap):
     assert a["found"] and a["rate"] == pytest.approx(drift, abs=0.02)
 
 
+def test_a_drift_is_found_beside_the_offset_that_its_speed_always_had(p):
+    """Also one that makes both signals agree."""
+    a = _watched(p, drift=0.05, offset=0.05)
+    assert a["found"] and a["rate"] == pytest.approx(0.05, abs=0.025)
+
+
 def test_counts_lost_in_one_direction_are_found_at_their_size(p):
     """They are half a share of the whole way, and a gain error that returns with the motor."""
     a = _watched(p, loss=0.006)
@@ -53,7 +59,7 @@ def test_counts_lost_in_one_direction_are_found_at_their_size(p):
 
 
 @pytest.mark.parametrize(
-    "healthy", [{}, {"gain": 0.98}, {"gain": 1.02}, {"late": 2}, {"offset": 0.02}, {"offset": -0.02, "gain": 1.01, "late": 1}]
+    "healthy", [{}, {"gain": 0.98}, {"gain": 1.02}, {"late": 2}, {"offset": 0.05}, {"offset": -0.05, "gain": 1.01, "late": 1}]
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_what_returns_with_the_motor_or_was_always_there_is_no_drift(p, healthy, seed):
@@ -95,6 +101,17 @@ def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < 60 / _DT
     assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_is_lost_before_it_is_certain_is_covered(p, seed):
+    """The contact angle walks as far as counts that are probably lost would take it."""
+
+    def lose(rows):
+        rows["angle"] -= 0.004 * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))
+
+    estimates, force = _estimated(p, lose, seed)
+    assert np.mean(_beyond(estimates, force)) < 0.01
 
 
 def test_without_drift_nothing_is_told(p):
