@@ -154,24 +154,21 @@ def _of_a_widening_caliper():
 
 
 @pytest.fixture
-def one_more(tmp_path) -> Path:
-    """A folder with a package that has one effect more. It is kept beside numba's for this state of the sources: the next run
-    compiles none of it."""
+def one_more() -> Path:
+    """A folder with a package that has one effect more, written anew each time. It is beside numba's for this state of the
+    kernels, and what was compiled of it stays there."""
     root = Path(emb_daemon.__file__).parent.parent
     text = (root / "examples" / "own_effect.py").read_text().replace("caliper_widening", "own_effect")
-    kept = Path(config.CACHE_DIR) / f"one_more_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    if kept.exists():
-        return kept
-    new = tmp_path / "new"
+    new = Path(config.CACHE_DIR) / f"one_more_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     for folder in ("emb_daemon", "config", "dbc"):
-        shutil.copytree(root / folder, new / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(root / folder, new / folder, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     effects = new / "emb_daemon" / "effects"
     (effects / "own_effect.py").write_text(text.partition('if __name__ == "__main__":')[0])
     registration = effects / "__init__.py"
     registration.write_text(
         registration.read_text().replace('    "thermocouple_lag",\n', '    "thermocouple_lag",\n    "own_effect",\n')
     )
-    return Path(shutil.move(new, kept))
+    return new
 
 
 def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(one_more, tmp_path):
