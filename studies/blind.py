@@ -31,7 +31,7 @@ from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
 from emb_daemon.diagnose.selection import LASTING
 from emb_daemon.effects import REGISTRY
-from emb_daemon.offline.log import Log, log_of
+from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import ONSET, POWER, SATURATION, SIGNALS, drawn
 from emb_daemon.plant.derive import plant_from_calibration
@@ -391,16 +391,16 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         left.strongest.signal if left and left.strongest else None,
         error,
         seconds,
-        what_is_left(result, log_of(simulate_log(base, judging, seed=seed + 2)[0])),
+        what_is_left(result, base, judging, seed + 2),
         tuple(f.effect.name for f in result.accepted if f.in_calibration),
         result.judged_residual.get("temperature"),
         {f.effect.name: [":".join(["term", port, *signals]) for port, signals in f.alike] for f in new if f.alike},
     )
 
 
-def what_is_left(result: Diagnosis, alone: Log) -> dict[str, Rest]:
-    """Remaining error by path, compared with the log of the same unit with nothing hidden."""
-    plain = Model.of(Bench([alone], result.original))
+def what_is_left(result: Diagnosis, plant: np.void, schedule: Schedule, seed: int) -> dict[str, Rest]:
+    """Remaining error by path, compared with the log that the unit leaves with nothing hidden, its ``plant``."""
+    plain = Model.of(Bench([log_of(simulate_log(plant, schedule, seed=seed)[0])], result.original))
     fitted = plain.refined(FORCE_CHANNELS)
     judges = result.judges.under(result.calibration)
     all_three = (judges, judges.residuals({})), (plain.bench, plain.residual), (fitted.bench, fitted.residual)

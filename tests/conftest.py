@@ -18,9 +18,9 @@ settings.load_profile("project")
 _ROOT = Path(__file__).parent.parent
 
 #: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache the
-#: first compiles the simulated car and a package with one effect more, the other the estimator: neither does it twice.
+#: first compiles the library, in which nothing of the cache helps, the other the estimator: neither does it twice.
 _FIRST = (
-    "test_effects", "test_hypotheses", "test_diagnose", "test_ahead", "test_adapt", "test_fleet", "test_plant", "test_rig",
+    "test_ahead", "test_hypotheses", "test_diagnose", "test_effects", "test_adapt", "test_fleet", "test_plant", "test_rig",
     "test_identify_command", "test_foreign_rig_identify", "test_foreign_rig", "test_identify_fit", "test_formats",
     "test_browser", "test_reload", "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
 )  # fmt: skip

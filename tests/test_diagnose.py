@@ -52,7 +52,7 @@ from emb_daemon.offline.score import EpisodeErrors, rmse
 from emb_daemon.plant.brake import ONSET, POWER
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import random_angle, rig_drag, simulate_log, training
+from emb_daemon.plant.scenarios import random_angle, rig_drag, rig_stop, simulate_log, training
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
 from studies import blind
@@ -363,11 +363,19 @@ def test_zero_is_a_start_like_any_other(calibration):
 # -- the loop ---------------------------------------------------------------------------------------------------------
 
 
-def _logs(calibration, seed, effects, reference=True, stops=6):
+def _drive(plant, rng, stops):
+    """What the campaign of a blind trial has, in two thirds of its time: everything here is run over it some hundred times."""
+    schedule = training(plant, 21.0) + random_angle(plant, 6.0, rng)
+    for force in np.exp(rng.uniform(np.log(2000.0), np.log(22000.0), stops)):
+        schedule += rig_stop(force, rng.uniform(20.0, 60.0), 3.0, 6.5)
+    return schedule + rig_drag(rng.uniform(2500.0, 5000.0), rng.uniform(20.0, 40.0), 10.0)
+
+
+def _logs(calibration, seed, effects, reference=True, stops=5, drive=_drive):
     """Two drives of one brake, each simulated when it is asked for."""
     plant = plant_from_calibration(calibration, seed=seed, effects=effects)
     rng = np.random.default_rng(seed)
-    schedules = [campaign(plant, rng, stops) for _ in range(2)]
+    schedules = [drive(plant, rng, stops) for _ in range(2)]
     for k, schedule in enumerate(schedules, start=1):
         yield simulate_log(plant, schedule, seed=seed + k, reference=reference)[0]
 
@@ -442,7 +450,7 @@ def test_nothing_is_invented_and_a_calibration_that_is_off_is_said_to_be_off(cal
     plant = plant_from_calibration(calibration, seed=21)
     plant["curve"] *= 1.03
     rng = np.random.default_rng(21)
-    fit_log, val_log = (log_of(simulate_log(plant, campaign(plant, rng, 5), seed=k)[0]) for k in (1, 2))
+    fit_log, val_log = (log_of(simulate_log(plant, _drive(plant, rng, 4), seed=k)[0]) for k in (1, 2))
     result = diagnose([fit_log], calibration, [val_log])
     assert not result.accepted
     assert result.unexplained is None
@@ -672,7 +680,7 @@ def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(ca
 def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_follows_it(calibration):
     """A gear whose gain follows the square of the brake torque for seconds beyond each stop."""
     hidden = {"size": 1.0, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 2.3, "other": -1.0, "lag_s": 7.0}
-    frames = next(_logs(calibration, 35, {"drawn_gear_gain": hidden}, stops=6))
+    frames = next(_logs(calibration, 35, {"drawn_gear_gain": hidden}, stops=6, drive=campaign))
     model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
     best = Search(model, "torque", grammar._signals(model)).prospects()[0]
     assert best.means == ("gear_gain", "brake_torque") and best.form.memory == "response"
@@ -682,7 +690,8 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
 def test_two_signals_that_multiply_are_seen_as_both(calibration):
     """A gear whose friction rises for seconds with the force, more on a faster disc: neither explains it alone."""
     of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}
-    frames = next(_logs(calibration, 35, {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}, stops=12))
+    hidden = {"drawn_gear_friction": {"size": 1.0, "lag_s": 5.0} | of}
+    frames = next(_logs(calibration, 35, hidden, stops=12, drive=campaign))
     model = Model.of(Bench([log_of(frames)], calibration)).refined(["torque"])
     best = Search(model, "torque", grammar._signals(model)).prospects()[0]
     assert best.means == ("gear_friction", "clamp_force times disc_speed") and best.form.memory == "response"
@@ -1056,7 +1065,7 @@ def test_blind(calibration):
 
 def test_a_term_of_the_heat_balance_is_named_and_carries_over(calibration, monkeypatch):
     """A disc that cools faster the hotter it is: conductances alone leave 2.0 K of the temperatures on another log."""
-    monkeypatch.setattr(blind, "what_is_left", lambda result, alone: {})
+    monkeypatch.setattr(blind, "what_is_left", lambda *_: {})
     monkeypatch.setattr(blind, "heat_campaign", partial(blind.heat_campaign, drags=2))
     trial = run_trial(calibration, 80000, "heat", (), 8.0)
     assert trial.named and list(trial.found) == ["term:disc_cooling:disc_temperature"], trial
@@ -1065,7 +1074,7 @@ def test_a_term_of_the_heat_balance_is_named_and_carries_over(calibration, monke
 
 def test_a_ripple_of_a_sixth_of_the_current_s_noise_is_named_once_its_order_is_fitted(calibration, monkeypatch):
     """As its order was scanned a dozen effective episodes leave it unsure; it is most of what lasts of the torque residual."""
-    monkeypatch.setattr(blind, "what_is_left", lambda result, alone: {})
+    monkeypatch.setattr(blind, "what_is_left", lambda *_: {})
     trial = run_trial(calibration, 20280, "single", ("gear_mesh_ripple",), 75.0)
     assert trial.named, trial
     assert trial.found["gear_mesh_ripple"]["order_per_turn"] == pytest.approx(
@@ -1319,9 +1328,9 @@ def _path_effects(result):
     return {finding.effect.name for finding in result.accepted if finding.channel in ("stiffness", "torque")}
 
 
-def _undeclared(rig, case):
+def _undeclared(rig, case, seconds):
     """Fit and validation log of the simulated rig: training, random angle and the first stops."""
-    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), 110.0) for name in ("fit", "val")]
+    return [_first(load_log(rig / "undeclared" / case / f"{name}.log.gz"), seconds) for name in ("fit", "val")]
 
 
 def _first(log, seconds):
@@ -1330,7 +1339,7 @@ def _first(log, seconds):
 
 
 def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, calibration):
-    fit_log, val_log = _undeclared(rig, "case0")
+    fit_log, val_log = _undeclared(rig, "case0", 85.0)
     result = diagnose([fit_log], calibration, [val_log])
     assert not _path_effects(result)
     assert result.after.rmse("fused") < 33.0
@@ -1339,7 +1348,7 @@ def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, cali
 def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calibration):
     """The rig has hysteresis and a second relaxation of its own; in this case its disc is uneven as well."""
     thesis = msgspec.structs.replace(calibration, effects={})
-    fit_log, val_log = _undeclared(rig, "case3")
+    fit_log, val_log = _undeclared(rig, "case3", 110.0)
     result = diagnose([fit_log], thesis, [val_log])
     assert _path_effects(result) == {"stiffness_hysteresis", "second_relaxation", "disc_thickness_variation"}
     assert result.before.rmse("fused") > 180.0

@@ -147,7 +147,7 @@ def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(ow
 
     def explained(current, load):
         samples = {"speed": speed, "current_q": current, "has_current": np.ones(len(current), bool)}
-        return residuals._explained([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
+        return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
 
     current, load = (moved_by + 0.1 * random.normal(size=len(speed)) for _ in range(2))
     assert explained(current, load) < 0.01

@@ -353,7 +353,7 @@ def test_heat_beside_friction_is_stored_or_lost(port):
 def _hidden(law, rng):
     """Recordings of a disc whose cooling follows another ``law`` of the speed than a line."""
     found = []
-    for scenario in (_drag(420.0), *(_cooling(speed) for speed in (0.0, 6.0, 18.0, 36.0))):
+    for scenario in (_drag(240.0), *(_cooling(speed, 90.0, 250.0) for speed in (0.0, 6.0, 18.0, 36.0))):
         power, touching, speed = scenario
         r, _ = run_plant(to_parameters(START), power, touching, law(speed), 0.25, rng)
         found.append(replace(r, speed=speed))

@@ -5,6 +5,7 @@ exports only those wrappers; functions that need Python or numba are then unused
 and emits code for the target, and an installed linker makes the library.
 """
 
+import functools
 import platform
 import re
 import shutil
@@ -66,9 +67,10 @@ def _wrapper(entry: Entry):
     return scope[entry.name], tuple(kinds)
 
 
+@functools.cache
 def _lower(entry: Entry) -> str:
     """LLVM assembly of an entry point with all that it calls, and of the wrapper that calls it with words in memory, under its
-    name in C."""
+    name in C. It is the same for all targets."""
     wrapper, kinds = _wrapper(entry)
     compiled = numba.njit(types.void(*kinds), nogil=True, error_model="numpy", no_cfunc_wrapper=True)(wrapper)
     [overload] = compiled.overloads.values()

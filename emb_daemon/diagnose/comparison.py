@@ -18,7 +18,7 @@ def errors_of(bench: Bench, trial: Trial, calibration: Calibration) -> EpisodeEr
     log, parameters = trial.log, to_parameters(calibration)
     turning = is_turning(log.samples)
     if not bench.clamps:
-        errors = {"torque": bench.compared(trial, run_step(log.samples, held(parameters)))["torque"]}
+        errors = {"torque": bench.compare(trial, run_step(log.samples, held(parameters)))["torque"]}
         return EpisodeErrors.of(errors, {"rotating": turning, "standing": ~turning}, trial.episode)
     estimates = estimate(log.samples, parameters)
     if bench.has_reference:
@@ -52,17 +52,17 @@ def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict[str, dict[st
     weights = random.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES)
     result: dict = {}
     for path in before.paths:
-        part = {c: _compared(before, after, path, c, weights) for c in before.conditions if _known(before, after, path, c)}
+        part = {c: _compare(before, after, path, c, weights) for c in before.conditions if _is_known(before, after, path, c)}
         if "total" in part:
             result[path] = part
     return result
 
 
-def _known(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str) -> bool:
+def _is_known(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str) -> bool:
     return bool(np.isfinite(before.rmse(path, condition)) and np.isfinite(after.rmse(path, condition)))
 
 
-def _compared(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str, weights: np.ndarray) -> dict:
+def _compare(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str, weights: np.ndarray) -> dict:
     sampled = np.column_stack([which.rmses(path, condition, weights) for which in (before, after)])
     sampled = sampled[np.isfinite(sampled).all(axis=1)]
     low, high = np.percentile(sampled, (2.5, 97.5), axis=0)

@@ -176,7 +176,7 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
         return {}
     table = np.column_stack([model.columns[c] for c in linear])
     centre = np.array([model.centre.get(c, c.start) for c in linear])
-    restored = model.residual[channel] + table @ (np.array([model.values[c] for c in linear]) - centre)
+    restored = model.residual_at(channel, dict(zip(linear, centre, strict=True)))
     free = np.array([c.effect != without or not without for c in linear])
     moments = Moments.of(table[:, free], restored, model.bench.episode[channel], model.bench.episodes)
     penalty = model.penalty([c for c, use in zip(linear, free, strict=True) if use], channel)

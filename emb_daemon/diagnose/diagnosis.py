@@ -18,9 +18,8 @@ from emb_daemon.calibration.types import Calibration, Provenance, Source, to_par
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
-from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.forms import equation
-from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.model import Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
@@ -184,7 +183,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         before=before,
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
-        judged_residual={c: (_rms(judged_before[c]), _rms(final[c])) for c in judging.channels} if judges else {},
+        judged_residual={c: (rms_known(judged_before[c]), rms_known(final[c])) for c in judging.channels} if judges else {},
         left=_left(selection, judged_before, final, judging, augmented),
         left_before=selection.at_first,
         seconds=time.monotonic() - begin,
@@ -298,10 +297,9 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
         channel, gain = group[0].channel, 0.0
         # What stands as chosen was fitted elsewhere.
         if not model.chosen.issuperset(group):
-            own = model.own(channel)
-            rest = [c for c in own if c not in group]
+            rest = [c for c in model.own(channel) if c not in group]
             without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
-            gain = model.rms(_left_out(model, channel, rest, without) - _left_out(model, channel, own), channel)
+            gain = model.rms(model.left_out(channel, rest, without).sum() - model.left_out(channel).sum(), channel)
         for c in group:
             size = next((move.weight for move in c.moves if move.key == c.name), 1.0)
             sigma = c.sigma_of(model.values[c], model.fits[c.channel].sigmas.get(c, 0.0)) * abs(size)
@@ -314,12 +312,6 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
             result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel)
     return result
-
-
-def _left_out(model: Model, channel: str, free: Sequence[Coordinate], residual: np.ndarray | None = None) -> float:
-    """Squared error of the channel's residual, or another, over left-out episodes, some coordinates refitted."""
-    moments = model.moments(channel, [model.columns[c] for c in free], residual)
-    return float(leave_out(moments, model.penalty(free, channel)).left_out.sum())
 
 
 # -- what is left -----------------------------------------------------------------------------------------------------
@@ -350,11 +342,11 @@ def _left(
             if not model.bench.own_data:
                 least = max(least, least_dependence(model.residual[channel], LASTING[channel]))
             found = dependences(channel, gains, model.counted(channel), least)
-        first, last = _rms(before[channel]), _rms(after[channel])
+        first, last = rms_known(before[channel]), rms_known(after[channel])
         known = screening.achieved(model, channel, force, rise)
         if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):
             # Where the brake torque is measured the pads' friction has no share in it.
-            first, last = (_rms(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
+            first, last = (rms_known(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
             known = screening.achieved(model, channel, force, np.zeros(0))
             found = _heat_dependences(selection, augmented) if is_beyond(last, known) else []
         share = (last / first) ** 2 if first > 0.0 else 0.0
@@ -369,11 +361,6 @@ def _heat_dependences(selection: Selection, augmented: Calibration) -> list[Depe
         return []
     model, floor = bench.model(), selection.screening.floor(selection.model, CHANNEL_OF_HEAT, made=True)
     return dependences(CHANNEL_OF_HEAT, HeatSearch(model).dependence(), model.counted(CHANNEL_OF_HEAT), floor)
-
-
-def _rms(residual: np.ndarray) -> float:
-    counted = residual[residual != 0.0]
-    return rmse(counted) if len(counted) else 0.0
 
 
 # -- the calibration --------------------------------------------------------------------------------------------------
@@ -413,12 +400,11 @@ def _with_less_noise(calibration: Calibration, selection: Selection) -> Calibrat
     if stated < _OVERSTATED * rmse(residual[known]):
         return calibration
     floor, relative = force_error_levels(residual[known], force[known])
-    lengths = np.cumsum([len(trial.log.samples) for trial in model.bench.trials])[:-1]
     levels = msgspec.structs.replace(
         noise,
         stiffness_N=floor,
         stiffness_relative=relative,
-        stiffness_correlation_s=integral_time(np.split(residual, lengths)),
+        stiffness_correlation_s=integral_time(model.bench.by_log(residual)),
     )
     return msgspec.structs.replace(calibration, noise=levels)
 
@@ -431,11 +417,10 @@ def _with_lasting(calibration: Calibration, selection: Selection) -> Calibration
     residual = bench.residuals(selection.applied()).get("torque")
     if residual is None or not (bench.has_reference and bench.clamps):
         return calibration
-    ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]
     loads = np.where(residual != 0.0, selection.screening.signals["clamp_force"], 0.0)
     apart = residual - (residual @ loads) / max(loads @ loads, 1.0) * loads
     worst, noise = 0.0, calibration.noise
-    for error, force in zip(np.split(apart, ends), np.split(loads, ends), strict=True):
+    for error, force in zip(bench.by_log(apart), bench.by_log(loads), strict=True):
         rows = np.flatnonzero(error)
         cuts = np.flatnonzero(np.diff(rows) != 1) + 1
         pairs = zip(np.split(error[rows], cuts), np.split(force[rows], cuts), strict=True)

@@ -29,7 +29,7 @@ from emb_daemon.diagnose.prospects import (
     with_term,
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
-from emb_daemon.diagnose.screening import Q_VALUE, Candidate
+from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
@@ -54,8 +54,6 @@ _FITTED = 4
 _FITS, _LITTLE = 8, 0.98
 #: Further shapes of one place that are fitted beside the first.
 _SHAPES = 3
-#: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
-_OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
 
 
 def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selection:
@@ -290,8 +288,8 @@ def _with(
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
-        < _OF_MODEL_FREE * ceiling,
-        f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
+        < OF_MODEL_FREE * ceiling,
+        f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > OF_PLACEBO,
         made_of: at_port < _SAME_PORT,
     }
     against = next((text for text, holds in objections.items() if holds), "")

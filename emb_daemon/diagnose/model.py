@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -18,6 +18,12 @@ from emb_daemon.offline.score import rmse
 _INFLATION = 5.0
 #: A fit ends when the cost falls by less than this share, or after so many evaluations: screening and the next round follow.
 TOLERANCE, _EVALUATIONS = 2e-3, 8
+
+
+def rms_known(residual: np.ndarray) -> float:
+    """RMS of a channel's residual where there is one: it is zero where nothing was measured."""
+    counted = residual[residual != 0.0]
+    return rmse(counted) if len(counted) else 0.0
 
 
 @dataclass(frozen=True)
@@ -91,8 +97,7 @@ class Model:
 
     def noise(self, channel: str) -> float:
         """Mean square of the residual where there is one."""
-        counted = self.residual[channel][self.residual[channel] != 0.0]
-        return rmse(counted) ** 2 if len(counted) else 0.0
+        return rms_known(self.residual[channel]) ** 2
 
     def lasting(self, channel: str, samples: int) -> float:
         """Mean square of what lasts over so many samples of the residual."""
@@ -181,6 +186,21 @@ class Model:
             table, episode = means.of(table), means.episode
         return Moments.of(table[:, :-1], table[:, -1], episode, self.bench.episodes)
 
+    def residual_at(self, channel: str, elsewhere: Values) -> np.ndarray:
+        """A channel's residual with some of its coordinates elsewhere, by their regressors."""
+        back = np.array([self.values[c] - value for c, value in elsewhere.items()])
+        return self.residual[channel] + np.column_stack([self.columns[c] for c in elsewhere]) @ back
+
+    def left_out(
+        self, channel: str, free: Sequence[Coordinate] | None = None, residual: np.ndarray | None = None, samples: int = 1
+    ) -> np.ndarray:
+        """Squared error of the channel's residual, or another, over each episode by a fit to the others, shape (episodes,).
+
+        ``free``: coordinates that are fitted, all in the channel if none are given; ``samples``: in a mean."""
+        free = self.own(channel) if free is None else free
+        moments = self.moments(channel, [self.columns[c] for c in free], residual, samples)
+        return leave_out(moments, self.penalty(free, channel)).left_out
+
     def evidence(
         self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
     ) -> Evidence:
@@ -199,9 +219,7 @@ class Model:
         tested = list(values)
         channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
         free = [c for c in self.own(channel) if c in values or c.effect not in effects or not is_shape(c)]
-        from_ = {c: values.get(c, self.centre.get(c, c.start)) for c in free}
-        moved = np.array([self.values[c] - from_[c] for c in free])
-        restored = self.residual[channel] + np.column_stack([self.columns[c] for c in free]) @ moved
+        restored = self.residual_at(channel, {c: values.get(c, self.centre.get(c, c.start)) for c in free})
         moments = self.moments(channel, [self.columns[c] for c in free], restored, samples)
         rest = [index for index, c in enumerate(free) if c not in values]
         return judge(moments, rest, [free.index(c) for c in tested], self.penalty(free, channel))

@@ -86,7 +86,7 @@ def _bars(names: list[str], figures: dict):
     return figure
 
 
-def _binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _bin(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centre of bins of ``x`` and mean of ``y`` in them; bins with too few samples are left out."""
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, _BINS + 1)))
     if len(edges) < 3:
@@ -116,8 +116,8 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
         (diagnosis.initial[channel], "before", PALE),
         (diagnosis.residual[channel], "after", MODEL),
     ):
-        traces.append(Trace(name, *_binned(signal[applied], residual[applied]), style))
-    traces.append(Trace("what it does", *_binned(signal[applied], finding.contribution[applied]), MARKS))
+        traces.append(Trace(name, *_bin(signal[applied], residual[applied]), style))
+    traces.append(Trace("what it does", *_bin(signal[applied], finding.contribution[applied]), MARKS))
     panels = [Panel(f"mean residual of the {NAMES[channel]}", unit, traces)]
     section.figure(xy_figure(panels, finding.effect.signal.replace("_", " ")), "Mean residual in bins of equal counts.")
     for text, share in finding.placebos.items():
@@ -147,8 +147,8 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
             continue
         strongest = left.dependences[0].signal
         signal = diagnosis.signals[strongest]
-        before = _binned(signal[keep], diagnosis.initial[channel][keep])
-        after = _binned(signal[keep], diagnosis.residual[channel][keep])
+        before = _bin(signal[keep], diagnosis.initial[channel][keep])
+        after = _bin(signal[keep], diagnosis.residual[channel][keep])
         traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
         section.figure(
             xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),

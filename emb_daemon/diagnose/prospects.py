@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.diagnose.coordinates import Coordinate, Move
-from emb_daemon.diagnose.evidence import Averaging, Evidence, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.orders import strongest_orders
@@ -89,7 +89,7 @@ class Screen:
         """Of regressors (N, k)."""
         return self.scores_of(self.means.of(columns * self.keep[:, None]))
 
-    def explained(self, prospect: "Prospect") -> np.ndarray:
+    def contribution(self, prospect: "Prospect") -> np.ndarray:
         """What a form of its size takes from the averaged residual."""
         columns = self.beside_nuisances(self.means.of(np.column_stack(prospect.columns) * self.keep[:, None]))
         return columns @ prospect.evidence.values
@@ -149,7 +149,7 @@ class Search:
     @cached_property
     def gains(self) -> np.ndarray:
         """What left-out episodes gain by each of them."""
-        return self._screened(self.forms)
+        return self._find_gains(self.forms)
 
     @cached_property
     def products(self) -> list[Form]:
@@ -164,13 +164,13 @@ class Search:
     @cached_property
     def product_gains(self) -> np.ndarray:
         """What left-out episodes gain by each of those."""
-        return self._screened(self.products)
+        return self._find_gains(self.products)
 
     def answer(self, form: Form) -> np.ndarray:
         """What a form of coefficient one does to the channel."""
         return self.sensitivities[form.port] * _values(self.model.bench, form, self.signals)
 
-    def _screened(self, forms: Sequence[Form]) -> np.ndarray:
+    def _find_gains(self, forms: Sequence[Form]) -> np.ndarray:
         return _screen_forms(self.screen, forms, self.sensitivities, self.signals).gain
 
     def ripples(self) -> list[Prospect]:
@@ -178,16 +178,15 @@ class Search:
         return self._run(_ripples(self))
 
     def _run(self, forms: Sequence[Form]) -> list[Prospect]:
-        columns = [_probed(self.model, self.channel, form) for form in forms]
+        columns = [_find_regressors(self.model, self.channel, form) for form in forms]
         found = [self.model.evidence(self.channel, own, samples=LASTING[self.channel]) for own in columns]
         return [Prospect(*one) for one in zip(forms, columns, found, strict=True)]
 
     def prospects(self, floor: float = 0.0) -> list[Prospect]:
         """The best forms, through the estimator, with their sizes fitted; shortest description first. Of two signals only
         where one leaves more than ``floor`` (RMS, in the channel's unit) that lasts, and if the best is one of them."""
-        model, own, samples = self.model, self.model.own(self.channel), LASTING[self.channel]
-        moments = model.moments(self.channel, [model.columns[c] for c in own], samples=samples)
-        alone = float(leave_out(moments, model.penalty(own, self.channel)).left_out.sum())
+        model, samples = self.model, LASTING[self.channel]
+        alone = float(model.left_out(self.channel, samples=samples).sum())
         alone -= noise_left(model, self.channel, samples)
 
         def shortest(found: Sequence[Prospect]) -> list[Prospect]:
@@ -219,7 +218,7 @@ class Search:
 
     def undecided(self, best: Prospect, rivals: Sequence[Prospect]) -> float:
         """Largest RMS by which a rival does otherwise than the best, beside all that the path's parameters can do."""
-        does = [self.screen.explained(prospect) for prospect in (best, *rivals)]
+        does = [self.screen.contribution(prospect) for prospect in (best, *rivals)]
         return max((self.model.rms(float(np.square(does[0] - other).sum()), self.channel) for other in does[1:]), default=0.0)
 
     def chance(self, best: Prospect) -> float:
@@ -267,10 +266,10 @@ def covered_by(signals: np.ndarray) -> dict[str, tuple[float, float]]:
 def _sensitivity(model: Model, channel: str, port: str) -> np.ndarray:
     """What one unit at a port does to a channel, minus the derivative of the residual."""
     constant = Form(port, "motor_speed", "none", "constant", "always", 1.0, 0.0, 1.0, 1.0, -1e9, 1e9)
-    return _probed(model, channel, constant)[0]
+    return _find_regressors(model, channel, constant)[0]
 
 
-def _probed(model: Model, channel: str, form: Form) -> list[np.ndarray]:
+def _find_regressors(model: Model, channel: str, form: Form) -> list[np.ndarray]:
     """A form's regressors, by the estimator itself."""
     index = len(model.bench.calibration.terms)
     bench = with_term(model.bench, form.term())
@@ -320,15 +319,15 @@ def _screen_forms(
 
 def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
     """What a form of coefficient one makes of its signal, at every sample."""
-    return _evaluated(bench, record_of(replace(form, port=form.port or PORTS[0])), signals)
+    return _evaluate(bench, record_of(replace(form, port=form.port or PORTS[0])), signals)
 
 
 def values_of(bench: Bench, term: Term, signals: list[np.ndarray]) -> np.ndarray:
     """What a term adds at its port at every sample if nothing holds it."""
-    return _evaluated(bench, _unheld(term), signals)
+    return _evaluate(bench, _unheld(term), signals)
 
 
-def _evaluated(bench: Bench, record: np.void, signals: list[np.ndarray]) -> np.ndarray:
+def _evaluate(bench: Bench, record: np.void, signals: list[np.ndarray]) -> np.ndarray:
     largest = bench.calibration.stiffness.maximum_force_N
     parts = zip(bench.trials, signals, strict=True)
     return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])

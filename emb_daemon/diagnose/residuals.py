@@ -116,7 +116,7 @@ def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:
     return rows, measured
 
 
-def _explained(trials: Sequence[Trial]) -> float:
+def _partial_correlation(trials: Sequence[Trial]) -> float:
     """Squared partial correlation of current and reference load, beside the motor's direction, speed and acceleration."""
     tables = []
     for trial in trials:
@@ -173,7 +173,7 @@ class Bench:
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
-        self.load_follows: bool = self.has_reference and not self.clamps and _explained(self.trials) > _FOR_THE_LOAD
+        self.load_follows: bool = self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
         #: Whether the load is known to be nothing: then the current itself is all that is explained.
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
         #: Converts unexplained current to force: what it would be on the spindle.
@@ -212,6 +212,10 @@ class Bench:
         """The reference force where it is known, N, shape (n,)."""
         force = np.concatenate([trial.force_N for trial in self.trials])
         return force[np.isfinite(force)]
+
+    def by_log(self, column: np.ndarray) -> list[np.ndarray]:
+        """A column over the samples of all logs, cut where each log ends."""
+        return np.split(column, np.cumsum([len(trial.log.samples) for trial in self.trials])[:-1])
 
     def _channels(self) -> list[str]:
         if self.has_reference and (self.clamps or self.has_current):
@@ -269,7 +273,7 @@ class Bench:
 
         def one(trial: Trial) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
             trace, heat = run_with_heat(trial.log.samples, self._parameters(trial, values))
-            return self.compared(trial, trace), heat
+            return self.compare(trial, trace), heat
 
         parts, heat = zip(*self.map(one, self.trials), strict=True)
         return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
@@ -277,7 +281,7 @@ class Bench:
     def _parameters(self, trial: Trial, values: Values) -> np.void:
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
-    def compared(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
+    def compare(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
         """Residuals of a run (TRACE rows)."""
         samples, force = trial.log.samples, trial.force_N
         judged = force if self.has_reference else trace["force"]
@@ -323,7 +327,7 @@ class Bench:
             step = coordinate.step if now + coordinate.step <= coordinate.high else -coordinate.step
             tried[coordinate] = now + step
             follows = coordinate.channel not in FORCE_CHANNELS or coordinate.name == HISTORY_TIME
-            known = [None] * len(self.trials) if follows else heat
+            known = [None] * len(heat) if follows else heat
             return (at[coordinate.channel] - self.residual_held(tried, coordinate.channel, known)) / step
 
         return list(self.map(answer, probes))
@@ -334,7 +338,7 @@ class Bench:
         for trial, known in zip(self.trials, heat, strict=True):
             samples, parameters = trial.log.samples, self._parameters(trial, values)
             trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
-            parts.append(self.compared(trial, trace)[channel])
+            parts.append(self.compare(trial, trace)[channel])
         return np.concatenate(parts)
 
 

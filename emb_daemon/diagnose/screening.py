@@ -40,7 +40,7 @@ _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
 #: fifths of it and will not in the next: the standard deviation of a thermocouple (IEC 60584, class 1: 1.5 K are two).
 _MADE_K = 0.75
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
-_OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
+OF_MODEL_FREE, OF_PLACEBO = 0.6, 0.5
 #: Draws of a placebo that runs through the estimator, and of one that does not.
 _DRAWS, _SHUFFLES = 2, 5
 #: By channel, the largest gain of a smooth function of one signal, and that signal.
@@ -227,7 +227,7 @@ class Screening:
             if not c.low - 2.0 * sigma <= value <= c.high + 2.0 * sigma:
                 return replace(candidate, reason=f"{c.parameter} = {value:.3g} {c.unit} is outside what physics allows")
         gain, signal = self.rival(model, channel, rivals)
-        if evidence.gain < _OF_MODEL_FREE * gain and _together(model, candidate, signal, tested) < _OF_MODEL_FREE * gain:
+        if evidence.gain < OF_MODEL_FREE * gain and _together(model, candidate, signal, tested) < OF_MODEL_FREE * gain:
             shadow = (
                 f"explains {candidate.gain:.3g} {unit} RMS where a smooth function of {signal} explains "
                 f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
@@ -235,7 +235,7 @@ class Screening:
             return replace(candidate, reason=shadow)
         candidate = self.with_placebos(model, candidate)
         for text, share in candidate.placebos.items():
-            if share > _OF_PLACEBO:
+            if share > OF_PLACEBO:
                 return replace(candidate, reason=f"its placebo ({text}) explains {100 * share:.0f} % of the same")
         return replace(candidate, reason="")
 
@@ -259,7 +259,7 @@ class Screening:
         own = model.own(channel)
         base, prior = [model.columns[c] for c in own], model.penalty(own, channel)
         keep = model.residual[channel] != 0.0
-        plain = leave_out(model.moments(channel, base, samples=samples), prior).left_out
+        plain = model.left_out(channel, samples=samples)
         result = {}
         for name, signal in self.signals.items():
             basis = smooth_basis(name, signal, self.signals["clamp_force"]) * keep[:, None]

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
-from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.model import Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
@@ -163,10 +162,8 @@ def find_recalibrated(selection: Selection, start: Model) -> dict[str, float]:
         if not own or channel == "innovation":
             continue
         # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
-        columns = [model.columns[c] for c in own]
-        moved = np.array([model.values[c] - model.centre.get(c, c.start) for c in own])
-        moments = model.moments(channel, columns, model.residual[channel] + np.column_stack(columns) @ moved)
-        left_out = leave_out(moments, model.penalty(own, channel)).left_out
+        restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in own})
+        left_out = model.left_out(channel, residual=restored)
         before = float(start.residual[channel] @ start.residual[channel])
         gain = model.rms(before - float(left_out.sum()), channel)
         if gain > 0.0 and gain >= selection.screening.floor(model, channel):
@@ -316,8 +313,8 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
         if over_grammar and whole and 0.0 < gain < floor:
             # From where a far fit ended a line does not lead back: what it gains, a fit without it says.
             without = model.without(model.of_effect(name)).refined({candidate.channel})
-            more = _left_out(without, candidate.channel) - _left_out(model, candidate.channel)
-            gain = model.rms(more, candidate.channel)
+            before, after = (m.left_out(candidate.channel, samples=LASTING[candidate.channel]).sum() for m in (without, model))
+            gain = model.rms(before - after, candidate.channel)
         little = gain < floor
         # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so must
         # what is gained where a prior alone says how large it is.
@@ -326,13 +323,6 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
             gone += group
             gains.append(gain / floor)
     return (max(gains), name, gone) if gone else None
-
-
-def _left_out(model: Model, channel: str) -> float:
-    """Squared error of means of a channel's residual over left-out episodes, everything in it refitted."""
-    own = model.own(channel)
-    moments = model.moments(channel, [model.columns[c] for c in own], samples=LASTING[channel])
-    return float(leave_out(moments, model.penalty(own, channel)).left_out.sum())
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:

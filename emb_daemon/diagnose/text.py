@@ -34,7 +34,7 @@ NAMES = {
 }
 
 
-def number(value: float, sigma: float = 0.0) -> str:
+def number(value: float, sigma: float) -> str:
     """A value to the digits that its sigma supports."""
     return f"{value:.3g} ± {sigma:.2g}" if sigma > 0.0 else f"{value:.3g}"
 

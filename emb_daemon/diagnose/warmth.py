@@ -5,7 +5,7 @@ the same moment. But the heat chain alone costs a fiftieth of the whole step: ea
 `identify` fits pads and disc to. The brake torque is measured there, so that friction and force cannot hide behind a term.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,10 @@ import numpy as np
 from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Values, base_coordinates, scaled_coordinate
-from emb_daemon.diagnose.evidence import leave_out
 from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.prospects import Scores, Screen, Search, covered_by, record_of
-from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, Probe
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench
 from emb_daemon.diagnose.screening import Rivals, Screening
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import PORTS, SIGNALS
@@ -48,13 +47,13 @@ _FURTHER = (
 class HeatBench(Bench):
     """Recordings on which a calibration's heat balance is tried: what `Bench` is for logs, of one channel."""
 
-    def __init__(self, recordings: Sequence[Recording], calibration: Calibration, workers: int = 2):
+    def __init__(self, recordings: Sequence[Recording], calibration: Calibration):
         self.calibration = calibration
         self.recordings = recordings
         self.own_data: bool = True
         self.middle: float = 0.0
         self.straight: bool = False
-        self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
+        self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(2).map
         self.channels: list[str] = [CHANNEL_OF_HEAT]
         inside = np.append(np.tile(np.array(DEPTHS_M) <= 1e-3 * calibration.pad_thickness_mm, 2), True)
         self._every = [max(round(_EVERY_S / r.step_s), 1) for r in recordings]
@@ -82,16 +81,8 @@ class HeatBench(Bench):
     def run(self, values: Values) -> tuple[dict[str, np.ndarray], list[None]]:
         return {CHANNEL_OF_HEAT: self.residual_of(to_parameters(self.calibrated(values)))}, [None] * len(self.recordings)
 
-    def regressors(
-        self, values: Values, probes: Sequence[Probe], at: Mapping[str, np.ndarray], heat: Sequence[None]
-    ) -> list[np.ndarray]:
-        def answer(probe: Probe) -> np.ndarray:
-            c, tried = probe.coordinate, {**values, **dict(probe.shape)}
-            now = tried.get(c, c.start)
-            step = c.step if now + c.step <= c.high else -c.step
-            return (at[CHANNEL_OF_HEAT] - self.run(tried | {c: now + step})[0][CHANNEL_OF_HEAT]) / step
-
-        return list(self.map(answer, probes))
+    def residual_held(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
+        return self.run(values)[0][channel]
 
     def signals(self, values: Values) -> list[np.ndarray]:
         """What terms see at every row, by recording."""
@@ -145,40 +136,38 @@ class HeatSearch(Search):
         terms["count"] += 1
         return (self.model.residual[CHANNEL_OF_HEAT] - self.model.bench.residual_of(own)) / form.step
 
-    def _answered(self, forms: Sequence[Form]) -> np.ndarray:
+    def _answers_of(self, forms: Sequence[Form]) -> np.ndarray:
         """Of each form, shape (N, forms)."""
         new = [form for form in forms if form not in self._answers]
         self._answers |= dict(zip(new, self.model.bench.map(self.answer, new), strict=True))
         return np.column_stack([self._answers[form] for form in forms])
 
-    def _screened(self, forms: Sequence[Form]) -> np.ndarray:
-        return self.screen.scores(self._answered(forms)).gain
+    def _find_gains(self, forms: Sequence[Form]) -> np.ndarray:
+        return self.screen.scores(self._answers_of(forms)).gain
 
-    def _moved(self, columns: np.ndarray, low: float, high: float) -> np.ndarray:
+    def _move_in_time(self, columns: np.ndarray, low: float, high: float) -> np.ndarray:
         """Columns at another time, as if the recordings were a circle: a share between two of them later."""
         rows = len(columns) // _PLACES
         return np.roll(columns, _PLACES * int(rows * self.random.uniform(low, high)), axis=0)
 
     def chance_of(self, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
-        columns, most = self._answered(forms), gains.max()
+        columns, most = self._answers_of(forms), gains.max()
         for number in range(chances):
-            if float(self.screen.scores(self._moved(columns, 0.1, 0.9)).gain.max()) >= most:
+            if float(self.screen.scores(self._move_in_time(columns, 0.1, 0.9)).gain.max()) >= most:
                 return 2.0 / (2.0 + number)
         return 1.0 / (1.0 + chances)
 
     def gains_moved(self, form: Form, shifts: int) -> np.ndarray:
         column = self.answer(form)[:, None]
-        return np.array([self.screen.scores(self._moved(column, 0.25, 0.75)).gain[0] for _ in range(shifts)])
+        return np.array([self.screen.scores(self._move_in_time(column, 0.25, 0.75)).gain[0] for _ in range(shifts)])
 
     def is_within(self, term: Term) -> bool:
         return True
 
     def dependence(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Squared error of each left-out episode, without and with the best form of each signal."""
-        own = self.model.own(CHANNEL_OF_HEAT)
-        moments = self.model.moments(CHANNEL_OF_HEAT, [self.model.columns[c] for c in own])
-        plain = leave_out(moments, self.model.penalty(own, CHANNEL_OF_HEAT)).left_out
-        scores, gains = self.screen.scores(self._answered(self.forms)), self.gains
+        plain = self.model.left_out(CHANNEL_OF_HEAT)
+        scores, gains = self.screen.scores(self._answers_of(self.forms)), self.gains
         found = {}
         for signal in {form.signal for form in self.forms}:
             best = max((index for index, form in enumerate(self.forms) if form.signal == signal), key=gains.__getitem__)
