@@ -628,6 +628,16 @@ def test_validation_has_a_veto(nominal, judged):
     assert result.after.rmse("torque") <= result.before.rmse("torque")
 
 
+def test_noise_with_which_the_validation_logs_get_worse_is_not_written(viscous, judged, monkeypatch):
+    """A stiffness path that is said to be worthless leaves the force to the current."""
+    worthless = {"noise.stiffness_N": 1e5}
+    monkeypatch.setattr(diagnosis, "_with_noise", lambda calibration, selection: moved(calibration, worthless))
+    result = judged(viscous[2])
+    assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
+    assert result.calibration.noise.stiffness_N == result.original.noise.stiffness_N
+    assert result.after.rmse("fused") <= 1.05 * result.before.rmse("fused")
+
+
 def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_disc):
     """The same stops with the wheel angle of each disturbed: the residual is there, its cause must not be named."""
     log = load_log(uneven_disc[0] / "fit.log")
@@ -1381,6 +1391,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         suspects: list[str]
         reasons: dict[str, str]
         model = SimpleNamespace(bench=bench)
+        recalibrated = ()
 
         def without(self, suspect, reason):
             return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
@@ -1409,3 +1420,38 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
     if not guilty:
         return
     assert found.reasons == {"wrong": "the estimator's fused error on near.log goes from 30 to 60 N on left-out episodes"}
+
+
+def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch):
+    """The torque path's, withdrawn before the effect whose harm it was taken for; not one that went last."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Chosen:
+        recalibrated: dict
+        accepted: tuple = ("wrong",)
+        model = SimpleNamespace(
+            bench=SimpleNamespace(calibration=None, residuals=lambda _: {}), refined=lambda _: Chosen.model
+        )
+        touched = property(lambda self: {*self.recalibrated})
+
+        def without(self, suspect, _):
+            left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}
+            return Chosen(left, tuple(name for name in self.accepted if name != suspect))
+
+    def replaced(chosen, recalibrated, model):
+        return Chosen(recalibrated, chosen.accepted)
+
+    def against(tried, *_):
+        if tried.accepted:
+            return ("torque" if "torque" in tried.recalibrated else "wrong"), "it is worse"
+        return ("stiffness", "it is worse") if "stiffness" in tried.recalibrated else None
+
+    monkeypatch.setattr(confirmation, "errors", lambda *_: None)
+    monkeypatch.setattr(confirmation, "whole", lambda _: "fused")
+    monkeypatch.setattr(confirmation, "harm", lambda *_: "")
+    monkeypatch.setattr(confirmation, "left_out_errors", lambda _: None)
+    monkeypatch.setattr(confirmation, "_beyond_bounds", lambda _: [])
+    monkeypatch.setattr(confirmation, "_against", against)
+    monkeypatch.setattr(confirmation, "replace", replaced)
+    found, _ = confirmation.confirm(Chosen({"torque": 50.0, "stiffness": 20.0}), None)
+    assert found.accepted == () and found.recalibrated == {"torque": 50.0}
