@@ -19,6 +19,7 @@ from emb_daemon.diagnose.forms import Form, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
+    AS_GOOD,
     COARSE,
     Prospect,
     Screen,
@@ -28,7 +29,7 @@ from emb_daemon.diagnose.prospects import (
     noise_left,
     with_term,
 )
-from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
@@ -40,10 +41,10 @@ from emb_daemon.offline.score import rmse
 
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
-#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: what
-#: fewer choose is outside of a confidence of 95 %. Four fifths must choose the port of a term that is taken, which is in the
-#: upper half of what stability selection uses (Meinshausen and Bühlmann, J. Royal Statistical Society B 72, 2010: 0.6 to 0.9).
-_AS_GOOD, _RIVAL, _SAME_PORT = 0.95, 0.05, 0.8
+#: Share of bootstraps that must choose another port or signal for it to be a rival: what fewer choose is outside of a
+#: confidence of 95 %. Four fifths must choose the port of a term that is taken, which is in the upper half of what stability
+#: selection uses (Meinshausen and Bühlmann, J. Royal Statistical Society B 72, 2010: 0.6 to 0.9).
+_RIVAL, _SAME_PORT = 0.05, 0.8
 #: Why a term goes whose gain the fit does not find again.
 _NOT_HELD = "fitted with everything else it no longer holds"
 #: Terms of the heat balance in a calibration.
@@ -76,6 +77,9 @@ def _with_terms(selection: Selection, channel: str) -> Selection:
         before, selection = selection, _one_more(selection, channel)
         if selection.accepted == before.accepted:
             break
+        if channel == "stiffness":
+            # The force that heats the pads has changed: what is left of their heat must not look like another term.
+            selection = replace(selection, model=selection.model.settled({*HEAT_CHANNELS, channel}))
         selection = _restated(selection, before, channel)
     return selection
 
@@ -252,7 +256,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
     """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
     more is chance."""
-    equal = [p for p in prospects if p.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain]
+    equal = [p for p in prospects if p.evidence.gain >= AS_GOOD * prospects[0].evidence.gain]
     return sorted(equal, key=lambda p: -shares[p.means])
 
 
@@ -277,7 +281,7 @@ def _with(
 ) -> Selection:
     """With one of the ``prospects``, accepted if it is proven, else with what speaks against it; ``shares`` of bootstraps."""
     model, screening, channel = selection.model, selection.screening, search.channel
-    rivals = _as_good(best, [p for p in prospects if p is not best], shares, model.bench.straight)
+    rivals = _as_good(best, [p for p in prospects if p is not best], shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
     at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
     made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
@@ -315,7 +319,7 @@ def _with(
 def _enter_lobe(selection: Selection, candidate: Candidate, lobes: Sequence[Prospect]) -> Selection:
     """With a ripple: side lobes that do as well as the best on the screen are told from it by a fit with everything else."""
     most = max(lobe.evidence.gain for lobe in lobes)
-    close = [lobe for lobe in lobes if lobe.evidence.gain >= _AS_GOOD * most]
+    close = [lobe for lobe in lobes if lobe.evidence.gain >= AS_GOOD * most]
     fitted = [_enter(selection, replace(candidate, evidence=lobe.evidence), lobe.form) for lobe in close]
     return min(fitted, key=lambda s: s.model.noise(candidate.channel))
 
@@ -372,15 +376,14 @@ def _arrived(model: Model, channel: str) -> Model:
     return model
 
 
-def _as_good(
-    best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float], straight: bool
-) -> list[Prospect]:
-    """The best forms of other ports and signals that resampled episodes would choose often enough; also those that gain nearly
-    as much where a small step, by which the resampled ones choose, does not tell (not ``straight``)."""
+def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """The best forms of other ports and signals that gain nearly as much, or that resampled episodes choose often enough.
+
+    How episodes scatter is not all that is unsure: shapes are guesses, and temperatures and torque in a car are models' own,
+    wrong alike in every resampled set."""
     found: dict[tuple[str, str], Prospect] = {}
     for other in sorted(others, key=lambda p: -p.evidence.gain):
-        close = not straight and other.evidence.gain >= _AS_GOOD * best.evidence.gain
-        close |= shares[other.means] >= _RIVAL
+        close = other.evidence.gain >= AS_GOOD * best.evidence.gain or shares[other.means] >= _RIVAL
         if other.means != best.means and close:
             found.setdefault(other.means, other)
     return list(found.values())
