@@ -950,7 +950,10 @@ def test_of_equal_gains_what_most_resampled_episodes_choose_is_named_and_what_so
 
 def test_many_shapes_of_one_signal_keep_no_other_from_being_asked(monkeypatch):
     """What nearly equals the best is asked however many shapes of the best's own signal gain more, up to a shortlist."""
-    named = lambda name, memory: SimpleNamespace(means=("stiffness", name), memory=memory)  # noqa: E731
+
+    def named(name, memory):
+        return SimpleNamespace(means=("stiffness", name), port="stiffness", signals=(name,), memory=memory)
+
     disc, pads, power = [named("disc", n) for n in range(30)], [named("pads", n) for n in range(2)], named("power", 0)
     forms, gains = [*disc, *pads, power], np.array([100.0] * 30 + [96.0, 95.5, 80.0])
     monkeypatch.setattr(prospects, "_fit_sizes", lambda _, form: (form, float(gains[forms.index(form)])))
@@ -958,6 +961,14 @@ def test_many_shapes_of_one_signal_keep_no_other_from_being_asked(monkeypatch):
     assert len(asked) == prospects._SHORTLIST + 1 and asked[-1] is pads[0] and power not in asked
     every = [named(str(number), 0) for number in range(30)]
     assert len(prospects._of_other_means(every, np.ones(30), [], 0.9)) == prospects._SHORTLIST
+
+
+def test_of_a_product_both_signals_are_asked_for_a_shape():
+    """A power of the one that gains more must not keep a power of the other from being fitted."""
+    of = lambda one, other: SimpleNamespace(port="stiffness", signals=(one, other), memory="none")  # noqa: E731
+    torque, surface = ([of(*names) for _ in range(3)] for names in (("torque", "surface"), ("surface", "torque")))
+    forms = [*surface, *torque]
+    assert prospects._best_of(forms, np.array([9.0, 8.0, 7.0, 6.0, 5.0, 4.0]), 10) == [*surface[:2], *torque[:2]]
 
 
 def test_the_heat_of_a_force_that_a_term_has_changed_is_settled_before_another_is_made(coupled, monkeypatch):
@@ -1051,8 +1062,9 @@ def test_of_what_logs_cannot_tell_apart_what_does_not_hold_is_not_it(coupled, mo
     assert len(tried) == 1 + accepted and len(set(tried)) == len(tried)
 
 
-def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled):
-    """What it leaves would look like another term."""
+def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled, monkeypatch):
+    """What it leaves would look like another term. Other shapes are fitted from where the first has led: a fit without any
+    would first make up for it with everything else."""
     [name] = coupled[0].accepted
     bare, candidate = coupled[0].without(name, "to be made again"), coupled[0].candidates[name]
     search = Search(bare.model, "stiffness", grammar._signals(bare.model))
@@ -1062,6 +1074,7 @@ def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled):
     effect = made_effect(crooked.form, grammar._name(crooked.form, bare))
     before = grammar._enter(bare, dataclasses.replace(candidate, effect=effect, evidence=crooked.evidence), crooked.form)
     assert before.accepted == [effect.name]
+    monkeypatch.setattr(Selection, "without", lambda *_: pytest.fail("it was refitted without the term"))
     found = grammar._restated(before, before, "stiffness")
     [chosen] = found.accepted
     [term] = [t for t in found.model.bench.calibrated(found.model.values).terms if t.name == chosen]

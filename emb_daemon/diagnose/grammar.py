@@ -100,7 +100,9 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
-        bare = before.without(name, "its shape was chosen again")
+        # Not refitted without it: everything else would make up for it, and its heat too, and no single fit leads back.
+        refused = replace(candidate, accepted=False, reason="its shape was chosen again")
+        bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
         found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
         if found is last:
             further = _in_shapes(before, candidate, channel, _SHAPES)

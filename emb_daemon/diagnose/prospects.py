@@ -371,11 +371,12 @@ def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray, chances: i
 
 
 def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
-    """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
+    """The best forms, no more than two of one port, signal and memory: near relatives tell the same. Of a product it matters
+    which of its signals is shaped."""
     chosen: list[Form] = []
     for index in np.argsort(-gains):
         form = forms[index]
-        relatives = [f for f in chosen if (f.means, f.memory) == (form.means, form.memory)]
+        relatives = [f for f in chosen if (f.port, f.signals, f.memory) == (form.port, form.signals, form.memory)]
         if gains[index] > 0.0 and len(relatives) < 2:
             chosen.append(form)
         if len(chosen) == most:
