@@ -1062,6 +1062,30 @@ def test_of_what_logs_cannot_tell_apart_what_does_not_hold_is_not_it(coupled, mo
     assert len(tried) == 1 + accepted and len(set(tried)) == len(tried)
 
 
+@pytest.mark.parametrize(("port", "share", "asked"), [("thickness", 0.09, 0), ("thickness", 0.11, 1), ("stiffness", 0.09, 1)])
+def test_what_a_term_that_is_nearly_right_leaves_is_no_second_cause(coupled, monkeypatch, port, share, asked):
+    """A term of another place gains a tenth of what the first does, or is not believed; a further shape of the same may."""
+    selection, tried = coupled[0], []
+    model = selection.model
+    [term] = [t for t in model.bench.calibrated(model.values).terms if t.name in selection.accepted]
+    off = model.bench.under(model.bench.calibrated(model.values))
+    off = off.under(msgspec.structs.replace(off.calibration, terms=()))
+    does = model.rms(float(np.square(off.residuals({})["stiffness"] - model.residual["stiffness"]).sum()), "stiffness")
+    found = Search(model, "stiffness", grammar._signals(model))
+    form = next(f for f in found.forms if (f.port, f.signal) == (port, term.signal))
+    [prospect] = found._run([form])
+    gain = (share * does) ** 2 * model.counted("stiffness")
+    prospect = dataclasses.replace(prospect, evidence=dataclasses.replace(prospect.evidence, gain=gain))
+    monkeypatch.setattr(Search, "prospects", lambda *_: [prospect])
+    monkeypatch.setattr(Search, "chance", lambda *_: 0.0)
+    monkeypatch.setattr(Search, "at_another_time", lambda *_: 0.0)
+    monkeypatch.setattr(Screening, "rival", lambda *_: (0.0, ""))
+    monkeypatch.setattr(Screening, "floor", lambda *_, **__: 0.0)
+    monkeypatch.setattr(grammar, "_enter", lambda before, candidate, _: tried.append(candidate) or before.noted([candidate]))
+    grammar._one_more(selection, "stiffness")
+    assert len(tried) == asked
+
+
 def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled, monkeypatch):
     """What it leaves would look like another term. Other shapes are fitted from where the first has led: a fit without any
     would first make up for it with everything else."""

@@ -57,6 +57,9 @@ _FITS, _LITTLE = 8, 0.98
 _SHAPES = 3
 #: Share of a smooth function's gain that a term must reach, and of its own that it must not reach at another time.
 _OF_MODEL_FREE, _OF_PLACEBO = 0.6, 0.5
+#: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
+#: wrong by some per cent, which then look like another cause.
+_BESIDE = 0.1
 
 
 def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selection:
@@ -293,11 +296,16 @@ def _with(
         alike = ", ".join(_words(p.form) for p in rivals)
         made_of += f"; these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
     ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
+    largest = _largest_beside(selection, best, channel)
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
         < _OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > _OF_PLACEBO,
+        f"less than a tenth of the {largest:.3g} {UNITS[channel]} that another term does, whose shape is a guess": model.rms(
+            best.evidence.gain, channel
+        )
+        < _BESIDE * largest,
         made_of: at_port < _SAME_PORT,
     }
     against = next((text for text, holds in objections.items() if holds), "")
@@ -316,6 +324,19 @@ def _with(
             selection, candidate, [p for p in prospects if p.form.shape == "harmonic" and p.means == best.means]
         )
     return _enter(selection, candidate, best.form)
+
+
+def _largest_beside(selection: Selection, best: Prospect, channel: str) -> float:
+    """RMS of what the largest term of a path does that says something else; none of the heat balance, whose terms were fitted
+    in all their shapes."""
+    model, largest = selection.model, 0.0
+    for name in _made(selection, channel) if channel != CHANNEL_OF_HEAT else ():
+        made = selection.candidates[name]
+        if (made.effect.hook, {*made.signals}) != (best.form.port, {*best.form.signals}):
+            off = {**model.values, **dict.fromkeys(made.amplitudes, 0.0)}
+            does = model.bench.residual_held(off, channel, model.heat) - model.residual[channel]
+            largest = max(largest, model.rms(float(does @ does), channel))
+    return largest
 
 
 def _enter_lobe(selection: Selection, candidate: Candidate, lobes: Sequence[Prospect]) -> Selection:
