@@ -8,6 +8,7 @@ refitted.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,25 +37,49 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
 
     Returns it with the errors on left-out episodes. ``judges``: the validation logs.
     """
-    bench = selection.model.bench
+    bench, recalibrated = selection.model.bench, selection.recalibrated
     before, main, held = errors(bench, bench.calibration), whole(bench), bench.residuals({})
+    withdrawn: list[str] = []
+
+    def judged(tried: Selection) -> tuple[EpisodeErrors, tuple[str, str] | None]:
+        after = left_out_errors(tried)
+        return after, _against(tried, before, after, held) or (_veto(tried, judges) if judges else None)
+
     while True:
         for name in _beyond_bounds(selection):
             selection = selection.without(name, TOO_LARGE)
-        after = left_out_errors(selection)
-        if rise := _own_harm(selection, held):
-            selection = selection.without(*rise)
-        elif (worse := harm(before, after, main)) and selection.suspects:
-            rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
-            selection = selection.without(min(rest, key=rest.__getitem__), f"{worse} on left-out episodes")
-        elif (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
-            own, told = ruined
-            rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
-            selection = selection.without(min(rest, key=rest.__getitem__), told)
-        elif veto := judges and _veto(selection, judges):
-            selection = selection.without(*veto)
-        else:
-            return selection, after
+        after, against = judged(selection)
+        if against is None:
+            break
+        withdrawn.append(against[0])
+        selection = selection.without(*against)
+    # A recalibration may have gone for what something else did that went later.
+    for channel in withdrawn[:-1]:
+        if channel in recalibrated and channel not in selection.touched:
+            more = {**selection.recalibrated, channel: recalibrated[channel]}
+            again = replace(selection, recalibrated=more, model=selection.model.refined({channel}))
+            its, against = judged(again)
+            if against is None and not harm(after, its, main):
+                selection, after = again, its
+    return selection, after
+
+
+def _against(
+    selection: Selection, before: EpisodeErrors, after: EpisodeErrors, held: Mapping[str, np.ndarray]
+) -> tuple[str, str] | None:
+    """The suspect that left-out episodes speak against most, and what they say; ``held`` by channel, residuals before in N."""
+    bench = selection.model.bench
+    main = whole(bench)
+    if rise := _own_harm(selection, held):
+        return rise
+    if (worse := harm(before, after, main)) and selection.suspects:
+        rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
+        return min(rest, key=rest.__getitem__), f"{worse} on left-out episodes"
+    if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
+        own, told = ruined
+        rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
+        return min(rest, key=rest.__getitem__), told
+    return None
 
 
 def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[np.ndarray, str] | None:

@@ -16,7 +16,7 @@ from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import comparison, errors, whole
-from emb_daemon.diagnose.confirmation import confirm, validation_gains
+from emb_daemon.diagnose.confirmation import confirm, harm, validation_gains
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model, rms_known
@@ -157,14 +157,15 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     progress("confirming with the running estimator", 0.8)
     selection, left_out = confirm(selection, judges)
     applied = selection.applied()
-    augmented = (
-        with_terms(_with_noise(selection.model.bench.calibrated(applied), selection), selection) if applied else calibration
-    )
-    augmented = _with_lasting(augmented, selection)
+    found = with_terms(selection.model.bench.calibrated(applied), selection) if applied else calibration
+    augmented = _with_lasting(_with_noise(found, selection) if applied else found, selection)
     progress("judging", 0.9)
     judging = judges or bench
     before = errors(judging, calibration)
     after = errors(judging, augmented) if judges else left_out
+    if judges and harm(before, after, whole(judges)):
+        # What was found the validation logs have not refused; then it is how the noise, stated anew, weighs the paths.
+        augmented, after = found, errors(judges, found)
     final = judging.under(augmented).residuals({}) if judges else selection.model.residual
     judged_before = judging.residuals({})
     logs = [trial.log for trial in bench.trials]

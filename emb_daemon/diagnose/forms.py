@@ -101,6 +101,11 @@ class Form:
         return (self.signal, self.other) if self.other else (self.signal,)
 
     @property
+    def means(self) -> tuple[str, str]:
+        """What it says: port and signals."""
+        return self.port, " times ".join(sorted(self.signals))
+
+    @property
     def fitted(self) -> tuple[str, ...]:
         """Sizes that are fitted beside the coefficients."""
         own = {

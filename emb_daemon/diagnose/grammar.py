@@ -19,6 +19,7 @@ from emb_daemon.diagnose.forms import Form, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
+    AS_GOOD,
     COARSE,
     Prospect,
     Screen,
@@ -28,7 +29,7 @@ from emb_daemon.diagnose.prospects import (
     noise_left,
     with_term,
 )
-from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, UNITS
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
@@ -40,10 +41,10 @@ from emb_daemon.offline.score import rmse
 
 #: Bootstraps over episodes.
 _BOOTSTRAPS = 100
-#: Share of the gain with which another port or signal is as good, and of bootstraps that must choose it to be a rival: what
-#: fewer choose is outside of a confidence of 95 %. Four fifths must choose the port of a term that is taken, which is in the
-#: upper half of what stability selection uses (Meinshausen and Bühlmann, J. Royal Statistical Society B 72, 2010: 0.6 to 0.9).
-_AS_GOOD, _RIVAL, _SAME_PORT = 0.95, 0.05, 0.8
+#: Share of bootstraps that must choose another port or signal for it to be a rival: what fewer choose is outside of a
+#: confidence of 95 %. Four fifths must choose the port of a term that is taken, which is in the upper half of what stability
+#: selection uses (Meinshausen and Bühlmann, J. Royal Statistical Society B 72, 2010: 0.6 to 0.9).
+_RIVAL, _SAME_PORT = 0.05, 0.8
 #: Why a term goes whose gain the fit does not find again.
 _NOT_HELD = "fitted with everything else it no longer holds"
 #: Terms of the heat balance in a calibration.
@@ -54,6 +55,9 @@ _FITTED = 4
 _FITS, _LITTLE = 8, 0.98
 #: Further shapes of one place that are fitted beside the first.
 _SHAPES = 3
+#: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
+#: wrong by some per cent, which then look like another cause.
+_BESIDE = 0.1
 
 
 def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selection:
@@ -74,6 +78,9 @@ def _with_terms(selection: Selection, channel: str) -> Selection:
         before, selection = selection, _one_more(selection, channel)
         if selection.accepted == before.accepted:
             break
+        if channel == "stiffness":
+            # The force that heats the pads has changed: what is left of their heat must not look like another term.
+            selection = replace(selection, model=selection.model.settled({*HEAT_CHANNELS, channel}))
         selection = _restated(selection, before, channel)
     return selection
 
@@ -94,7 +101,9 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
-        bare = before.without(name, "its shape was chosen again")
+        # Not refitted without it: everything else would make up for it, and its heat too, and no single fit leads back.
+        refused = replace(candidate, accepted=False, reason="its shape was chosen again")
+        bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
         found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
         if found is last:
             further = _in_shapes(before, candidate, channel, _SHAPES)
@@ -250,7 +259,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
     """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
     more is chance."""
-    equal = [p for p in prospects if p.evidence.gain >= _AS_GOOD * prospects[0].evidence.gain]
+    equal = [p for p in prospects if p.evidence.gain >= AS_GOOD * prospects[0].evidence.gain]
     return sorted(equal, key=lambda p: -shares[p.means])
 
 
@@ -275,7 +284,7 @@ def _with(
 ) -> Selection:
     """With one of the ``prospects``, accepted if it is proven, else with what speaks against it; ``shares`` of bootstraps."""
     model, screening, channel = selection.model, selection.screening, search.channel
-    rivals = _as_good(best, [p for p in prospects if p is not best], shares, model.bench.straight)
+    rivals = _as_good(best, [p for p in prospects if p is not best], shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
     at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
     made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
@@ -285,11 +294,16 @@ def _with(
         alike = ", ".join(_words(p.form) for p in rivals)
         made_of += f"; these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
     ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
+    largest = _largest_beside(selection, best, channel)
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
         f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
         < OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > OF_PLACEBO,
+        f"less than a tenth of the {largest:.3g} {UNITS[channel]} that another term does, whose shape is a guess": model.rms(
+            best.evidence.gain, channel
+        )
+        < _BESIDE * largest,
         made_of: at_port < _SAME_PORT,
     }
     against = next((text for text, holds in objections.items() if holds), "")
@@ -310,10 +324,23 @@ def _with(
     return _enter(selection, candidate, best.form)
 
 
+def _largest_beside(selection: Selection, best: Prospect, channel: str) -> float:
+    """RMS of what the largest term of a path does that says something else; none of the heat balance, whose terms were fitted
+    in all their shapes."""
+    model, largest = selection.model, 0.0
+    for name in _made(selection, channel) if channel != CHANNEL_OF_HEAT else ():
+        made = selection.candidates[name]
+        if (made.effect.hook, {*made.signals}) != (best.form.port, {*best.form.signals}):
+            off = {**model.values, **dict.fromkeys(made.amplitudes, 0.0)}
+            does = model.bench.residual_held(off, channel, model.heat) - model.residual[channel]
+            largest = max(largest, model.rms(float(does @ does), channel))
+    return largest
+
+
 def _enter_lobe(selection: Selection, candidate: Candidate, lobes: Sequence[Prospect]) -> Selection:
     """With a ripple: side lobes that do as well as the best on the screen are told from it by a fit with everything else."""
     most = max(lobe.evidence.gain for lobe in lobes)
-    close = [lobe for lobe in lobes if lobe.evidence.gain >= _AS_GOOD * most]
+    close = [lobe for lobe in lobes if lobe.evidence.gain >= AS_GOOD * most]
     fitted = [_enter(selection, replace(candidate, evidence=lobe.evidence), lobe.form) for lobe in close]
     return min(fitted, key=lambda s: s.model.noise(candidate.channel))
 
@@ -370,15 +397,14 @@ def _arrived(model: Model, channel: str) -> Model:
     return model
 
 
-def _as_good(
-    best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float], straight: bool
-) -> list[Prospect]:
-    """The best forms of other ports and signals that resampled episodes would choose often enough; also those that gain nearly
-    as much where a small step, by which the resampled ones choose, does not tell (not ``straight``)."""
+def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
+    """The best forms of other ports and signals that gain nearly as much, or that resampled episodes choose often enough.
+
+    How episodes scatter is not all that is unsure: shapes are guesses, and temperatures and torque in a car are models' own,
+    wrong alike in every resampled set."""
     found: dict[tuple[str, str], Prospect] = {}
     for other in sorted(others, key=lambda p: -p.evidence.gain):
-        close = not straight and other.evidence.gain >= _AS_GOOD * best.evidence.gain
-        close |= shares[other.means] >= _RIVAL
+        close = other.evidence.gain >= AS_GOOD * best.evidence.gain or shares[other.means] >= _RIVAL
         if other.means != best.means and close:
             found.setdefault(other.means, other)
     return list(found.values())

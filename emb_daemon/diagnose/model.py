@@ -8,7 +8,7 @@ import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
 from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out
-from emb_daemon.diagnose.residuals import FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.score import rmse
@@ -18,6 +18,10 @@ from emb_daemon.offline.score import rmse
 _INFLATION = 5.0
 #: A fit ends when the cost falls by less than this share, or after so many evaluations: screening and the next round follow.
 TOLERANCE, _EVALUATIONS = 2e-3, 8
+#: Heat and force that rest on each other are fitted in turn so often at most, until a turn leaves this share of the force's
+#: mean square, and of the temperatures' or these are right within the standard deviation of a thermocouple (IEC 60584, class
+#: 1), K.
+_TURNS, _RIGHT_K, _LITTLE = 5, 0.75, 0.98
 
 
 def rms_known(residual: np.ndarray) -> float:
@@ -118,6 +122,22 @@ class Model:
             if channel in channels and model.own(channel):
                 model = model._fitted(channel)
         return model
+
+    def settled(self, channels: Iterable[str]) -> "Model":
+        """The same, heat and force in turn until both have arrived: the force heats the pads, and follows their heat.
+        One turn from a force that is off by 600 N leaves temperatures wrong by 15 K."""
+        model, channels = self, set(channels)
+        # Neither rests on the torque path.
+        in_turn = channels.intersection(self.bench.channels) & {*HEAT_CHANNELS, "stiffness"}
+        if not in_turn.issuperset((CHANNEL_OF_HEAT, "stiffness")):
+            return self.refined(channels)
+        for _ in range(_TURNS):
+            before, model = model, model.refined(in_turn)
+            left, was = (m.noise(CHANNEL_OF_HEAT) for m in (model, before))
+            right = left < _RIGHT_K**2 or _LITTLE * was < left <= was
+            if right and model.noise("stiffness") > _LITTLE * before.noise("stiffness"):
+                break
+        return model.refined(channels - in_turn)
 
     def _fitted(self, channel: str) -> "Model":
         own, episode = tuple(self.own(channel)), self.bench.episode[channel]

@@ -31,6 +31,8 @@ _SHORTLIST = 10
 #: Forms whose sizes are fitted before that, and tries for each size: exponents and times as enumerated are a factor of two and
 #: more apart, and between two signals that resemble each other the better guess of an exponent would decide.
 _SHARPENED, _TRIES = 24, 8
+#: Share of the best gain from which another port or signal is as good, and from which it may be once its sizes are fitted.
+AS_GOOD, _NEARLY = 0.95, 0.9
 #: Signals at their ports that are multiplied by others: what says nothing alone rarely does in a product (weak heredity,
 #: Chipman, Canadian J. Statistics 24, 1996).
 _LEADING = 10
@@ -116,7 +118,7 @@ class Prospect:
     @property
     def means(self) -> tuple[str, str]:
         """What it says: port and signals."""
-        return self.form.port, " times ".join(sorted(self.form.signals))
+        return self.form.means
 
 
 class Search:
@@ -368,11 +370,12 @@ def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray, chances: i
 
 
 def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
-    """The best forms, no more than two of one port, signal and memory: near relatives tell the same."""
+    """The best forms, no more than two of one port, signal and memory: near relatives tell the same. Of a product it matters
+    which of its signals is shaped."""
     chosen: list[Form] = []
     for index in np.argsort(-gains):
         form = forms[index]
-        relatives = [f for f in chosen if (f.port, {*f.signals}, f.memory) == (form.port, {*form.signals}, form.memory)]
+        relatives = [f for f in chosen if (f.port, f.signals, f.memory) == (form.port, form.signals, form.memory)]
         if gains[index] > 0.0 and len(relatives) < 2:
             chosen.append(form)
         if len(chosen) == most:
@@ -383,9 +386,26 @@ def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
 def _sharpen(search: Search, forms: Sequence[Form], gains: np.ndarray) -> list[Form]:
     """The best of some forms with their sizes where left-out episodes gain most."""
     best = _best_of(forms, gains, _SHARPENED)
+    best += _of_other_means(forms, gains, best, _NEARLY)
     found = list(search.model.bench.map(lambda form: _fit_sizes(search, form), best))
-    gains = np.array([gain for _, gain in found])
-    return _best_of([form for form, _ in found], gains, _SHORTLIST)
+    best, gains = [form for form, _ in found], np.array([gain for _, gain in found])
+    chosen = _best_of(best, gains, _SHORTLIST)
+    return chosen + _of_other_means(best, gains, chosen, AS_GOOD)
+
+
+def _of_other_means(forms: Sequence[Form], gains: np.ndarray, chosen: Sequence[Form], share: float) -> list[Form]:
+    """The best form of each port and signals that are not among the ``chosen`` ones, but gain this share of the best: many
+    shapes of one signal must not keep another from being asked. As many as a shortlist has at most."""
+    means = {form.means for form in chosen}
+    found: list[Form] = []
+    for index in np.argsort(-gains):
+        form = forms[index]
+        if gains[index] < share * gains.max() or len(found) == _SHORTLIST:
+            break
+        if gains[index] > 0.0 and form.means not in means:
+            means.add(form.means)
+            found.append(form)
+    return found
 
 
 def _fit_sizes(search: Search, form: Form) -> tuple[Form, float]:

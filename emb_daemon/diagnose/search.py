@@ -14,7 +14,15 @@ from emb_daemon.diagnose.grammar import make_terms
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
 from emb_daemon.diagnose.screening import Screening
-from emb_daemon.diagnose.selection import Progress, Selection, find_changes, find_recalibrated, one_round, revise, settle_heat
+from emb_daemon.diagnose.selection import (
+    Progress,
+    Selection,
+    find_changes,
+    find_recalibrated,
+    one_round,
+    recalibrate_heat,
+    revise,
+)
 from emb_daemon.diagnose.unexplained import dependences, is_beyond
 from emb_daemon.effects import REGISTRY
 
@@ -25,7 +33,7 @@ def select(bench: Bench, progress: Progress) -> Selection:
     ``progress``: what is being done, share done."""
     progress("recalibrating", 0.1)
     start = Model.of(bench)
-    model = start.refined(bench.channels)
+    model = start.settled(bench.channels)
     screening = Screening(bench, start)
     at_first = {
         channel: dependences(
@@ -35,9 +43,9 @@ def select(bench: Bench, progress: Progress) -> Selection:
         if channel in FORCE_CHANNELS
     }
     selection = Selection(model, screening, at_first=at_first)
-    selection = replace(selection, recalibrated=find_recalibrated(selection, start))
+    selection = replace(selection, recalibrated=find_recalibrated(selection, start, bench.channels))
     if bench.own_data and not _anything_left(selection):
-        return find_changes(settle_heat(selection))
+        return find_changes(recalibrate_heat(selection))
     for number in range(len(REGISTRY)):
         progress(f"testing the catalogue, round {number + 1}", 0.2 + 0.5 * (1.0 - 0.6**number))
         before = selection.accepted
@@ -46,7 +54,7 @@ def select(bench: Bench, progress: Progress) -> Selection:
             break
     selection = make_terms(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
-    return find_changes(revise(settle_heat(selection)))
+    return find_changes(revise(recalibrate_heat(selection)))
 
 
 def _anything_left(selection: Selection) -> bool:

@@ -133,7 +133,7 @@ class Selection:
         model = before.entered(values, chosen, centre).refined(channels)
         if "stiffness" in channels:
             # The force that heats the pads has changed, and with their temperatures what softening and growth mean.
-            model = model.refined({*HEAT_CHANNELS, *channels})
+            model = model.settled({*HEAT_CHANNELS, *channels})
         result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
         for winner in winners:
             if result.model.noise(winner.channel) >= before.noise(winner.channel):
@@ -150,25 +150,39 @@ def settle_heat(selection: Selection) -> Selection:
     model = selection.model
     idle = [c for c in model.values if c.channel in HEAT_CHANNELS and c.channel not in selection.touched]
     start = about_middle({c: c.start for c in idle}, model.bench.middle)
-    return replace(selection, model=model.entered(start, chosen=idle).refined(selection.touched))
+    return replace(selection, model=model.entered(start, chosen=idle).settled(selection.touched))
 
 
-def find_recalibrated(selection: Selection, start: Model) -> dict[str, float]:
-    """Channels in which refitting the base parameters gains on left-out episodes what matters."""
-    model, result = selection.model, {}
-    for channel in model.bench.channels:
-        own = model.own(channel)
-        # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
-        if not own or channel == "innovation":
-            continue
-        # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
-        restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in own})
-        left_out = model.left_out(channel, residual=restored)
-        before = float(start.residual[channel] @ start.residual[channel])
-        gain = model.rms(before - float(left_out.sum()), channel)
-        if gain > 0.0 and gain >= selection.screening.floor(model, channel):
-            result[channel] = gain
-    return result
+def recalibrate_heat(selection: Selection) -> Selection:
+    """The same with the heat settled, and recalibrated where that gains what matters beside all that was found: as long as the
+    force was off, heat that made up for it may have gained nothing.
+
+    Capacities and conductances are never recalibrated without the pads' friction, the source of the heat: they would make up
+    for what is wrong of it."""
+    settled, model = settle_heat(selection), selection.model
+    heat = [c for c in HEAT_CHANNELS if c in model.bench.channels]
+    again = find_recalibrated(selection, settled.model, [c for c in heat if c not in selection.touched])
+    if CHANNEL_OF_HEAT in {*again, *selection.touched}:
+        again |= {c: recalibration_gain(model, settled.model, c) for c in heat if c not in {*again, *selection.touched}}
+    return settle_heat(replace(selection, recalibrated=selection.recalibrated | again)) if again else settled
+
+
+def find_recalibrated(selection: Selection, start: Model, channels: Iterable[str]) -> dict[str, float]:
+    """Those of some channels in which refitting the base parameters gains on left-out episodes what matters."""
+    model, floor = selection.model, selection.screening.floor
+    # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
+    asked = [c for c in channels if model.own(c) and c != "innovation"]
+    gains = {c: recalibration_gain(model, start, c) for c in asked}
+    return {c: gain for c, gain in gains.items() if gain > 0.0 and gain >= floor(model, c)}
+
+
+def recalibration_gain(model: Model, start: Model, channel: str) -> float:
+    """RMS that refitting a channel's base parameters takes on left-out episodes from what it leaves at the ``start``."""
+    # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
+    restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.own(channel)})
+    left_out = model.left_out(channel, residual=restored)
+    before = float(start.residual[channel] @ start.residual[channel])
+    return model.rms(before - float(left_out.sum()), channel)
 
 
 def one_round(selection: Selection) -> Selection:
