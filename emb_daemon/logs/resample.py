@@ -66,7 +66,7 @@ _RATIOS = {
     1e3: "a unit of time or a prefix that is wrong by a thousand",
 }
 #: Least step of the wire's MotorSpeed.
-_STEP_RAD_PER_S = 0.02
+STEP_RAD_PER_S = 0.02
 #: Signals of an E2E protected message that protection fills in.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
@@ -505,7 +505,7 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
 
     The estimator expects noise and takes a speed that repeats to the bit for frozen, but an encoder's speed at rest, or the
     derivative of an angle, is constant for minutes."""
-    return np.where(np.abs(speed) < 0.5 * _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
+    return np.where(np.abs(speed) < 0.5 * STEP_RAD_PER_S, STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 
 def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
