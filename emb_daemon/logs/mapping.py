@@ -19,7 +19,18 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, starts_anew
 from emb_daemon.logs.read import Recorded, ids_in, read_log
-from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages, standing
+from emb_daemon.logs.resample import (
+    HEADER,
+    SUBSTITUTES,
+    Series,
+    fill_missing,
+    frames_of,
+    is_received,
+    is_unresolved,
+    our_messages,
+    standing,
+    turns_free,
+)
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
@@ -500,7 +511,9 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
     angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
     if angle is None and isinstance(speed, Series):
         angle = speed.integral()
-    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or not angle.way_is_unknown or starts_anew(angle):
+    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or starts_anew(angle):
+        return []
+    if not is_unresolved(angle, turns_free(corner, messages)):
         return []
     return [
         f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "
