@@ -296,9 +296,11 @@ def test_the_inertia_of_a_slow_joint_is_not_diluted_by_the_steps_of_its_speed(mo
     assert inertia(diagnose([log], stated)) < 0.04
 
 
-def test_a_speed_without_noise_stays_as_it_is():
+@pytest.mark.parametrize("ripple_Hz", [0.0, 57.0, 80.0, 110.0])
+def test_a_speed_without_noise_stays_as_it_is(ripple_Hz):
+    """Nor is the ripple of a motor that cogs noise: its inertia answers it."""
     time_s = 0.004 * np.arange(3000)
-    speed = 30.0 * np.sin(2.0 * np.pi * time_s / 0.5)
+    speed = 30.0 * np.sin(2.0 * np.pi * time_s / 0.5) if not ripple_Hz else 5.0 + np.sin(2.0 * np.pi * ripple_Hz * time_s)
     samples = _drawn(time_s, np.cumsum(speed) * 0.004, speed, 0.0 * time_s + 1.0).samples
     assert denoised(samples) is samples
 

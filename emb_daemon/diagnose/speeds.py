@@ -16,6 +16,9 @@ from emb_daemon.logs.resample import STEP_RAD_PER_S
 
 #: Largest share of noise in the squared changes of speed: it is the share by which an inertia comes out too small.
 _MOST = 0.1
+#: Number of cycles over which changes are compared; correlation of neighbouring ones below minus which they are no noise's;
+#: largest difference of those further apart, as a share of the squared changes, of a slow motion.
+_LAGS, _OF_NOISE, _ALIKE = 7, 0.55, 0.2
 #: Numbers of samples over which a parabola replaces the speeds, at most a quarter of a second, and the fewest changes of speed
 #: that tell their noise.
 _WINDOWS, _FEWEST = (5, 9, 25, 63), 100
@@ -25,13 +28,18 @@ def denoised(samples: np.ndarray) -> np.ndarray:
     """SAMPLE rows with speeds smoothed as far as their noise asks for; the same rows where it hides nothing."""
     speed, in_turn = samples["speed"], samples["dt"] <= ONE_CYCLE_S
     moving = in_turn[1:] & (np.abs(speed[1:]) > STEP_RAD_PER_S)
-    both = moving[1:] & moving[:-1]
-    if np.sum(both) < _FEWEST:
+    if np.sum(moving) < _FEWEST:
         return samples
-    changes = np.diff(speed)
-    # Of white noise neighbouring changes have minus half of its share in their squares; those of a motion are alike.
-    variance = float(np.mean(changes[1:][both] ** 2 - changes[1:][both] * changes[:-1][both])) / 3.0
-    if 2.0 * variance <= _MOST * np.mean(changes[moving] ** 2):
+    changes = np.where(moving, np.diff(speed), 0.0)
+    square, first, second, *apart = (
+        float(changes[lag:] @ changes[: len(changes) - lag]) / np.sum(moving) for lag in range(_LAGS)
+    )
+    # White noise makes neighbouring changes opposite by its variance and leaves the second ones as the motion has them. A
+    # ripple may do more. Where two of its values were averaged, it is over after two cycles, and a slow motion goes on.
+    white = second - first if first > -_OF_NOISE * square else 0.0
+    over = 0.5 * (square - float(np.mean(apart))) if np.ptp(apart) < _ALIKE * square else 0.0
+    variance = max(white, over)
+    if 2.0 * variance <= _MOST * square:
         return samples
     cuts = [0, *np.flatnonzero(~in_turn[1:]) + 1, len(samples)]
     result = samples.copy()
