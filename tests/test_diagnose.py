@@ -919,6 +919,13 @@ def _prospect(port, signals, numbers, gain, columns=()):
     )
 
 
+def test_a_form_that_does_next_to_nothing_gains_nothing():
+    """What decays over a log ends far below what a number holds."""
+    least = prospects.Scores(np.array([[1e-158, 1e-160, 0.0]]), np.array([[1e-316, 1e-320, 0.0]]))
+    with np.errstate(all="raise"):
+        assert abs(least.gain[0]) < 1e-100
+
+
 def test_resampled_episodes_choose_the_shorter_description(monkeypatch):
     """A form of five numbers that explains a thousandth more than one of three is not what episodes choose."""
     rng = np.random.default_rng(4)

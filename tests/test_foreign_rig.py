@@ -343,6 +343,35 @@ def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
     assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
 
 
+def test_a_column_may_count_instead_of_telling_a_time(tmp_path):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    timed = load_log(foreignkit.write_table(tmp_path / "a.csv", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    counts = np.rint(8000.0 * columns["time_s"]).astype(np.int64)
+    foreignkit.write_table(tmp_path / "b.csv", columns | {"time_s": counts})
+    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: time_s, rate_Hz: 8000"))
+    counted = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert counted.time_ns == pytest.approx(timed.time_ns, abs=1e9 / 8000.0)
+    _assert_same(counted.samples, timed.samples)
+
+
+def test_a_matrix_whose_rows_end_with_semicolons_is_a_table(tmp_path, capsys):
+    """As MATLAB and a motor drive's firmware write it: comments, a header and units behind %, rows of nan while nothing was
+    measured yet."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    header, *rows = (
+        foreignkit.write_table(tmp_path / "a.csv", foreignkit.sampled(foreignkit.truth(), 250.0)).read_text().split()
+    )
+    plain = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    capsys.readouterr()
+    nothing = ",".join(["nan"] * len(header.split(",")))
+    lines = ["%Measured on the bench, axis 0", "", "%" + header, "%[s],[rad]", f"{nothing};", *(f"{row};" for row in rows)]
+    (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
+    log = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    _assert_same(log.samples, plain.samples)
+    assert capsys.readouterr().err == ""
+
+
 def _written(path: Path, variables: dict) -> Path:
     if path.suffix == ".mat":
         savemat(path, variables)
@@ -606,8 +635,12 @@ def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, sa
 @pytest.mark.parametrize(
     ("before", "after", "expected"),
     [
-        ("time: {signal: time_s}", "time: {}", "expected either signal (a column) or rate_Hz"),
-        ("time: {signal: time_s}", "time: {signal: t, rate_Hz: 9}", "expected either signal (a column) or rate_Hz"),
+        ("time: {signal: time_s}", "time: {}", "expected signal (a column), rate_Hz (rows per second), or both"),
+        (
+            "time: {signal: time_s}",
+            "time: {signal: t, rate_Hz: 9, unit: ms}",
+            "unit: counts have none; expected unit or rate_Hz",
+        ),
         (
             "angle_rad, unit: rad",
             "x, unit: mm",
@@ -615,6 +648,12 @@ def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, sa
         ),
         ("speed_rad_per_s, unit: rad/s", "v, unit: mm/s", "v is a travel in mm/s, not the motor's angle; state `unit: rad/s`"),
         ("force_N, unit: N", "force_N, unit: stone", "force_N is in 'stone'; expected N, kN"),
+        (
+            "VEH_WheelSpeed.WheelSpeedFL: {value: 0}",
+            "VEH_WheelSpeed.WheelSpeedFL: {signal: v, unit: km/h}",
+            "v is the speed of a tyre in km/h, not the wheel's turning; state `unit: rad/s`, and as `scale` the radians that "
+            "the wheel turns for one of them: 0.2778 over the tyre's radius in m",
+        ),
     ],
 )
 def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):

@@ -277,7 +277,10 @@ _GVRET = """Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
 """
 
 
-@pytest.mark.parametrize(("name", "text"), [("x.log", _SHOWN), ("x.txt", _SHOWN), ("x.csv", _GVRET)])
+_GVRET_BEFORE = _GVRET.replace("Dir,", "").replace(",Rx", "")
+
+
+@pytest.mark.parametrize(("name", "text"), [("x.log", _SHOWN), ("x.txt", _SHOWN), ("x.csv", _GVRET), ("x.csv", _GVRET_BEFORE)])
 def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     recorded = read_log(tmp_path / name)
@@ -292,6 +295,62 @@ def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, te
     (tmp_path / name).write_text(text + "what is this\n")
     with pytest.raises(InputError, match=r"x\.\w+:\d: not a candump line"):
         read_log(tmp_path / name)
+
+
+_PEAK_TABLE = """;$FILEVERSION=2.1
+;   Message   Time    Type    ID     Rx/Tx
+
+1;1059,900;1;Rx;DT;0123;-;8;11;22;33;44;55;66;77;88
+2;1069,900;2;Tx;DT;18FEF131;-;2;AB;CD
+3;1079,900;1;Rx;FD;0123;-;9;01;02;03;04;05;06;07;08;09;0A;0B;0C
+4;1080,000;1;Rx;ER;-;-;5;04;00;02;00;00
+5;1080,100;-;;EV;a word of its user
+6;1089,900;1;Rx;RR;0123;-;3
+"""
+
+
+@pytest.mark.parametrize(
+    "text", [_PEAK_TABLE, _PEAK_TABLE.replace(",", ".").replace(";", ","), _PEAK_TABLE.replace(";", "\t")]
+)
+def test_what_peak_converter_makes_of_a_trace_is_read(tmp_path, text):
+    (tmp_path / "x.csv").write_text(text)
+    recorded = read_log(tmp_path / "x.csv")
+    frames = recorded.frames
+    assert frames["can_id"].tolist() == [0x123, 0x18FEF131, 0x123, 0x123]
+    assert frames["flags"][:2].tolist() == [0, EXTENDED] and frames["flags"][3] == REMOTE
+    assert frames["data"][:2].tolist() == [0x8877665544332211, 0xCDAB]
+    assert recorded.payloads(np.array([2]))[0] == bytes(range(1, 13))
+    assert np.diff(frames["time_ns"]).tolist() == [10_000_000] * 3
+    assert recorded.channels.tolist() == ["1", "2", "1", "1"]
+    (tmp_path / "x.csv").write_text(text + "what is this\n")
+    with pytest.raises(InputError, match=r"x\.csv:10: not a candump line"):
+        read_log(tmp_path / "x.csv")
+
+
+_TRACE_1_0 = """;  CAN activities
+;----+-   ---+---  ----+---  +  -+ -- -- ...
+     1)      1841      0123  8  11 22 33 44 55 66 77 88
+     2)      1842      0008  4  ERROR 00 19 08 08
+     3)      1843  FFFFFFFF  4  00 00 00 04 -- -- -- --  BUSLIGHT
+     4)      1851  18FEF131  2  AB CD
+"""
+_TRACE_1_2 = """;$FILEVERSION=1.2
+;$STARTTIME=39878.6772258947;
+;---+--   ----+------  +  --+--  ----+---  +  -+ -- -- -- -- -- -- --
+     1)      1841.000  1  Rx         0123  8  11 22 33 44 55 66 77 88
+     2)      1842.000  1  Warng  FFFFFFFF  4  00 00 00 04  BUSLIGHT
+     3)      1843.000  1  Error      0008  4  00 19 08 08
+     4)      1851.000  1  Tx     18FEF131  2  AB CD
+"""
+
+
+@pytest.mark.parametrize("text", [_TRACE_1_0, _TRACE_1_2])
+def test_old_traces_of_peak_are_read_with_their_errors(tmp_path, text):
+    (tmp_path / "x.trc").write_text(text)
+    frames = read_log(tmp_path / "x.trc").frames
+    assert frames["can_id"].tolist() == [0x123, 0x18FEF131] and frames["flags"].tolist() == [0, EXTENDED]
+    assert frames["data"].tolist() == [0x8877665544332211, 0xCDAB]
+    assert np.diff(frames["time_ns"]) == pytest.approx(10_000_000, abs=1e3)
 
 
 _BUSMASTER = """***BUSMASTER Ver 3.2.0***

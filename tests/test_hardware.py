@@ -18,6 +18,7 @@ from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.speeds import denoised
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import resample
 from emb_daemon.offline import load_log
@@ -229,6 +230,79 @@ def test_friction_that_turns_over_at_once_and_a_light_rotor_are_found_from_a_bra
     before, after = found.before.rmse("torque"), found.after.rmse("torque")
     assert after < 1.3 * 0.02 * scale < before
     assert found.selection.recalibrated["torque"] == pytest.approx(np.sqrt(before**2 - after**2), rel=0.05)
+
+
+def _of_a_joint(**values: float):
+    """A calibration to begin with, of a joint at its own shaft that clamps nothing."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    start = {"motor.torque_constant_Nm_per_A": 1.0, "friction.load_m_per_rad": 0.0, "motor.inertia_kg_m2": 0.01}
+    return moved(stated, start | {f"friction.{name}": value for name, value in values.items()})
+
+
+def _drawn(time_s, angle, speed, torque):
+    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque, "force_N": 0.0 * time_s}
+    return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+
+def _breakaways(seed: int):
+    """A joint of 0.5 N m that turns free, broken away time and again by a current that rises while it stands, for a second
+    and a half of every two."""
+    random, time_s = np.random.default_rng(seed), 0.004 * np.arange(12_000)
+    phase, turn = time_s % 2.0, np.floor(time_s / 2.0).astype(int)
+    way = random.choice([-1.0, 1.0], 24)[turn]
+    speed = way * random.uniform(1.0, 4.0, 24)[turn] * np.where(phase > 1.5, np.sin(2.0 * np.pi * (phase - 1.5)), 0.0)
+    torque = np.where(phase <= 1.5, 0.5 * way * phase / 1.5, 0.5 * np.sign(speed)) + 0.02 * random.normal(size=len(time_s))
+    return _drawn(time_s, np.cumsum(speed) * 0.004, speed, torque)
+
+
+def test_a_current_that_does_not_turn_a_free_motor_tells_nothing_of_its_friction(monkeypatch):
+    """Friction holds it, whatever the current below that is: friction is not fitted to it, nor the model judged by it."""
+    stated = _of_a_joint(offset_Nm=0.2, presliding_angle_rad=0.001)
+    found = diagnose([_breakaways(1)], stated, [_breakaways(2)])
+    scale = stated.motor.torque_constant_Nm_per_A / stated.motor.gear_gain_m_per_rad
+    assert found.calibration.friction.offset_Nm == pytest.approx(0.5, rel=0.05) and not found.accepted
+    assert found.after.rmse("torque") < 1.3 * 0.02 * scale
+    monkeypatch.setattr(residuals, "standing", lambda time_s, angle: np.zeros(len(time_s), np.bool_))
+    with_rest = diagnose([_breakaways(1)], stated, [_breakaways(2)])
+    assert with_rest.after.rmse("torque") > 5.0 * found.after.rmse("torque")
+
+
+def test_a_free_motor_that_never_turns_is_no_diagnosis():
+    time_s = 0.004 * np.arange(2000)
+    logs = [_drawn(time_s, 0.0 * time_s, 0.0 * time_s, 0.01 * n * np.sin(time_s)) for n in range(1, 8)]
+    with pytest.raises(InputError, match="the motor stands throughout without a load, and friction holds it"):
+        diagnose(logs, _of_a_joint(offset_Nm=0.2))
+
+
+@pytest.mark.parametrize("step", [0.02, 0.2])
+def test_the_inertia_of_a_slow_joint_is_not_diluted_by_the_steps_of_its_speed(monkeypatch, step):
+    """Of our message, or coarser ones of the joint's own encoder: five times what the calibration begins with, and friction
+    a third of it."""
+    time_s, random = 0.004 * np.arange(12_000), np.random.default_rng(4)
+    angle = np.repeat(random.uniform(0.2, 0.8, 12), 1000) * np.sin(2.0 * np.pi * time_s / 2.0)
+    speed = np.gradient(angle, time_s)
+    torque = 0.05 * np.gradient(speed, time_s) + 0.06 * np.tanh(speed / 0.01) + 0.02 * random.normal(size=len(time_s))
+    log = _drawn(time_s, angle, step * np.rint(speed / step), torque)
+    stated = _of_a_joint(offset_Nm=0.2)
+
+    def inertia(found):
+        return found.calibration.motor.inertia_kg_m2
+
+    found = diagnose([log], stated)
+    assert inertia(found) == pytest.approx(0.05, rel=0.1)
+    monkeypatch.setattr(residuals, "denoised", lambda samples: samples)
+    assert inertia(diagnose([log], stated)) < 0.04
+
+
+@pytest.mark.parametrize("ripple_Hz", [0.0, 57.0, 80.0, 110.0])
+def test_a_speed_without_noise_stays_as_it_is(ripple_Hz):
+    """Nor is the ripple of a motor that cogs noise: its inertia answers it."""
+    time_s = 0.004 * np.arange(3000)
+    speed = 30.0 * np.sin(2.0 * np.pi * time_s / 0.5) if not ripple_Hz else 5.0 + np.sin(2.0 * np.pi * ripple_Hz * time_s)
+    samples = _drawn(time_s, np.cumsum(speed) * 0.004, speed, 0.0 * time_s + 1.0).samples
+    assert denoised(samples) is samples
 
 
 def test_saturation_takes_half_of_the_constant_at_most_at_the_largest_current_of_the_logs():

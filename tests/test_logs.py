@@ -171,7 +171,12 @@ def test_a_gzipped_log_that_is_cut_off_is_read_up_to_the_cut(tmp_path, capsys):
         ("damaged.log.gz", gzip.compress(_GOOD.encode() * 1000, mtime=0)[:-8] + b"wrong CRC", "damaged gzip"),
         ("flipped.log.gz", gzip.compress(_GOOD.encode(), mtime=0)[:10] + b"\xff\xff\xff", "damaged gzip"),
         ("notes.txt", b"hello", "unknown log format"),
-        ("run.csv", b"t,angle\n0.0,1.5\n", "a table of signals needs --mapping"),
+        (
+            "run.csv",
+            b"t,angle\n0.0,1.5\n",
+            "begins with ['t,angle'], as no log of frames that is known here does (python-can's CSV, SavvyCAN's, "
+            "PEAK-Converter's); a table of signals needs --mapping",
+        ),
         ("run.mat", b"MATLAB 5.0", "or --mapping of a table's columns"),
         ("nothing", b"hello", "unknown log format"),
         ("x.blf", b"not a blf file at all", "BLFReader"),

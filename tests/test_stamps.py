@@ -315,6 +315,35 @@ def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):
         assert "scale: -1" not in capsys.readouterr().err, start
 
 
+def test_a_load_that_pulls_as_it_pushes_is_no_clamp_that_is_turned_round(tmp_path, capsys):
+    """A pendulum's: it falls where the angle rises, and so does the current that holds it."""
+    time_s = 0.004 * np.arange(5000)
+    angle = 2.5 * np.sin(2.0 * np.pi * 0.2 * time_s) + 1.8
+    load = 6000.0 * np.sin(angle + 2.0)
+    columns = {"time_s": time_s, "angle_rad": angle, "speed_rad_per_s": np.gradient(angle, time_s)}
+    _read(tmp_path, columns | {"current_A": 5e-4 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
+    assert "scale: -1" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("load", ["signal: force_N, unit: N", "value: 0"])
+def test_a_joint_stated_at_its_motor_is_sampled_as_often_as_it_was(tmp_path, capsys, load):
+    """Every 20 ms, and the straight line misses three times what it may of a brake: without a load the current
+    tells of its speed, and not of where it is."""
+    mapping = foreignkit.COLUMNS.replace("signal: force_N, unit: N", load)
+    time_s = 0.02 * np.arange(1000)
+    angle = 300.0 * np.sin(2.0 * np.pi * 0.25 * time_s)
+    still = 0.0 * time_s
+    columns = {
+        "time_s": time_s,
+        "angle_rad": angle,
+        "speed_rad_per_s": np.gradient(angle, time_s),
+        "current_A": np.sign(still + 1),
+    }
+    log = _read(tmp_path, columns | {"plate_C": 22.0 + still, "force_N": 100.0 * np.sin(time_s)}, mapping)
+    told = "too rare for this motion" in capsys.readouterr().err
+    assert told == ("value" not in load) and (len(log.samples) > 4000) == ("value" in load)
+
+
 @pytest.mark.parametrize("rate_Hz", [12.5, 250.0])
 def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, rate_Hz):
     """At the top of a fast sine the current brakes the motor; between slow samples the motor goes its way."""

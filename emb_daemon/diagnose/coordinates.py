@@ -97,8 +97,8 @@ _OF_USUAL, _NEXT_TO_NOTHING = 3.0, 0.3
 #: A parameter that cannot be zero does not fall below this share of itself.
 _LEAST = 0.1
 #: The same where nothing is clamped: there inertia and presliding angle are any machine's, and the calibration to begin with
-#: is a brake's or a guess; and how well the presliding angle is known then, over its size.
-_LEAST_OF_ANY, _PRESLIDING = {INERTIA: 1e-3, PRESLIDING_ANGLE: 1e-4}, 3.0
+#: is a brake's or a guess; and how well these and friction are known then, over their size.
+_LEAST_OF_ANY, _GUESSED = {INERTIA: 1e-3, PRESLIDING_ANGLE: 1e-4, OFFSET_FRICTION: 0.0}, 3.0
 #: Curve coefficients and the pads' friction, as above; slopes of the latter over force and disc speed turn about these.
 _CURVE, _FRICTION, _SLOPE = 0.1, 0.3, 0.1
 _FRICTION_FORCE_N, _FRICTION_SPEED = 5000.0, 20.0
@@ -144,7 +144,7 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
     for key, channel, prior in _BASE:
         coordinate = _scale(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)
         if key in _LEAST_OF_ANY and not calibration.contact.is_in_reach:
-            known = _PRESLIDING * coordinate.start if key == PRESLIDING_ANGLE else coordinate.prior
+            known = max(_GUESSED * coordinate.start, coordinate.prior)
             coordinate = replace(coordinate, prior=known, low=_LEAST_OF_ANY[key] * coordinate.start)
         result.append(coordinate)
     return result + _friction(calibration)

@@ -204,6 +204,8 @@ def _refuse_silent(bench: Bench) -> None:
     if any(np.any(residual) for residual in bench.residuals({}).values()):
         return
     log = bench.trials[0].log
+    if bench.turns_free and all(trial.stands.all() for trial in bench.trials):
+        raise InputError(f"{log.path}: the motor stands throughout without a load, and friction holds it whatever its current")
     apart = 1e3 * float(np.median(log.samples["dt"]))
     raise InputError(
         f"{log.path}: no sample of it can be judged; expected motor, current and reference at 100 Hz or more, or slower "

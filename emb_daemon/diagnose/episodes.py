@@ -17,6 +17,9 @@ _PAUSE_S = 0.3
 _LONGEST_S, _SHORTEST_S, _PIECES = 8.0, 0.5, 40
 #: The motor holds where it turns less than this over this time: a tenth of the angle over which gears slide.
 _HOLDING_RAD, _HOLDING_S = 0.03, 0.25
+#: The motor stands where it turns less than a step of our message of its speed, 0.02 rad/s, for this time, s;
+#: number of places in it.
+_STILL_RAD_PER_S, _STILL_S, _STILL_PARTS = 0.02, 0.1, 5
 
 
 def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
@@ -61,6 +64,16 @@ def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:
         if time_s[end] - time_s[cuts[-1]] >= _SHORTEST_S:
             cuts.append(int(end))
     return cuts
+
+
+def standing(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Mask of the samples, shape (N,), before or after which the motor does not turn as far as our messages tell."""
+    stands = {-1.0: np.ones(len(time_s), np.bool_), 1.0: np.ones(len(time_s), np.bool_)}
+    for part in _STILL_S * np.arange(1, _STILL_PARTS + 1) / _STILL_PARTS:
+        for way, still in stands.items():
+            there = np.interp(time_s + way * part, time_s, angle_rad)
+            still &= np.abs(there - angle_rad) < _STILL_RAD_PER_S * _STILL_S
+    return stands[-1.0] | stands[1.0]
 
 
 def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

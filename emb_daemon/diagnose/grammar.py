@@ -21,6 +21,7 @@ from emb_daemon.diagnose.model import TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
+    NOTHING,
     Prospect,
     Screen,
     Search,
@@ -427,7 +428,7 @@ def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, st
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
     alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, episodes)
     alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
-    left = np.maximum(1.0 - gains / np.maximum(alone, 1e-300), 1e-3)
+    left = np.maximum(1.0 - gains / np.maximum(alone, NOTHING), 1e-3)
     numbers = np.array([prospect.form.numbers for prospect in prospects])
     chosen = np.argmin(description_length(left, numbers[:, None], episodes), axis=0)
     shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)

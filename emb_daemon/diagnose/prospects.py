@@ -40,6 +40,8 @@ _LEADING = 10
 _CHANCES, _SHIFTS = 99, 5
 #: Share of the samples in which a term must stay within what its port may bear.
 _HELD = 0.9
+#: Sum of squares up to which it is nothing, as that of a regressor that decays: a quotient by less would overflow.
+NOTHING = 1e-200
 #: Orders of ripples that are scanned, and how many of the strongest are run through the estimator.
 _ORDERS, _LOBES = (0.05, 100.0), 4
 
@@ -56,7 +58,8 @@ class Scores:
     def fall(self) -> np.ndarray:
         """Fall of the squared error of each left-out episode."""
         rest = self.a.sum(axis=1, keepdims=True) - self.a
-        without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=rest > 0.0)
+        told = rest > NOTHING
+        without = np.divide(self.u.sum(axis=1, keepdims=True) - self.u, rest, out=np.zeros_like(rest), where=told)
         return 2.0 * without * self.u - without**2 * self.a
 
     @property

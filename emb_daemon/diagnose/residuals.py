@@ -17,8 +17,9 @@ import numpy as np
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
-from emb_daemon.diagnose.episodes import episodes
+from emb_daemon.diagnose.episodes import episodes, standing
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
+from emb_daemon.diagnose.speeds import denoised
 from emb_daemon.effects.base import OF_THE_MOTOR
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
@@ -58,6 +59,8 @@ class Trial:
     temperature_rows: np.ndarray
     temperature_C: np.ndarray
     brake_torque_Nm: np.ndarray
+    #: Where the motor stands.
+    stands: np.ndarray
     #: What the calibration says otherwise of this log alone, by key: pads of another thickness, and their clearance.
     mounted: Mapping[str, float]
 
@@ -73,7 +76,8 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     known = np.isfinite(force).mean() > _RECORDED
     clamping = force if known else run_step(log.samples, parameters)["force"]
     cut = episodes(log.time_s, np.nan_to_num(clamping), log.samples["angle"])
-    return Trial(log, index, force, cut, rows, measured, torque, mounted)
+    stands = standing(log.time_s, log.samples["angle"])
+    return Trial(log, index, force, cut, rows, measured, torque, stands, mounted)
 
 
 def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
@@ -174,6 +178,9 @@ class Bench:
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows: bool = self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
+        if not self.clamps and not self.load_follows:
+            for trial in self.trials:
+                trial.log = replace(trial.log, samples=denoised(trial.log.samples))
         #: Whether the load is known to be nothing: then the current itself is all that is explained.
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
         #: Converts unexplained current to force: what it would be on the spindle.
@@ -296,7 +303,11 @@ class Bench:
             # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
             load = left / trace["torque_constant"] * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
-        torque = np.where(samples["dt"] <= ONE_CYCLE_S, np.nan_to_num(load, nan=0.0), 0.0)
+        told = samples["dt"] <= ONE_CYCLE_S
+        if self.turns_free:
+            # Without a load friction holds a motor that stands, whatever its current below that of friction.
+            told &= ~trial.stands
+        torque = np.where(told, np.nan_to_num(load, nan=0.0), 0.0)
         result = {"stiffness": np.nan_to_num(force - trace["force"]), "torque": torque, "innovation": torque}
         if "temperature" in self.channels:
             temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]

@@ -7,7 +7,7 @@ reported.
 import numpy as np
 
 from emb_daemon.logs.columns import shipped_database
-from emb_daemon.logs.resample import Series, Signals
+from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
 
 #: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
@@ -62,14 +62,16 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         lines += _find_rounded(corner, angle, current)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     # A motor with constant load clamps nothing.
-    is_free = isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
-    moves = not (speed is None or current is None or (angle or speed.integral()).way_is_unknown)
+    is_free = turns_free(corner, messages)
+    moves = not (speed is None or current is None or is_unresolved(angle or speed.integral(), is_free))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # Travel alone does not show directions; current and force do.
         return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
-    if current is not None and np.ptp(current.values) and not is_free:
+    if is_free or (force is not None and _is_of_either_sign(force)):
+        return lines
+    if current is not None and np.ptp(current.values):
         lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force)
@@ -197,6 +199,12 @@ def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.nda
         return None
     columns = np.stack([np.ones(len(load)), load, acceleration], axis=1)
     return current - np.linalg.lstsq(columns, current)[0][2] * acceleration
+
+
+def _is_of_either_sign(force: Series) -> bool:
+    """Whether a load pulls as it pushes: no clamp force does, whichever way its sensor counts."""
+    low, high = np.quantile(force.values, (0.01, 0.99))
+    return bool(min(-low, high) > _FOLLOWS * max(-low, high))
 
 
 def _find_turned_current(angle: Series, current: Series) -> list[str]:

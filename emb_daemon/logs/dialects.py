@@ -8,8 +8,8 @@ _SHOWN = re.compile(
     rb"\s*\((\d+\.\d+)\)\s+(\S+)\s+(?:[RT]X\s[^\[]*?\s)?([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})\s+\[(\d+)\]((?:\s+[0-9A-Fa-f]{2})*)"
     rb"\s*(remote request|'.*)?"
 )
-#: How SavvyCAN's tables (GVRET) begin, times in microseconds.
-_GVRET = b"Time Stamp,ID,Extended,Dir,Bus,LEN"
+#: How SavvyCAN's tables (GVRET) begin, times in microseconds; older ones name no direction.
+_GVRET, _GVRET_COLUMNS = b"Time Stamp,ID,Extended,", (b"Time Stamp", b"ID", b"Extended", b"Bus", b"LEN")
 #: How BUSMASTER's logs begin, and a frame in one: ``hh:mm:ss:fraction Rx|Tx channel id type length bytes``, of type s(tandard)
 #: or (e)x(tended), with r where it is remote. All other lines begin with stars.
 _BUSMASTER = b"***BUSMASTER"
@@ -18,20 +18,82 @@ _BUSMASTER_FRAME = re.compile(
 )
 _DECIMAL = b"***DEC***"
 _HALF_A_DAY_S = 43_200
+#: How PEAK's trace files begin, if they name their version, and a line in one of 1.0 that is no frame: the number of an error.
+_PEAK, _PEAK_ERROR = b";$FILEVERSION", re.compile(rb"[ \t]*\d+\)[^\n]*\bERROR\b[^\n]*\n?")
+#: A stray semicolon after the time at which a trace file of PEAK began; version 1.2, which is 1.3 without a reserved column
+#: between id and length.
+_PEAK_START = re.compile(rb"(?m)^(;\$STARTTIME=[\d.]+);")
+_PEAK_1_2, _PEAK_1_2_ID = (
+    re.compile(rb"^;\$FILEVERSION=1\.2\b"),
+    re.compile(rb"(?m)^(\s*\d+\)\s+[\d.]+\s+\d+\s+[RT]x\s+[0-9A-Fa-f]+)"),
+)
+#: A row of a table that PEAK-Converter makes of one: ``number,ms,bus,Rx|Tx,type,id,reserved,length,bytes``, parted by what its
+#: user chose; types of messages, and of those of CAN FD; how a row of any other type begins, or a comment.
+_PEAK_ROW = re.compile(
+    rb"\s*\d+\)?(?P<mark>[,;\t|])\s*(?P<ms>\d+(?:[.,]\d+)?)(?P=mark)\s*(?P<bus>\d+)(?P=mark)\s*[RT]x(?P=mark)\s*(?P<kind>[A-Z]{2})"
+    rb"(?P=mark)\s*(?P<id>[0-9A-Fa-f]{3,8})(?P=mark)[^,;\t|]*(?P=mark)\s*(?P<length>\d+)(?P<data>(?:(?P=mark)[^,;\t|]*)*)\s*"
+)
+_PEAK_MESSAGES, _PEAK_FD = (b"DT", b"RR"), (b"FD", b"FB", b"FE", b"BI")
+_PEAK_OTHER = re.compile(rb"\s*(\d+\)?[,;\t|]|;|$)")
+#: Lines at the beginning of a file among which the first frame is looked for.
+_FIRST_LINES = 100
 
 
 def as_candump(content: bytes) -> bytes | None:
     """A text in another format converted to candump's log format line by line; None if the format is unknown. A line that
     cannot be read stays as it is."""
     first = content[:1000].lstrip().split(b"\n", 1)[0]
-    if first.startswith(_GVRET):
+    if first.startswith(_GVRET) and all(name in (names := _names(first)) for name in _GVRET_COLUMNS):
+        places = [names.index(name) for name in _GVRET_COLUMNS]
         # The header becomes an empty line, so that the line numbers stay the same.
-        return b"\n".join([b"", *map(_of_gvret, content.split(b"\n")[1:])])
+        return b"\n".join([b"", *(_of_gvret(line, places) for line in content.split(b"\n")[1:])])
     if first.startswith(_BUSMASTER):
         return b"\n".join(_of_busmaster(content.split(b"\n")))
     if _SHOWN.fullmatch(first.strip()):
         return b"\n".join(map(_of_terminal, content.split(b"\n")))
+    if any(map(_PEAK_ROW.fullmatch, content.split(b"\n", _FIRST_LINES)[:_FIRST_LINES])):
+        return b"\n".join(_of_peak_table(content.split(b"\n")))
     return None
+
+
+def tidied_trace(content: bytes) -> bytes:
+    """A trace file of PEAK as python-can's reader knows it: not version 1.2, and no errors in 1.0."""
+    if not content.startswith(_PEAK):
+        return _PEAK_ERROR.sub(b"", content)
+    content = _PEAK_START.sub(rb"\1", content)
+    if not _PEAK_1_2.match(content):
+        return content
+    return _PEAK_1_2_ID.sub(rb"\1 -", _PEAK_1_2.sub(b";$FILEVERSION=1.3", content))
+
+
+def _names(header: bytes) -> list[bytes]:
+    return [cell.strip() for cell in header.split(b",")]
+
+
+def _of_peak_table(lines: list[bytes]) -> Iterator[bytes]:
+    """Text before the first frame, and rows of events and errors, become empty lines."""
+    begun = False
+    for line in lines:
+        found = _PEAK_ROW.fullmatch(line)
+        begun = begun or found is not None
+        if found and (found["kind"] in _PEAK_MESSAGES or found["kind"] in _PEAK_FD):
+            yield _of_peak_row(found)
+        else:
+            yield line if begun and not _PEAK_OTHER.match(line) else b""
+
+
+def _of_peak_row(found: re.Match[bytes]) -> bytes:
+    kind, can_id = found["kind"], found["id"]
+    octets = [cell.strip() for cell in found["data"].split(found["mark"])]
+    # Ids of eleven bits have four digits.
+    width = b"%08X" if len(can_id) > 4 else b"%03X"
+    return b"(%.6f) %s %s%s%s" % (
+        1e-3 * float(found["ms"].replace(b",", b".")),
+        found["bus"],
+        width % int(can_id, 16),
+        b"##0" if kind in _PEAK_FD else b"#",
+        b"R" if kind == b"RR" else b"".join(octet for octet in octets if octet not in (b"", b"-", b"--")),
+    )
 
 
 def _of_terminal(line: bytes) -> bytes:
@@ -50,14 +112,16 @@ def _of_terminal(line: bytes) -> bytes:
     )
 
 
-def _of_gvret(line: bytes) -> bytes:
+def _of_gvret(line: bytes, places: list[int]) -> bytes:
+    """Args: places: the columns of time, id, whether it is extended, bus and length; the bytes follow the length."""
     cells = [cell.strip() for cell in line.split(b",")]
     try:
-        micros, can_id, bus, length = int(cells[0]), int(cells[1], 16), cells[4], int(cells[5])
-        data = b"".join(b"%02X" % int(cell, 16) for cell in cells[6 : 6 + length])
+        stamp, can_id, extended, bus, length = (cells[place] for place in places)
+        micros, can_id, length = int(stamp), int(can_id, 16), int(length)
+        data = b"".join(b"%02X" % int(cell, 16) for cell in cells[places[-1] + 1 :][:length])
     except (ValueError, IndexError):
         return line
-    width = b"%08X" if cells[2].lower() == b"true" else b"%03X"
+    width = b"%08X" if extended.lower() == b"true" else b"%03X"
     return b"(%d.%06d) %s %s%s%s" % (*divmod(micros, 1_000_000), bus, width % can_id, b"##0" if length > 8 else b"#", data)
 
 

@@ -19,7 +19,18 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, starts_anew
 from emb_daemon.logs.read import Recorded, ids_in, read_log
-from emb_daemon.logs.resample import HEADER, SUBSTITUTES, Series, fill_missing, frames_of, is_received, our_messages, standing
+from emb_daemon.logs.resample import (
+    HEADER,
+    SUBSTITUTES,
+    Series,
+    fill_missing,
+    frames_of,
+    is_received,
+    is_unresolved,
+    our_messages,
+    standing,
+    turns_free,
+)
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
@@ -80,12 +91,14 @@ class Time(Struct, kw_only=True):
     signal: str | None = None
     #: s, ms, us or ns.
     unit: str = "s"
-    #: Of a table without such a column: rows per second.
+    #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
     rate_Hz: Positive | None = None
 
     def __post_init__(self) -> None:
-        if (self.signal is None) == (self.rate_Hz is None):
-            raise ValueError("expected either signal (a column) or rate_Hz (rows per second)")
+        if self.signal is None and self.rate_Hz is None:
+            raise ValueError("expected signal (a column), rate_Hz (rows per second), or both (a column's counts per second)")
+        if self.rate_Hz is not None and self.unit != "s":
+            raise ValueError("unit: counts have none; expected unit or rate_Hz")
         if UNITS.get(self.unit, ("",))[0] != "s":
             raise ValueError(f"unit: expected s, ms, us or ns, found {self.unit!r}")
 
@@ -208,11 +221,15 @@ class Mapping:
         if self.databases and (fault := self._misfit(mapped.bus, mapped.signal)):
             return self._fault(name, f"{mapped.signal}: the rig's DBC contradicts itself: {fault}")
         unit = (stated if mapped.unit is None else mapped.unit).strip()
-        if unit in TRAVELS and ours.unit in ("rad", "rad/s"):
+        if (unit in TRAVELS or UNITS.get(unit, ("",))[0] == "m/s") and ours.unit in ("rad", "rad/s"):
+            if message_name == "VEH_WheelSpeed":
+                what = "the speed of a tyre", "the wheel", "turning", f"{_per_radius(unit)} over the tyre's radius in m"
+            else:
+                what = "a travel", "the motor", "angle", "6.283 over the travel in a turn (a screw's lead)"
             return self._fault(
                 name,
-                f"{mapped.signal} is a travel in {unit}, not the motor's angle; state `unit: {ours.unit}`, and as `scale` the "
-                "radians that the motor turns for one of them: 6.283 over the travel in a turn (a screw's lead)",
+                f"{mapped.signal} is {what[0]} in {unit}, not {what[1]}'s {what[2]}; state `unit: {ours.unit}`, and as "
+                f"`scale` the radians that {what[1]} turns for one of them: {what[3]}",
             )
         try:
             factor, shift = conversion(unit, ours.unit or "")
@@ -289,7 +306,7 @@ class Mapping:
             if name.endswith("_Resolver") and not self._sources(name):
                 if "MotorAngle" not in signals:
                     self._fault(f"{name}.MotorAngle", "missing: of a motor that stands give it a constant `value`, too")
-                elif not any(map(self._sources, self.messages)):
+                elif not self._faults and not any(map(self._sources, self.messages)):
                     self._fault(name, "only constants: expected at least one signal of the rig")
                 else:
                     self.notes.append(f"{self.path}: {name} is constant: the motor stands throughout")
@@ -446,6 +463,14 @@ class Mapping:
         return np.flatnonzero(mine)
 
 
+def _per_radius(unit: str) -> str:
+    """Radians a second of a wheel of one metre of radius, of a speed of its tyre of one, as a number in words."""
+    try:
+        return f"{conversion(unit, 'm/s')[0]:.4g}"
+    except InputError:
+        return "its m/s"
+
+
 def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
     the payload is too short or belongs to other multiplexed signals.
@@ -486,7 +511,9 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
     angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
     if angle is None and isinstance(speed, Series):
         angle = speed.integral()
-    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or not angle.way_is_unknown or starts_anew(angle):
+    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or starts_anew(angle):
+        return []
+    if not is_unresolved(angle, turns_free(corner, messages)):
         return []
     return [
         f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "

@@ -19,7 +19,7 @@ from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError
 from emb_daemon.logs.apart import frames_apart, frames_of
 from emb_daemon.logs.candump import parse_candump
-from emb_daemon.logs.dialects import as_candump
+from emb_daemon.logs.dialects import as_candump, tidied_trace
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
 
@@ -38,6 +38,8 @@ LOG_ENDINGS = (".log", *_PYTHON_CAN)
 _BEGINNINGS = {
     b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
 }  # fmt: skip
+#: How python-can's tables begin; number of bytes shown of a text that does not.
+_CSV, _SHOWN_BYTES = b"timestamp,arbitration_id", 60
 #: Number of ids listed if the expected ones are not in a log.
 _LISTED = 8
 
@@ -134,6 +136,8 @@ def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[
 
 
 def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
+    if reader_name == "TRCReader":
+        content = tidied_trace(content)
     try:
         if reader_name in _APART:
             frames, octets, channels = frames_apart(path, content, reader_name, 2 * _most_bytes())
@@ -144,9 +148,15 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
     except ImportError as error:
         raise needs_extra(path, error) from None
     except Exception as error:
-        hint = "; a table of signals needs --mapping of its columns (without dbc)" if log_ending(path) == ".csv" else ""
+        if reader_name == "CSVReader" and not content.startswith(_CSV):
+            # What its reader says is about columns of its own, which this text has not.
+            begins = content[:_SHOWN_BYTES].decode(errors="replace").splitlines()[:1]
+            raise InputError(
+                f"{path}: begins with {begins}, as no log of frames that is known here does (python-can's CSV, SavvyCAN's, "
+                "PEAK-Converter's); a table of signals needs --mapping of its columns (without dbc)"
+            ) from None
         text = str(error) or type(error).__name__
-        raise InputError(f"{path}: not readable by python-can's {reader_name}: {text}{hint}") from None
+        raise InputError(f"{path}: not readable by python-can's {reader_name}: {text}") from None
     return frames, octets, lambda: channels
 
 

@@ -31,6 +31,9 @@ _SPARSE_CYCLES = 5
 #: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
 #: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
 _LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
+#: Share of the way between two samples that the straight line may miss of a machine without a load: its current tells of
+#: speed and acceleration, and no force of its angle.
+_UNKNOWN_SHARE = 0.1
 #: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Share of values outside our message's range that is too large for faults of an instrument.
@@ -66,7 +69,7 @@ _RATIOS = {
     1e3: "a unit of time or a prefix that is wrong by a thousand",
 }
 #: Least step of the wire's MotorSpeed.
-_STEP_RAD_PER_S = 0.02
+STEP_RAD_PER_S = 0.02
 #: Signals of an E2E protected message that protection fills in.
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
@@ -122,20 +125,37 @@ class Series:
         """Whether a fast motion's way between two samples is unknown."""
         return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
 
-    @cached_property
+    @property
     def way_is_unknown(self) -> bool:
-        """Whether an angle's way between two samples is unknown: sparse samples of a motion that they do not resolve.
+        """Whether an angle's way between two samples is unknown: sparse samples of a motion that they do not resolve."""
+        return self._misses > _UNKNOWN_WAY_RAD
+
+    @property
+    def course_is_unknown(self) -> bool:
+        """The same of a machine without a load."""
+        return self._misses > max(_UNKNOWN_WAY_RAD, _UNKNOWN_SHARE * self._goes)
+
+    @cached_property
+    def _goes(self) -> float:
+        """How far it goes between two samples where it goes furthest."""
+        return float(np.quantile(np.abs(np.diff(self.values)), _RESOLVED_SHARE)) if len(self.values) > 1 else 0.0
+
+    @cached_property
+    def _misses(self) -> float:
+        """How far the straight line between sparse samples misses the way; infinite if they are too few to tell.
 
         Left out, a sample of a smooth motion would be missed by the straight line between its neighbours four times as far as
         the straight line between samples misses the way."""
-        if not self.is_sparse or self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
-            return self.is_sparse
+        if not self.is_sparse:
+            return 0.0
+        if self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
+            return np.inf
         # Samples of a busy computer are not evenly apart.
         share = (self.time_ns[1:-1] - self.time_ns[:-2]) / np.maximum(self.time_ns[2:] - self.time_ns[:-2], 1)
         missed = 0.25 * np.abs(self.values[1:-1] - self.values[:-2] - share * (self.values[2:] - self.values[:-2]))
         # Long standstill does not show how stops are sampled.
         moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
-        return bool(moving.any()) and float(np.quantile(missed[moving], _RESOLVED_SHARE)) > _UNKNOWN_WAY_RAD
+        return float(np.quantile(missed[moving], _RESOLVED_SHARE)) if moving.any() else 0.0
 
     @property
     def is_slow(self) -> bool:
@@ -337,7 +357,8 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     ticks = {}
     for corner in CORNERS:
         if resolver := messages.get(f"EMB_{corner}_Resolver"):
-            ticks[corner] = _clock(next(source for source in resolver.values() if isinstance(source, Series)))
+            angle = next(source for source in resolver.values() if isinstance(source, Series))
+            ticks[corner] = _clock(angle, is_unresolved(angle, turns_free(corner, messages)))
     if not any(len(times) for times, _ in ticks.values()):
         return np.zeros(0, FRAME)
     stretches = _stretches(np.unique(np.concatenate([times for times, _ in ticks.values()])), _SILENT_NS)
@@ -505,16 +526,26 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
 
     The estimator expects noise and takes a speed that repeats to the bit for frozen, but an encoder's speed at rest, or the
     derivative of an angle, is constant for minutes."""
-    return np.where(np.abs(speed) < 0.5 * _STEP_RAD_PER_S, _STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
+    return np.where(np.abs(speed) < 0.5 * STEP_RAD_PER_S, STEP_RAD_PER_S * np.array([0.0, 1.0, 0.0, -1.0])[row % 4], speed)
 
 
-def _clock(angle: Series) -> tuple[np.ndarray, np.ndarray]:
+def turns_free(corner: str, messages: Mapping[str, Signals]) -> bool:
+    """Whether a mapping states a constant load: the machine clamps nothing."""
+    return isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
+
+
+def is_unresolved(angle: Series, free: bool) -> bool:
+    """Whether a motor moves too fast for its samples."""
+    return angle.course_is_unknown if free else angle.way_is_unknown
+
+
+def _clock(angle: Series, unresolved: bool) -> tuple[np.ndarray, np.ndarray]:
     """Times of the resolver samples and the cycle that each belongs to: the rig's own samples if its period is ours or too
     long to fill, a grid of our period otherwise."""
     times = angle.time_ns
     if len(times) < 3:
         return times, np.arange(len(times))
-    if angle.is_ours or angle.way_is_unknown:
+    if angle.is_ours or unresolved:
         steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
         return times, np.concatenate([[0], np.cumsum(steps)])
     return _grid(_stretches(times, _CARRIED_PERIODS * angle.period_ns), CYCLE_NS)

@@ -59,6 +59,8 @@ _LISTED = 20
 #: A value that its line names, as a serial port's text does: ``Time: 5001 Force=3.2 N``; share of the first lines that must
 #: name the same values.
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
+#: A semicolon at the end of a line.
+_ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
 #: Cells that mean that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -92,8 +94,9 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
     seconds = _seconds(path, table, time)
     known = np.isfinite(seconds)
     if len(seconds[known]) and (largest := float(np.max(np.abs(seconds[known])))) > LATEST_S:
-        hint = _other_unit(largest, time)
-        raise InputError(f"{path}: {time.signal}: {largest:g} s are no time; is `time.unit`, {time.unit}, right?{hint}")
+        told = f"`rate_Hz`, {time.rate_Hz:g}," if time.rate_Hz else f"`time.unit`, {time.unit},"
+        hint = "" if time.rate_Hz else _other_unit(largest, time)
+        raise InputError(f"{path}: {time.signal}: {largest:g} s are no time; is {told} right?{hint}")
     columns = {name: values[known] for name, values in columns.items()}
     stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
     return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
@@ -109,7 +112,9 @@ def _seconds(path: Path, table, time) -> np.ndarray:
     if is_clock or np.all(times[known] == np.rint(times[known])):
         times[known] = _going_on(times[known], _CLOCKS_S if is_clock else _COUNTERS)
     # Times of a clock are in seconds already.
-    return times * (1.0 if is_clock else UNITS[time.unit][1])
+    if is_clock:
+        return times
+    return times * UNITS[time.unit][1] if time.rate_Hz is None else times / time.rate_Hz
 
 
 def _going_on(times: np.ndarray, periods: tuple[int, ...]) -> np.ndarray:
@@ -304,7 +309,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     content = _as_utf8(content)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
-    content = _unlabelled(content)
+    content = _unlabelled(_unterminated(content))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
@@ -363,6 +368,13 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
     return table
+
+
+def _unterminated(content: bytes) -> bytes:
+    """Rows without the semicolon that ends each of a matrix as MATLAB writes it, if another separator parts their cells."""
+    lines = [line.rstrip() for line in content.split(b"\n", _PREAMBLE)[:_PREAMBLE] if line.strip()]
+    ended = sum(line.endswith(b";") and line.count(b";") == 1 and any(mark in line for mark in b",\t ") for line in lines)
+    return _ENDED.sub(b"", content) if ended > 0.5 * len(lines) else content
 
 
 def _parts(lines: list[str], delimiter: str) -> bool:
