@@ -33,7 +33,7 @@ _ANGLE_MARGIN = 0.5
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: A motor stands below this speed; offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations
 #: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
-_STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
+STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
 #: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
@@ -51,8 +51,6 @@ _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
 #: Friction state from which the motor slides; share of the clearance that must be passed; share of the largest force's torque
 #: that counts as none, because a clamped brake would have gained more over that travel.
 _SLIDING, _PASSED, _FREE = 0.9, 0.3, 0.02
-#: Angle by which a motor that is on its way has turned since the start, rad: three counts of a resolver of 12 bit.
-_MOVES_RAD = 0.005
 #: Force at power-on, as a share of the largest, from which the brake counts as clamped.
 _CLAMPED = 0.1
 
@@ -100,7 +98,7 @@ def _drift(s, m, slip, turned):
     s.strayed += slip
     s.turned += turned
     s.turned_s += m.dt
-    if max(abs(m.speed), abs(s.speed)) > _STANDING_RAD_PER_S:
+    if max(abs(m.speed), abs(s.speed)) > STANDING_RAD_PER_S:
         s.drifted = s.stood_s = 0.0
     else:
         s.drifted += slip
@@ -164,11 +162,9 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
     elif not s.seen:
-        # At a request the brake may be clamped, which friction may hold without torque, or on its way, from where nobody
-        # knows. Frames at a reduced rate tell nothing of it, and such logs begin with an open brake.
+        # At a request the brake may be clamped, which friction may hold without torque, or on its way. Frames at a reduced
+        # rate tell nothing of it, and such logs begin with an open brake.
         open_yet = m.has_status and m.park_brake == 0.0 and m.dt > ONE_CYCLE_S
-        if not released and abs(m.angle - s.start_angle) > _MOVES_RAD:
-            s.start_angle = np.inf
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
 

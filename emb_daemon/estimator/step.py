@@ -10,7 +10,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
+from emb_daemon.estimator.contact import SPEED_MARGIN, STANDING_RAD_PER_S, follow_zero, seek_release, watch_contact
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
@@ -71,7 +71,9 @@ def _start(s, p, m):
         set_priors(s.covariance, p)
         if p.clearance_sigma == 0.0:
             s.covariance[SCALE, SCALE] = 0.0
-    s.start_angle = s.gear_zero = m.angle
+    s.gear_zero = m.angle
+    # A motor that turns already comes from where nobody knows.
+    s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
