@@ -81,3 +81,8 @@ def stops(p, count: int, seed: int = 1, dt: float = 0.004) -> np.ndarray:
         held = top - rng.uniform(0.5, 2.0) * (1.0 - np.cos(2.0 * np.pi * np.arange(round(1.0 / dt)) * dt / 0.5))
         parts += [np.zeros(round(1.4 / dt)), top * rise, held, top * (1.0 - rise)]
     return np.concatenate(parts)
+
+
+def lose_counts(rows: np.ndarray, share: float) -> None:
+    """SAMPLE rows in which a ``share`` of the way is not counted while the motor closes, in place."""
+    rows["angle"] -= share * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))

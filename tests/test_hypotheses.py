@@ -8,6 +8,7 @@ import naive
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     CERTAIN_ODDS,
@@ -834,6 +835,10 @@ def test_a_contact_angle_that_moved_is_expected_to_move_again(p, opened):
     assert s["contact_walk"] == pytest.approx(1.0 / 10.0, rel=0.1)
     for _ in range(10):
         touch(0.0)
+    assert s["contact_walk"] < 0.001
+    # One that is counted from another released position has not moved.
+    place_contact(s, p, 5.0)
+    touch(0.0)
     assert s["contact_walk"] < 0.001
 
 

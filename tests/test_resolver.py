@@ -1,5 +1,6 @@
 """A resolver whose angle is not the motor's: its zero jumps, drifts or stays behind; and what must not be taken for that."""
 
+import brake
 import city
 import numpy as np
 import pytest
@@ -52,21 +53,16 @@ def test_a_zero_that_drifts_while_the_motor_stands_is_found_and_the_torque_goes_
     assert np.all(error < 4.0 * np.hypot(estimates["sigma"], 25.0))
 
 
-def _lose_counts(samples, share):
-    """A ``share`` of the way is not counted while the motor closes."""
-    samples["angle"] -= share * np.cumsum(np.maximum(np.diff(samples["angle"], prepend=samples["angle"][0]), 0.0))
-
-
 @pytest.mark.parametrize("share", [0.03, 0.05])
 def test_counts_that_are_lost_on_the_way_show_when_the_motor_stands(share):
     """Some hundredths of a radian in each sample are no jump; those of a stroke are tens of micrometres at the pads."""
-    estimates, force = city.changed(lambda samples: _lose_counts(samples, share))
+    estimates, force = city.changed(lambda samples: brake.lose_counts(samples, share))
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < city.BEFORE_RELEASE, "in the first hold"
     assert np.all(estimates["source"][told[0] + 1 :] == r.TORQUE_ONLY)
     assert estimates["reasons"][told[0]] & r.STUCK and estimates["reasons"][told[0]] & r.PATHS_DISAGREE
     good, _ = city.changed()
-    strayed = city.changed(lambda samples: _lose_counts(samples, share))[0]["contact_angle"] - good["contact_angle"]
+    strayed = city.changed(lambda samples: brake.lose_counts(samples, share))[0]["contact_angle"] - good["contact_angle"]
     assert np.abs(strayed[told[0] + 1]) > 0.1, "the contact angle follows the angle that is missing"
     error = np.abs(estimates["force"] - force)[told[0] :]
     assert np.all(error < 4.0 * np.hypot(estimates["sigma"][told[0] :], 25.0))

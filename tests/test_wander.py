@@ -94,10 +94,7 @@ def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, rad_per_s, see
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
-    def lose(rows):
-        rows["angle"] -= 0.005 * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))
-
-    estimates, force = _estimated(p, lose, seed)
+    estimates, force = _estimated(p, lambda rows: brake.lose_counts(rows, 0.005), seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < 60 / _DT
     assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
@@ -106,11 +103,7 @@ def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_is_lost_before_it_is_certain_is_covered(p, seed):
     """The contact angle walks as far as counts that are probably lost would take it."""
-
-    def lose(rows):
-        rows["angle"] -= 0.004 * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))
-
-    estimates, force = _estimated(p, lose, seed)
+    estimates, force = _estimated(p, lambda rows: brake.lose_counts(rows, 0.004), seed)
     assert np.mean(_beyond(estimates, force)) < 0.01
 
 

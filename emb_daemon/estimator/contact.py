@@ -23,6 +23,7 @@ from emb_daemon.models.contact import (
 from emb_daemon.models.fusion import CONTACT, GAIN, OFFSET, STATES
 from emb_daemon.models.gear import steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
+from emb_daemon.models.wander import STANDING_RAD_PER_S
 
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
 #: what a contact angle jumps by at once), is no motion.
@@ -31,9 +32,9 @@ _ANGLE_MARGIN = 0.5
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 60 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
-#: A motor stands below this speed; offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations
-#: of its noise; and time after which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
-STANDING_RAD_PER_S, _SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 3.0, 0.02, 6.0, 60.0
+#: Offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations of its noise; and time after
+#: which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
+_SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 0.02, 6.0, 60.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
 #: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
@@ -202,6 +203,7 @@ def place_contact(s: Record, p: Record, released: float) -> None:
     else:
         rest(s, p, x, s.factor * s.scale)
     s.contact_angle, s.contact_anchor = angle, released + p.clearance
+    s.contact_age_s = 0.0
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
     s.covariance[CONTACT, CONTACT] = sigma * sigma
@@ -300,5 +302,6 @@ def _start_contact(s, p, m, force, sigma, leverage):
     own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
     s.covariance[CONTACT, CONTACT] = own + misread * misread * s.covariance[OFFSET, OFFSET]
     s.contact_anchor = s.contact_angle
+    s.contact_age_s = 0.0
     start_anew(s.contact)
     open_again(s, p)

@@ -130,7 +130,7 @@ STATE = np.dtype(
         *fields("f8", "common pads_odds rotor_odds unit_odds"),
         # Offset of the torque when the pads last touched (N m), for how long ago (s; 0: never), and what it walks, N2 m2/s.
         *fields("f8", "offset_before offset_age_s offset_walk"),
-        # The same of the contact angle beside its anchor, rad and rad2/s, and its variance then, rad2.
+        # The same of the contact angle beside its anchor, as long as that stays, rad and rad2/s, and its variance then, rad2.
         *fields("f8", "contact_before contact_known contact_age_s contact_walk"),
         ("sensitivity", "f8", (2, STATES)),
         # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)

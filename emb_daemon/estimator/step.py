@@ -10,7 +10,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.contact import SPEED_MARGIN, STANDING_RAD_PER_S, follow_zero, seek_release, watch_contact
+from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
@@ -43,7 +43,7 @@ from emb_daemon.models.lateness import follow, interrupt
 from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.torque import torque_balance
-from emb_daemon.models.wander import leave_stretch, watch_wander
+from emb_daemon.models.wander import STANDING_RAD_PER_S, leave_stretch, watch_wander
 from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
