@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import TOLERANCE, Model
+from emb_daemon.diagnose.model import LITTLE, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -52,8 +52,8 @@ _NOT_HELD = "fitted with everything else it no longer holds"
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
 _FITTED = 4
-#: Fits after another that such a term is given, and share of the mean square from which another gains nothing.
-_FITS, _LITTLE = 8, 0.98
+#: Fits after another that such a term is given.
+_FITS = 8
 #: Further shapes of one place that are fitted beside the first.
 _SHAPES = 3
 #: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
@@ -393,7 +393,7 @@ def _arrived(model: Model, channel: str) -> Model:
     """Fitted until nothing is gained: from far away one fit does not arrive."""
     for _ in range(_FITS):
         before, model = model.noise(channel), model.refined({channel})
-        if model.noise(channel) > _LITTLE * before:
+        if model.noise(channel) > LITTLE * before:
             break
     return model
 

@@ -21,7 +21,7 @@ TOLERANCE, _EVALUATIONS = 2e-3, 8
 #: Heat and force that rest on each other are fitted in turn so often at most, until a turn leaves this share of the force's
 #: mean square, and of the temperatures' or these are right within the standard deviation of a thermocouple (IEC 60584, class
 #: 1), K.
-_TURNS, _RIGHT_K, _LITTLE = 5, 0.75, 0.98
+_TURNS, _RIGHT_K, LITTLE = 5, 0.75, 0.98
 
 
 def rms_known(residual: np.ndarray) -> float:
@@ -134,8 +134,8 @@ class Model:
         for _ in range(_TURNS):
             before, model = model, model.refined(in_turn)
             left, was = (m.noise(CHANNEL_OF_HEAT) for m in (model, before))
-            right = left < _RIGHT_K**2 or _LITTLE * was < left <= was
-            if right and model.noise("stiffness") > _LITTLE * before.noise("stiffness"):
+            right = left < _RIGHT_K**2 or LITTLE * was < left <= was
+            if right and model.noise("stiffness") > LITTLE * before.noise("stiffness"):
                 break
         return model.refined(channels - in_turn)
 
