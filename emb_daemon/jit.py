@@ -11,6 +11,7 @@ import functools
 import importlib.util
 import os
 from collections.abc import Callable
+from math import sqrt
 from pathlib import Path
 from typing import TypeAlias
 
@@ -22,7 +23,7 @@ from emb_daemon.ahead.signature import Array, Entry, Function, Kind, name_in_c
 
 __all__ = [
     "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Integer", "Record", "Records", "compile_beside",
-    "compiled_for_the_next_start", "depend_on", "entry", "fields", "njit",
+    "compiled_for_the_next_start", "depend_on", "entry", "fields", "hypot", "njit", "sq",
 ]  # fmt: skip
 
 # What annotations of kernels name. The fields of a `Record` are those of the numpy dtype that the argument's name or the
@@ -103,3 +104,15 @@ def entry(*takes: Kind, returns: int = 0) -> Callable[[Function], Function]:
 def fields(kind: str, names: str) -> list[tuple[str, str]]:
     """Fields of a record for compiled code: all of one ``kind`` (``f8``, ``i8``, ``?``), names separated by blanks."""
     return [(name, kind) for name in names.split()]
+
+
+@njit
+def sq(value: float) -> float:
+    """Product with itself: where Python raises to a power, the last bit is another now and then."""
+    return value * value
+
+
+@njit
+def hypot(a: float, b: float) -> float:
+    """Square root of the sum of squares, to the same bit as plain Python: that of `math` is not the C library's."""
+    return sqrt(sq(a) + sq(b))

@@ -7,19 +7,20 @@ from scipy.signal import lfilter
 from emb_daemon.estimator.records import SAMPLE
 
 
-def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.0) -> tuple[np.ndarray, np.ndarray]:
+def samples(
+    p, angle, dt: float = 0.004, friction=None, temperature: float = 20.0, creep=(0.0, 1.0)
+) -> tuple[np.ndarray, np.ndarray]:
     """SAMPLE rows of a motor that follows ``angle`` (rad past the released position), and the clamp force (N).
 
     The current is what the torque balance asks for, with friction that turns over within the presliding angle, or with the
-    share ``friction`` of full friction at each sample.
+    share ``friction`` of full friction at each sample. ``creep``: share of the force that lags, and its time constant, s.
     """
     angle = np.asarray(angle, float)
     speed = np.gradient(angle, dt)
     travel = np.maximum(angle - p["clearance"], 0.0)
     static = np.polynomial.Polynomial([0.0, *p["curve"]])(travel)
-    # The lag is linear and the step constant: its answers to single ones are its coefficients.
-    kept, before, now = (naive.first_order_lag(*ones, dt, p["relaxation_time"]) for ones in np.eye(3))
-    force = lfilter([now, before], [1.0, -kept], static)
+    share, seconds = creep
+    force = _lagged(np.maximum(static + share * (_lagged(static, dt, seconds) - static), 0.0), dt, p["relaxation_time"])
     mean = 0.5 * (force + np.concatenate([force[:1], force[:-1]]))
     s = _friction_means(np.diff(angle, prepend=angle[:1]) / p["presliding_angle"]) if friction is None else friction
     acceleration = np.diff(speed, prepend=speed[0]) / dt
@@ -33,6 +34,12 @@ def samples(p, angle, dt: float = 0.004, friction=None, temperature: float = 20.
     for name in ("has_current", "has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
         rows[name] = True
     return rows, force
+
+
+def _lagged(values, dt, time_constant):
+    # The lag is linear and the step constant: its answers to single ones are its coefficients.
+    kept, before, now = (naive.first_order_lag(*ones, dt, time_constant) for ones in np.eye(3))
+    return lfilter([now, before], [1.0, -kept], values)
 
 
 def _friction_means(ratio: np.ndarray) -> np.ndarray:
@@ -69,16 +76,15 @@ def noisy(rows: np.ndarray, p, seed: int = 1) -> np.ndarray:
     return rows
 
 
-def stops(p, count: int, seed: int = 1, dt: float = 0.004) -> np.ndarray:
-    """Angles of ``count`` stops of ordinary driving, three seconds each: a standstill in the clearance, an application of
-    0.3 s to
-    10 to 20 rad past contact, half a second of holding with reversals, the release."""
+def stops(p, count: int, seed: int = 1, dt: float = 0.004, held_s: float = 1.0) -> np.ndarray:
+    """Angles of ``count`` stops of ordinary driving: 1.4 s of standstill in the clearance, an application of 0.3 s to 10 to
+    20 rad past contact, ``held_s`` seconds of holding with two reversals, the release."""
     rng = np.random.default_rng(seed)
-    parts, time = [], np.arange(round(0.3 / dt)) * dt / 0.3
+    parts, time, held_time = [], np.arange(round(0.3 / dt)) * dt / 0.3, np.arange(round(held_s / dt)) * dt / held_s
     rise = 0.5 * (1.0 - np.cos(np.pi * time))
     for _ in range(count):
         top = p["clearance"] + rng.uniform(10.0, 20.0)
-        held = top - rng.uniform(0.5, 2.0) * (1.0 - np.cos(2.0 * np.pi * np.arange(round(1.0 / dt)) * dt / 0.5))
+        held = top - rng.uniform(0.5, 2.0) * (1.0 - np.cos(4.0 * np.pi * held_time))
         parts += [np.zeros(round(1.4 / dt)), top * rise, held, top * (1.0 - rise)]
     return np.concatenate(parts)
 

@@ -64,7 +64,7 @@ def _sensitivities(p, force, slope, speed, accelerating, motor_torque, friction_
     """Sensitivity of force and of the torque left unexplained, as `fuse` forms them."""
     to_f, to_t = np.zeros(STATES), np.zeros(STATES)
     leverage = p["gear_gain"] + p["load_friction"] * friction_mean
-    to_force(to_f, p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
+    to_force(to_f, new_state()[0], p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
     to_t[:] = to_f
     slow = friction_mean * np.exp(-abs(speed) / 10.0)
     to_torque(to_t, leverage, 1.0, friction_mean, force, speed, slow, accelerating, motor_torque, *heats)
@@ -206,8 +206,9 @@ def test_sigma_grows_while_the_torque_path_is_missing(parameters):
     turning = slice(520, None)
     assert np.array_equal(without["sigma"][:500], with_torque["sigma"][:500])
     assert np.all(without["stiffness_sigma"][turning] > with_torque["stiffness_sigma"][turning])
-    same_place = without["sigma"][500::126]
-    assert np.all(np.diff(same_place[:4]) > 0.0)
+    # Which share of the force the pads still have to gain falls in the first turns; nothing falls without the torque alone.
+    same_place = (without["sigma"] / with_torque["sigma"])[500::126]
+    assert np.all(same_place[1:] > same_place[0]) and same_place[0] > 1.0
 
 
 def test_friction_energy_leaves_the_contact_angle_open(parameters):

@@ -131,6 +131,15 @@ def test_force_controller_brings_the_true_force(bare, force):
     assert abs(car.states[0]["speed"]) < 0.05
 
 
+def test_pads_that_gave_way_let_go_and_do_not_pull(calibration):
+    """What pads lose while they are held is missing when they are released."""
+    effects = {name: {} for name in calibration.effects} | {"clamp_creep": {"share": -0.1, "time_constant_s": 5.0}}
+    plant = plant_from_calibration(calibration, effects=effects)
+    schedule = scenarios.rig_stop(8000.0, 0.0, 5.0, 6.0)
+    _, truth = scenarios.simulate_log(plant, schedule, seed=1)
+    assert truth["force"].max() > 7000.0 and truth["force"].min() >= 0.0
+
+
 def test_motor_work_becomes_motion_friction_and_clamping(bare):
     car = Car(np.atleast_1d(bare))
     schedule = scenarios.random_angle(bare, 5.0, np.random.default_rng(0))

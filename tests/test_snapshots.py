@@ -189,9 +189,9 @@ def test_a_restart_goes_on_with_the_first_sample(driven, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("clearance", 90.0), ("clearance_sigma", -1.0), ("scale", 10.0), ("growth", 1.0), ("disc", 5000.0), ("winding", 9.0),
-     ("history", 1e9), ("temperature_sigma", None),
-     ("history_sigma", -1.0), ("error", [9e9] * 14), ("covariance", [[1.0] * 13 + [2.0]] * 14)],
+    [("clearance", 90.0), ("clearance_sigma", -1.0), ("scale", 10.0), ("creep", [0.0, 0.6]), ("growth", 1.0), ("disc", 5000.0),
+     ("winding", 9.0), ("history", 1e9), ("temperature_sigma", None),
+     ("history_sigma", -1.0), ("error", [9e9] * 16), ("covariance", [[1.0] * 15 + [2.0]] * 16)],
 )  # fmt: skip
 def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name, value):
     """The checksum is right, the values are not."""

@@ -5,8 +5,6 @@ Training is requested once per application of the park brake. Motion without a r
 too. The controller may then raise BrakeRequest for this motion, so BrakeRequest ends only a requested training.
 """
 
-from math import hypot
-
 import numpy as np
 
 from emb_daemon.adapt import records as r
@@ -17,8 +15,8 @@ from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.unknown import contact_jump
-from emb_daemon.jit import Array, Record, Records, entry, njit
-from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, GROWTH, HOUSING, INERTIA, OFFSET, SCALE
+from emb_daemon.jit import Array, Record, Records, entry, hypot, njit, sq
+from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OF_THE_MODEL, OFFSET, SCALE
 from emb_daemon.wire import contract as e
 
 #: Wheel speed up to which a wheel counts as standing, rad/s: some 3 cm/s at the rim.
@@ -162,7 +160,7 @@ def _reset_fitted(x, P):
     other than those of motor and current sensor. Variances stay, except that of FAST, which becomes the stationary one."""
     for i in range(len(x)):
         if i not in _OF_THE_MOTOR:
-            if i not in (CONTACT, SCALE, GROWTH):
+            if i not in OF_THE_MODEL:
                 x[i] = 0.0
             for j in range(len(x)):
                 if i != j:
@@ -183,7 +181,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
         kept = kept and learned.curve[i] == p.curve[i]
-    weight = known / (known + a.contact_sigma**2) if kept else 1.0
+    weight = known / (known + sq(a.contact_sigma)) if kept else 1.0
     scale = s.scale if kept else 1.0
     apart = s.contact_angle + weight * moved - reached.contact_angle
     reached.contact_angle += apart
@@ -192,24 +190,26 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
         unexplained_step(reached, learned, rows[i])
     s.contact_angle, s.past_contact = reached.contact_angle, reached.past_contact
     s.drive, s.drive_slope, s.force, s.slope = reached.drive, reached.drive_slope, reached.force, reached.slope
+    for i in range(len(s.held)):
+        s.held[i] = reached.held[i]
     s.friction_state, s.friction_variance, s.slid_angle = reached.friction_state, reached.friction_variance, reached.slid_angle
     s.effects = reached.effects
     _reset_fitted(s.error, s.covariance)
-    s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else a.contact_sigma**2
+    s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else sq(a.contact_sigma)
     if not kept:
         # A new curve depends on the torque constant and the inertia of the stroke.
         faded = s.error[FADE] * s.winding + s.error[HOUSING] * s.housing
         _replace(s, GAIN, -a.torque_error - faded, a.torque_error_sigma)
         _replace(s, INERTIA, a.inertia_error, a.inertia_sigma)
         # Driving may still correct what the stroke left uncertain of the new curve.
-        s.covariance[SCALE, SCALE] = learned.stiffness_relative_sigma**2
+        s.covariance[SCALE, SCALE] = sq(learned.stiffness_relative_sigma)
     s.scale = scale
     s.contact.confirmed, s.contact.lost = True, False
     drift = s.alternatives[DRIFT]
     if kept:
         _reset_fitted(drift.error, drift.covariance)
         known = drift.covariance[CONTACT, CONTACT]
-        share = known / (known + a.contact_sigma**2)
+        share = known / (known + sq(a.contact_sigma))
         drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - weight * moved
         drift.covariance[CONTACT, CONTACT] = (1.0 - share) * known
         open_changes(s, learned)

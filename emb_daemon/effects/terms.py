@@ -5,11 +5,11 @@ makes them; `Calibration.terms` contains them, checked when the file is loaded. 
 kernel is not called.
 """
 
-from math import cos, exp, hypot, sin, sqrt
+from math import cos, exp, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, fields, njit
+from emb_daemon.jit import Record, fields, hypot, njit, sq
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Largest number of terms in a calibration.
@@ -239,9 +239,9 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:
-                of_force += (sigma * _of_force(q.port, s)) ** 2
+                of_force += sq(sigma * _of_force(q.port, s))
             else:
-                of_torque += (sigma * _of_torque(q.port, s, p, m)) ** 2
+                of_torque += sq(sigma * _of_torque(q.port, s, p, m))
     t.sigma, t.torque_sigma = sqrt(of_force), sqrt(of_torque)
 
 

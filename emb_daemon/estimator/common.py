@@ -12,7 +12,7 @@ from math import exp, sqrt
 
 from emb_daemon.estimator.hypotheses import PRIOR_ODDS
 from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
 
 #: Inertia of another unit of one drawing; torque constant of magnets that have lost strength or of a wrong current sensor,
@@ -55,7 +55,7 @@ def common_variance(
             odds, gain_sigma = unit_odds, GAIN_JUMP
         a = 1.0 / (stiffness_variance + _PADS_SIGMA[pads] * _PADS_SIGMA[pads])
         b = 1.0 / (gain_sigma * gain_sigma)
-        c = 1.0 / (inertia_variance + (_ANOTHER_ROTOR if rotor else INERTIA_SIGMA) ** 2)
+        c = 1.0 / (inertia_variance + sq(_ANOTHER_ROTOR if rotor else INERTIA_SIGMA))
         information = a + b + c
         mean = -(a * stiffness + b * gain + c * inertia) / information
         cost = a * stiffness * stiffness + b * gain * gain + c * inertia * inertia - information * mean * mean
@@ -87,7 +87,7 @@ def forget_common(s: Record) -> None:
 def weigh_common(s: Record, p: Record) -> None:
     """Take in what the first hypothesis believes now."""
     stiffness, gain, inertia = s.scale - 1.0, s.error[GAIN], s.error[INERTIA]
-    own = s.covariance[SCALE, SCALE] + max(p.stiffness_relative_sigma, _LEAST) ** 2
+    own = s.covariance[SCALE, SCALE] + sq(max(p.stiffness_relative_sigma, _LEAST))
     rotor_variance = s.covariance[INERTIA, INERTIA]
     _, pads, rotor, unit = common_variance(stiffness, gain, inertia, own, rotor_variance, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS)
     s.pads_odds = max(min(s.pads_odds, pads), exp(PRIOR_ODDS))

@@ -10,7 +10,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, njit, sq
 
 #: Horizons over which the innovation is smoothed, s, and time over which its square is averaged, s.
 HORIZONS_S = (0.05, 0.2, 1.0)
@@ -47,7 +47,7 @@ def remember(c: Record, innovation: float, sigma: float, dt: float) -> None:
     for i in range(HORIZONS):
         share = 1.0 - exp(-dt / HORIZONS_S[i])
         c.mean[i] += share * (innovation - c.mean[i])
-        c.variance[i] = (1.0 - share) ** 2 * c.variance[i] + share * share * sigma * sigma
+        c.variance[i] = sq(1.0 - share) * c.variance[i] + share * share * sigma * sigma
         slow = 1.0 - exp(-dt / min(_AVERAGED_S[i], max(c.seen_s, dt)))
         c.square[i] += slow * (min(c.mean[i] * c.mean[i], _COUNTED * c.variance[i]) - c.square[i])
         c.expected[i] += slow * (c.variance[i] - c.expected[i])

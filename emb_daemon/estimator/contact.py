@@ -1,13 +1,13 @@
 """The contact angle of one corner: a resolver that lost its zero, and torque that contradicts the believed angle."""
 
-from math import hypot, sqrt
+from math import sqrt
 
 import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, turned
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.contact import (
     NOTHING,
     TOO_EARLY,
@@ -276,7 +276,7 @@ def _start_clamped(s, p, m, torque, sigma, leverage):
     friction = (p.offset_friction + p.load_friction * force * s.gear_slope) * sqrt(s.friction_variance)
     # With the released position the gear's slope is unknown, too.
     least, most = steepest(p.gear)
-    s.covariance[GAIN, GAIN] += (0.5 * (most / least - 1.0)) ** 2
+    s.covariance[GAIN, GAIN] += sq(0.5 * (most / least - 1.0))
     forget_level(s.contact)
     s.contact.engaged = True
     _start_contact(s, p, m, force, (sigma + friction) / leverage, leverage)
@@ -299,7 +299,7 @@ def _start_contact(s, p, m, force, sigma, leverage):
     misread = 1.0 / (leverage * slope)
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = misread * s.covariance[OFFSET, i]
-    own = (sigma / slope) ** 2 + lag * lag + _KNOWN_RAD * _KNOWN_RAD
+    own = sq(sigma / slope) + lag * lag + _KNOWN_RAD * _KNOWN_RAD
     s.covariance[CONTACT, CONTACT] = own + misread * misread * s.covariance[OFFSET, OFFSET]
     s.contact_anchor = s.contact_angle
     s.contact_age_s = 0.0

@@ -9,7 +9,7 @@ The sensor itself may be faulty. Its evidence for or against a change of the bra
 that agrees with the torque explains its values, it is not used until it has followed the force again.
 """
 
-from math import hypot, inf, log, sqrt
+from math import inf, log, sqrt
 
 import numpy as np
 
@@ -29,8 +29,8 @@ from emb_daemon.estimator.hypotheses import (
 )
 from emb_daemon.estimator.uneven import applied
 from emb_daemon.estimator.unknown import add_stiffness_jumps
-from emb_daemon.jit import Floats, Record, fields, njit
-from emb_daemon.models.fusion import CONTACT, FAST, GROWTH, SCALE, maximum_likelihood, update_errors, variance_along
+from emb_daemon.jit import Floats, Record, fields, hypot, njit, sq
+from emb_daemon.models.fusion import CONTACT, FAST, GROWTH, OF_THE_MODEL, maximum_likelihood, update_errors, variance_along
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.models.stiffness import characteristic_curve
 
@@ -58,8 +58,6 @@ _BACK, _CLEAR_S, _LEFT = 0.3, 0.5, 0.1
 #: Least share of the force that is due to the pads' deformation: after they have opened the rest is relaxation, which does not
 #: depend on contact angle and stiffness.
 _HELD = 0.5
-#: States that determine the force and are constant over a stroke.
-_SLOW = (CONTACT, SCALE, GROWTH)
 #: Distance below the limit, in standard deviations of the noise, within which a value may be saturated.
 _SURELY = 3.0
 #: Part of a cycle by which the sensor's value and the angle may be apart in time, as of the current (`fuse._LATE`).
@@ -88,7 +86,7 @@ def _common(s, p, m, force, force_before):
     c, q = s.sensor, p.sensor
     warmed = q.per_kelvin * (m.caliper - c.zeroed) if m.has_thermocouple else 0.0
     late = _LATE * (s.force - force_before)
-    return sqrt(c.variance + warmed * warmed + late * late + (q.gain * force) ** 2)
+    return sqrt(c.variance + warmed * warmed + late * late + sq(q.gain * force))
 
 
 @njit
@@ -131,9 +129,9 @@ def _learn(x, P, gain, h, off, noise, common):
     """One hypothesis takes what the sensor says: ``off`` N over its force, with ``noise`` and ``common`` as standard
     deviations. Returns (variance of ``off``, share of what it did not know that the sensor told it)."""
     known, slow, along = variance_along(P, h, gain), 0.0, 0.0
-    for i in _SLOW:
+    for i in OF_THE_MODEL:
         along += h[i] * gain[i]
-        for j in _SLOW:
+        for j in OF_THE_MODEL:
             slow += h[i] * P[i, j] * h[j]
     total = known + noise * noise + common * common
     excess = slow - common * common
@@ -167,7 +165,7 @@ def _take(s, p, m, h, spread, warmth, noise, common):
     """What each hypothesis learns of one value; returns the square of what the best of those that stand leaves, normalised."""
     c = s.sensor
     value = m.sensor_force - c.offset - applied(s.uneven)
-    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(h, s, spread, s.slope, s.force, warmth)
     first = value - s.force - spread * s.error[FAST]
     variance, news = 0.0, 0.0
     if c.wrong:
@@ -180,7 +178,7 @@ def _take(s, p, m, h, spread, warmth, noise, common):
         a = s.alternatives[kind]
         if not exists(a):
             continue
-        to_force(h, spread, a.slope, s.force + a.shift, warmth)
+        to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         second = value - s.force - a.shift - spread * a.error[FAST]
         if c.wrong:
             variance_a = variance_along(a.covariance, h, s.gain) + noise * noise + common * common

@@ -1,6 +1,6 @@
 """Fusion of both paths: the filter over their errors, and the choice of a path where they contradict each other."""
 
-from math import exp, hypot, sqrt
+from math import exp, sqrt
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from emb_daemon.estimator.hypotheses import (
     unproven,
     weigh,
 )
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S
+from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, crept
 from emb_daemon.estimator.status import (
     ANGLE_LATE,
     CONTACT_LOST,
@@ -56,11 +56,12 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
     torque_offset,
 )
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
+    CREEPS,
     FADE,
     FAST,
     GAIN,
@@ -156,8 +157,8 @@ def _spread(s, p, m):
 def _wandered(s, p, m):
     """Variance (rad²) that the contact angle gains with this sample from a resolver whose zero wanders."""
     w = s.wander
-    drifted = (_UNSURE * w.rate) ** 2 * _LASTS_S * m.dt
-    lost = (_UNSURE * w.loss) ** 2 * _STROKE_S * p.maximum_speed * abs(m.angle - s.angle)
+    drifted = sq(_UNSURE * w.rate) * _LASTS_S * m.dt
+    lost = sq(_UNSURE * w.loss) * _STROKE_S * p.maximum_speed * abs(m.angle - s.angle)
     variance = s.gear_slope * s.gear_slope * (drifted + lost + w.unseen * w.unseen)
     w.unseen = 0.0
     return variance
@@ -183,6 +184,8 @@ def _predict(s, p, m, spread, warmth, known):
     s.softening = softening
     if known:
         walked[CONTACT] = walked[SCALE] = 0.0
+        for i in CREEPS:
+            walked[i] = 0.0
     predict_errors(s.error, s.covariance, decay, noise_decay, noise, walked)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
@@ -194,7 +197,7 @@ def _predict(s, p, m, spread, warmth, known):
         place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
         lag_error = p.relaxation_time * s.slope * s.gear_slope * (m.speed - (m.angle - s.angle) / m.dt)
-        s.covariance[FAST, FAST] += (lag_error / spread) ** 2
+        s.covariance[FAST, FAST] += sq(lag_error / spread)
     share = p.torque_constant * m.current_q / ((p.gear_gain + p.load_friction) * p.maximum_force)
     for_ever = share * share if m.has_current else s.housing
     s.winding += (1.0 - exp(-m.dt / WINDING_S)) * (for_ever - s.winding)
@@ -227,10 +230,10 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     out.torque_sigma = sqrt(white) / leverage
     # At standstill the errors of the friction state, and of a term outside its range, are constant, so that many samples
     # contain no more information than one. So is an error that no model explains, for some stops.
-    white += ((friction_torque * s.friction_variance) ** 2 + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
+    white += (sq(friction_torque * s.friction_variance) + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
     white += lasting * lasting * _LASTS_S / m.dt
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
-    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(h, s, spread, s.slope, s.force, warmth)
     slope = s.gear_slope
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
@@ -245,7 +248,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         a = s.alternatives[kind]
         if not exists(a):
             continue
-        to_force(h, spread, a.slope, s.force + a.shift, warmth)
+        to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         taken = needed + leverage * a.shift
         to_torque(h, leverage, slope, s_mean, load + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
@@ -276,7 +279,7 @@ def fuse(
     uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     if p.sensor.limit > 0.0 and not known:
         hear_sensor(s, p, m, h, spread, warmth, force_before)
-    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(h, s, spread, s.slope, s.force, warmth)
     out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
     out.innovation = out.innovation_sigma = np.nan
     out.torque_sigma = turning_sigma = standing_sigma = np.inf
@@ -319,6 +322,9 @@ def fuse(
         strays = abs(s.wander.rate) * _LASTS_S + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * strays)
         out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
+        if s.past_contact <= 0.0:
+            # Whether pads that are apart still push with what they creep was never seen.
+            out.sigma = hypot(out.sigma, crept(s, 0.0))
     # Not max(), which may return the number if the other is NaN, so that a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0

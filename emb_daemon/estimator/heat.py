@@ -1,6 +1,6 @@
 """Heat of one corner's pads and disc from sample to sample: what heats them, and what the estimate tells of them."""
 
-from math import exp, hypot
+from math import exp
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from emb_daemon.effects.terms import unsure_heat
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models import thermal
 from emb_daemon.models.thermal import NODES, at_depth, disc_loss, friction_power, heat_step, mean_temperature, stiffness_factor
 from emb_daemon.models.wheel import TURNING_RAD_PER_S

@@ -2,10 +2,11 @@
 
 Each is a Kalman filter over the errors of both paths. The first keeps what it learned and drifts only slowly. The others are
 copies of the first, to whose covariance the possible jumps of the stiffness path or of the torque path (`unknown`) are added
-at every release and from time to time; the likeliest of the jumps opened before; and a brake whose disc grows with heat, which
-shows slowly and is opened once. All explain the same torque; the ratios of their likelihoods (Magill, Optimal adaptive
-estimation of sampled stochastic processes, IEEE Trans. Automatic Control 10, 1965) say which holds, and the fused force is
-their mixture, so that an unproven change already counts in its standard deviation. A proven one becomes the first hypothesis.
+at every release and from time to time; the likeliest of the jumps opened before; and a brake whose disc grows with heat or
+whose pads creep otherwise than the calibration knows, which shows slowly and is opened once. All explain the same torque; the
+ratios of their likelihoods (Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Trans. Automatic Control
+10, 1965) say which holds, and the fused force is their mixture, so that an unproven change already counts in its standard
+deviation. A proven one becomes the first hypothesis.
 
 While closing, changes of pads, torque constant and friction look alike, and the first hypothesis attributes other pads to
 friction. A jump that is opened after that starts with the wrong friction; only one that was open before can separate them when
@@ -23,20 +24,23 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.paths import UNCERTAIN_CONTACT_RAD
+from emb_daemon.estimator.paths import UNCERTAIN_CONTACT_RAD, still_to_gain
 from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
+    MOST_CREEP,
     MOST_SCALE,
+    add_creep,
     add_drift,
     add_growth,
     add_stiffness_jumps,
     add_torque_jumps,
     stay_possible,
 )
-from emb_daemon.jit import Floats, Record, njit
+from emb_daemon.jit import Floats, Record, njit, sq
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
+    CREEPS,
     FADE,
     FAST,
     GAIN,
@@ -45,6 +49,8 @@ from emb_daemon.models.fusion import (
     INERTIA,
     LOAD,
     NOISE,
+    OF_THE_FORCE,
+    OF_THE_MODEL,
     OFFSET,
     SCALE,
     SLOW,
@@ -95,10 +101,10 @@ _SURELY = 9.0
 #: slowly.
 GATE = 5.0
 
-#: What may have changed at once, or with heat, a jump that was opened before, and a brake that drifts, which never becomes the
-#: first hypothesis.
+#: What may have changed at once, or shows with heat and time, a jump that was opened before, and a brake that drifts, which
+#: never becomes the first hypothesis.
 ALTERNATIVES = 5
-STIFFNESS_JUMP, TORQUE_JUMP, DISC_GROWTH, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
+STIFFNESS_JUMP, TORQUE_JUMP, SLOW_CHANGE, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
@@ -157,12 +163,13 @@ def _open(s, p, kind):
         add_stiffness_jumps(a.covariance, p)
     elif kind == TORQUE_JUMP:
         add_torque_jumps(a.covariance, p)
-    elif kind == DISC_GROWTH:
+    elif kind == SLOW_CHANGE:
         add_growth(a.covariance, p)
+        add_creep(a.covariance)
     else:
         add_drift(a.covariance, p)
     faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
-    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, faded)
+    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, s.creep, faded)
     a.least, a.prior = _least_odds(s, kind), _first_odds(s, kind)
     a.log_odds = a.prior
     if p.clearance_sigma == 0.0:
@@ -219,7 +226,7 @@ def _succeed(s, p, kind, released):
 def open_changes(s: Record, p: Record) -> None:
     """Open all changes except for drift anew."""
     open_again(s, p)
-    _open(s, p, DISC_GROWTH)
+    _open(s, p, SLOW_CHANGE)
 
 
 @njit
@@ -233,7 +240,7 @@ def open_all(s: Record, p: Record) -> None:
 def open_others(s: Record, p: Record) -> None:
     """Open the others anew after a change of the first hypothesis, in addition to a kept jump."""
     _open_jumps(s, p)
-    _open(s, p, DISC_GROWTH)
+    _open(s, p, SLOW_CHANGE)
     _open(s, p, DRIFT)
 
 
@@ -350,16 +357,20 @@ def place(s: Record, a: Record, p: Record, factor: float, warmth: float) -> None
         slope = mean_slope(x + moved, min(sigma, 3.0), p.curve)
     # The difference neglects the lag, which settles much faster than a jump can be proven.
     scaled = (1.0 + a.error[SCALE]) * (s.force + factor * (there - here))
+    for i in range(len(CREEPS)):
+        scaled += a.error[CREEPS[i]] * still_to_gain(s, i)
     a.shift = max(scaled, 0.0) - s.force
     a.slope = factor * (1.0 + a.error[SCALE]) * slope
 
 
 @njit
-def to_force(h: Floats, spread: float, slope: float, force: float, warmth: float) -> None:
+def to_force(h: Floats, s: Record, spread: float, slope: float, force: float, warmth: float) -> None:
     """Sensitivity of the clamp force to the states."""
     for i in range(STATES):
         h[i] = 0.0
     h[FAST], h[CONTACT], h[SCALE], h[GROWTH] = spread, -slope, force, slope * warmth
+    for i in range(len(CREEPS)):
+        h[CREEPS[i]] = still_to_gain(s, i)
 
 
 @njit
@@ -369,7 +380,7 @@ def to_torque(
 ) -> None:  # fmt: skip
     """Convert a sensitivity of the clamp force to that of the unexplained torque. ``slope`` of the gear; ``slow``,
     ``accelerating`` and ``motor_torque`` N m: slow friction, torque of inertia, and total torque."""
-    for i in (FAST, CONTACT, SCALE, GROWTH):
+    for i in OF_THE_FORCE:
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
     h[GAIN], h[FADE], h[HOUSING] = -motor_torque, -motor_torque * winding, -motor_torque * housing
@@ -399,7 +410,7 @@ def learn(
     Returns (innovation, its variance)."""
     innovation = unexplained
     for i in range(STATES):
-        if i not in (CONTACT, SCALE, GROWTH):
+        if i not in OF_THE_MODEL:
             innovation -= h[i] * x[i]
     s = variance + variance_along(P, h, gain)
     if trusted and innovation * innovation < GATE * GATE * s:
@@ -444,14 +455,16 @@ def _follow_offset(s):
 
 
 @njit
-def _follow_contact(s):
+def _follow_contact(s, p):
     """When the pads touch, the last stop and its release have shown the contact angle. If it has moved by more than the filter
-    expected since the stop before, its walk is enlarged."""
+    expected since the stop before, its walk is enlarged; what that stop said for a slow change is due to the jump."""
     contact, known = s.contact_angle - s.contact_anchor, s.covariance[CONTACT, CONTACT]
     if s.contact_age_s > 0.0:
         moved = contact - s.contact_before
         walk = max(moved * moved - _SURELY * (known + s.contact_known), 0.0) / s.contact_age_s
         s.contact_walk = 0.5 * (s.contact_walk + walk)
+        if walk > 0.0:
+            _open(s, p, SLOW_CHANGE)
     s.contact_before, s.contact_known, s.contact_age_s = contact, known, 1e-9
 
 
@@ -464,7 +477,7 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     if s.contact.engaged:
         if not s.braked:
             _follow_offset(s)
-            _follow_contact(s)
+            _follow_contact(s, p)
         s.braked = True
     elif released and s.braked:
         s.braked = False
@@ -503,6 +516,13 @@ def fold(s: Record, warmth: float, linear: bool) -> None:
     s.growth += growth
     s.past_contact += growth * warmth - contact
     change = s.slope * (growth * warmth - contact) + s.force * scale if linear else 0.0
+    for i in range(len(CREEPS)):
+        creep = x[CREEPS[i]]
+        change += creep * still_to_gain(s, i) if linear else 0.0
+        s.creep[i] = min(max(s.creep[i] + creep, -MOST_CREEP), MOST_CREEP)
+        for kind in range(ALTERNATIVES):
+            s.alternatives[kind].error[CREEPS[i]] -= creep
+        x[CREEPS[i]] = 0.0
     s.force += change
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
@@ -531,14 +551,14 @@ def _unseen_growth(a):
     P = a.covariance
     if P[CONTACT, CONTACT] <= 0.0:
         return P[GROWTH, GROWTH]
-    return max(P[GROWTH, GROWTH] - P[CONTACT, GROWTH] ** 2 / P[CONTACT, CONTACT], 0.0)
+    return max(P[GROWTH, GROWTH] - sq(P[CONTACT, GROWTH]) / P[CONTACT, CONTACT], 0.0)
 
 
 @njit
 def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, float]:
     """Force (N) and standard deviation of the first hypothesis and all changes together, over their common model of the force;
     how far a drift would be from that, and its disc's growth, count in the latter. ``h``: scratch."""
-    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(h, s, spread, s.slope, s.force, warmth)
     _share_out(s)
     rest = 1.0
     first = spread * s.error[FAST]
@@ -550,11 +570,11 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
         apart = a.shift + spread * a.error[FAST] - first
         mean += w * apart
         square += w * apart * apart
-        to_force(h, spread, a.slope, s.force + a.shift, warmth)
+        to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         variance += w * force_variance(a.covariance, h)
     d = s.alternatives[DRIFT]
     drifted = d.shift + spread * d.error[FAST] - first - mean
-    to_force(h, spread, s.slope, s.force, warmth)
+    to_force(h, s, spread, s.slope, s.force, warmth)
     variance += rest * force_variance(s.covariance, h)
     grown = d.slope * warmth
     variance += max(square - mean * mean, 0.0) + d.share * (drifted * drifted + grown * grown * _unseen_growth(d))

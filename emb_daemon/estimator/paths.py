@@ -1,6 +1,6 @@
 """Both force paths of one corner, and what acts on them: motor angle to force, motor torque to force."""
 
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 
@@ -20,6 +20,8 @@ DISSOLVING_PER_S = 0.05
 _SELF_LOCKING = 0.2
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
+#: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
+_CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
 _LONG_S = 1e6
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
@@ -68,11 +70,30 @@ def _deform(s, p, x, dt, factor):
     if variance > UNCERTAIN_CONTACT_RAD * UNCERTAIN_CONTACT_RAD:
         slope = mean_slope(x, sqrt(variance), p.curve)
     drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
+    for i in range(len(_CREEP_S)):
+        s.held[i] += (1.0 - exp(-dt / _CREEP_S[i])) * (drive - s.held[i])
+        slope *= 1.0 - s.creep[i]
+    drive = max(drive + crept(s, drive), 0.0)
     relaxation_time = p.relaxation_time * effects.relaxation_time(p.effects, s.effects, travel, dt)
     s.force = first_order_lag(s.force, s.drive, drive, dt, relaxation_time)
     s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, relaxation_time)
     s.drive = drive
     s.drive_slope = factor * slope
+
+
+@njit
+def crept(s: Record, drive: float) -> float:
+    """Force (N) by which pads that creep differ from those that are held with ``drive`` N for ever."""
+    total = 0.0
+    for i in range(len(_CREEP_S)):
+        total += s.creep[i] * (s.held[i] - drive)
+    return total
+
+
+@njit
+def still_to_gain(s: Record, creep: int) -> float:
+    """Force (N) that pads still gain, or lose, if all of it creeps with time constant number ``creep``."""
+    return s.held[creep] - s.drive
 
 
 @njit
@@ -105,6 +126,8 @@ def begin_paths(s: Record, p: Record, m: Record, factor: float) -> None:
     static, slope = characteristic_curve(s.past_contact, p.curve)
     s.force = s.drive = effects.static_force(p.effects, s.effects, factor * static, 0.0, 0.0)
     s.slope = s.drive_slope = factor * slope
+    for i in range(len(s.held)):
+        s.held[i] = s.drive
 
 
 @njit

@@ -11,7 +11,7 @@ from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
 from emb_daemon.models.contact import CONTACT
-from emb_daemon.models.fusion import STATES
+from emb_daemon.models.fusion import CREEPS, STATES
 from emb_daemon.models.gear import GEAR
 from emb_daemon.models.lateness import LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
@@ -107,6 +107,10 @@ STATE = np.dtype(
         ("spring_force", "f8"),
         # Stiffness path: static force (inputs of the lag) at the last sample, and the lag's output.
         *fields("f8", "past_contact drive drive_slope force slope"),
+        # Force that the pads were held with over the time constants of creep, N; share that creeps beyond the calibration:
+        # learned.
+        ("held", "f8", (len(CREEPS),)),
+        ("creep", "f8", (len(CREEPS),)),
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back"),
         *fields("f8", "torque_age balance leverage"),

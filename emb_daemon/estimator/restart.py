@@ -12,16 +12,18 @@ from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
     LEAST_SCALE,
+    MOST_CREEP,
     MOST_SCALE,
     WINDING_S,
+    add_creep,
     add_growth,
     add_rest,
     add_stiffness_jumps,
     add_torque_jumps,
     set_priors,
 )
-from emb_daemon.jit import Record, entry, njit
-from emb_daemon.models.fusion import CONTACT, FAST, NOISE, STATES, copy_errors
+from emb_daemon.jit import Record, entry, njit, sq
+from emb_daemon.models.fusion import CONTACT, CREEPS, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, UNALTERED, heat_step
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -40,6 +42,7 @@ SNAPSHOT = np.dtype(
         ("clearance", "f8"),
         ("clearance_sigma", "f8"),
         ("scale", "f8"),
+        ("creep", "f8", (len(CREEPS),)),
         ("growth", "f8"),
         ("growth_start", "f8"),
         ("error", "f8", (STATES,)),
@@ -74,6 +77,8 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     snapshot.clearance = p.clearance + s.contact_angle - s.contact_anchor
     snapshot.clearance_sigma = s.covariance[CONTACT, CONTACT] ** 0.5
     snapshot.scale, snapshot.growth, snapshot.growth_start = s.scale, s.growth, s.growth_start
+    for i in range(len(CREEPS)):
+        snapshot.creep[i] = s.creep[i]
     copy_errors(snapshot.error, snapshot.covariance, s.error, s.covariance)
     snapshot.winding, snapshot.housing = s.winding, s.housing
     snapshot.temperature_known = s.temperature_known
@@ -90,6 +95,7 @@ def _widen(s, p):
     add_stiffness_jumps(s.covariance, p)
     add_torque_jumps(s.covariance, p)
     add_growth(s.covariance, p)
+    add_creep(s.covariance)
 
 
 def why_implausible(snapshot: Record, p: Record) -> str:
@@ -104,6 +110,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
         "clearance": abs(snapshot["clearance"] - p["clearance"]) * p["gear_gain"] <= _CONTACT_M,
         "clearance_sigma": 0.0 <= snapshot["clearance_sigma"] * p["gear_gain"] <= _CONTACT_M,
         "scale": LEAST_SCALE <= snapshot["scale"] <= MOST_SCALE,
+        "creep": np.all(np.abs(snapshot["creep"]) <= MOST_CREEP),
         "growth": abs(snapshot["growth"]) * p["gear_gain"] <= _GROWTH_M_PER_K,
         "covariance": np.all(np.abs(correlation) <= 1.0 + 1e-6) and np.linalg.eigvalsh(correlation)[0] > -1e-3,
         "error": np.all(snapshot["error"] ** 2 <= _SIGMAS**2 * (np.diag(prior) + np.diag(covariance))),
@@ -127,13 +134,15 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.resumed = True
     s.clearance, s.clearance_sigma = snapshot.clearance, snapshot.clearance_sigma
     s.scale, s.growth, s.growth_start = snapshot.scale, snapshot.growth, snapshot.growth_start
+    for i in range(len(CREEPS)):
+        s.creep[i] = snapshot.creep[i]
     copy_errors(s.error, s.covariance, snapshot.error, snapshot.covariance)
     for i in range(STATES):
         for own in (FAST, NOISE):
             s.covariance[own, i] = s.covariance[i, own] = 0.0
     s.error[FAST] = s.error[NOISE] = 0.0
     s.covariance[FAST, FAST] = 1.0
-    s.covariance[NOISE, NOISE] = (p.torque_constant * p.current_sigma) ** 2
+    s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
     add_rest(s.covariance, p, elapsed_s)
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)

@@ -37,7 +37,7 @@ from emb_daemon.estimator.status import (
 )
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
 from emb_daemon.jit import Record, njit
-from emb_daemon.models.fusion import CONTACT, SCALE, maximum_likelihood
+from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import follow, interrupt
 from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
@@ -71,6 +71,8 @@ def _start(s, p, m):
         set_priors(s.covariance, p)
         if p.clearance_sigma == 0.0:
             s.covariance[SCALE, SCALE] = 0.0
+            for i in CREEPS:
+                s.covariance[i, i] = 0.0
     s.gear_zero = m.angle
     # A motor that turns already comes from where nobody knows.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf

@@ -8,11 +8,11 @@ is part of its standard deviation.
 It learns only while the motor turns: a standing motor is held by friction, whatever the disc does to the force.
 """
 
-from math import cos, exp, hypot, sin, sqrt
+from math import cos, exp, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.stiffness import first_order_lag
 from emb_daemon.models.wheel import TURNING_RAD_PER_S, WHEEL, track
 
@@ -82,7 +82,7 @@ def _begin(u):
     u.unseen = 0.0
     for i in range(STATES):
         # An amplitude as large as before is possible again, at another phase.
-        size = u.amplitude[i - i % 2] ** 2 + u.amplitude[i - i % 2 + 1] ** 2
+        size = sq(u.amplitude[i - i % 2]) + sq(u.amplitude[i - i % 2 + 1])
         u.gain[i] = _variance(i) + 0.5 * size
     for i in range(STATES):
         u.amplitude[i] = u.earlier[i] = 0.0
@@ -151,7 +151,7 @@ def _weigh(u, leverage, without, variance):
     for i in range(STATES):
         foretold += leverage * u.force[i] * u.earlier[i]
     edge = _GATE * _GATE * variance
-    better = min(without * without, edge) - min((without - foretold) ** 2, edge)
+    better = min(without * without, edge) - min(sq(without - foretold), edge)
     u.log_odds = min(max(u.log_odds + 0.5 * better / variance, _LEAST_ODDS), _CERTAIN_ODDS)
     # An even disc until there is evidence: no wheel frame, not even a forged one, then changes the force.
     u.share = 1.0 / (1.0 + exp(-u.log_odds)) if u.log_odds > _SPEAKING_ODDS else 0.0

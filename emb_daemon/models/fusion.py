@@ -14,26 +14,31 @@ for noise, which takes slow model error for white noise. Here the filter estimat
     COULOMB   error of the gear friction without clamp force, N m
     VISCOUS   error of the friction torque per motor speed, N m s/rad
     SLOW      relative rise of the gear friction at low speed (Stribeck)
+    CREEPS    shares of the force that a stroke lacks and that pads gain while they are held, within a second or some seconds
     FADE      relative loss of motor torque per heat that the motor's own current left in the winding
     HOUSING   the same for the heat left in the motor's housing
     INERTIA   relative error of the inertia
 
-    F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH
+    F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH + (H_i - F) CREEP_i
     torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS + T_f SLOW
                                           - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
                                           + white noise,  D = gamma + mu s
 
-so that slow errors stay correlated in time, and the standard deviation is that of the force.
+H_i is the force that the pads were held with of late. Slow errors stay correlated in time, and the standard deviation is that
+of the force.
 """
 
 from math import sqrt
 
 from emb_daemon.jit import Floats, njit
 
-STATES = 14
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(STATES)
-#: States that the clamp force itself rests on.
-OF_THE_FORCE = (FAST, CONTACT, SCALE, GROWTH)
+#: Number of states, and their places; creep's are two.
+STATES = 16
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(14)
+CREEPS = (14, 15)
+#: States that the model of the force takes in as soon as they are learned; all that the clamp force itself rests on.
+OF_THE_MODEL = (CONTACT, SCALE, GROWTH, *CREEPS)
+OF_THE_FORCE = (FAST, *OF_THE_MODEL)
 
 
 @njit

@@ -11,7 +11,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, fields, njit
+from emb_daemon.jit import Record, fields, njit, sq
 from emb_daemon.wire.contract import CYCLE_S
 
 #: What explains the angle less integrated speed, over integrated speed (1), gained speed (s), time (rad/s), and way (1).
@@ -81,7 +81,7 @@ def leave_stretch(a: Record) -> None:
 
 @njit
 def _take_stretch(a, noise):
-    variance = noise * noise * CYCLE_S * a.seconds + _COUNTS_RAD * _COUNTS_RAD + (_MISSED * a.way) ** 2
+    variance = noise * noise * CYCLE_S * a.seconds + _COUNTS_RAD * _COUNTS_RAD + sq(_MISSED * a.way)
     keep = exp(-a.seconds / _KEPT_S)
     causes = a.half
     causes[_RATE], causes[_LOSS], causes[_GAIN], causes[_AGE] = a.seconds, a.way, a.net, a.gained
@@ -93,7 +93,7 @@ def _take_stretch(a, noise):
     loss_sigma = 1.0 / a.lower[_LOSS, _LOSS]
     loss = a.half[_LOSS] * loss_sigma
     rate = (a.half[_RATE] - a.lower[_LOSS, _RATE] * loss) / a.lower[_RATE, _RATE]
-    rate_sigma = sqrt(1.0 + (a.lower[_LOSS, _RATE] * loss_sigma) ** 2) / a.lower[_RATE, _RATE]
+    rate_sigma = sqrt(1.0 + sq(a.lower[_LOSS, _RATE] * loss_sigma)) / a.lower[_RATE, _RATE]
     offset, offset_sigma = _offset(a, noise)
     a.strayed = keep * a.strayed + a.slip - offset * a.seconds
     apart = rate - offset
@@ -116,7 +116,7 @@ def _offset(a, noise):
     keep = exp(-a.seconds / _OFFSET_CHANGES_S)
     a.offset_weight *= keep
     a.offset_sum *= keep
-    weight = a.offset_weight + 1.0 / (_OFFSET_RAD_PER_S**2 + (_OFFSET_OF_NOISE * noise) ** 2)
+    weight = a.offset_weight + 1.0 / (sq(_OFFSET_RAD_PER_S) + sq(_OFFSET_OF_NOISE * noise))
     return a.offset_sum / weight, 1.0 / sqrt(weight)
 
 

@@ -263,6 +263,8 @@ def clamp(p: Record, s: Record) -> None:
     if e.clamp_creep.share != 0.0:
         s.creep = _settle(s.creep, s.drive, drive, e.clamp_creep.time_constant_s)
         excitation += e.clamp_creep.share * (s.creep - drive)
+    # Pads push only: those that have given way lose contact.
+    excitation = max(excitation, 0.0)
     force = _settle(s.force, s.excitation, excitation, p.relaxation_time)
     s.force_rate = (force - s.force) / SUBSTEP_S
     s.force, s.drive, s.excitation = force, drive, excitation
