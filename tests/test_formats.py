@@ -264,6 +264,31 @@ def test_a_multiplexer_of_an_unknown_number_is_no_value(tmp_path):
     assert len(angle) > 90 and angle == pytest.approx(20.0, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("choice", "is_value"),
+    [
+        ("SNA", False), ("Signal not available", False), ("LWS_invalid", False), ("Error Indicator", False),
+        ("Init", False), ("nicht_verfuegbar", False), ("NotAvailable", False), ("TEMP_SNA", False),
+        ("No_Fault", True), ("Not_Pressed", True), ("Maximum", True),
+    ],
+)  # fmt: skip
+def test_what_the_dbc_calls_not_available_is_no_value(tmp_path, choice, is_value):
+    """Sent as a number, 4095 would be a backing plate of 369.5 °C."""
+    (tmp_path / "x.dbc").write_text(
+        'VERSION ""\nBU_: T\nBO_ 256 M: 8 T\n SG_ Angle : 0|16@1+ (0.01,0) [0|0] "rad" T\n'
+        f' SG_ Plate : 16|12@1+ (0.1,-40) [0|0] "degC" T\n\nVAL_ 256 Plate 4095 "{choice}" ;\n'
+    )
+    plate = "EMB_FL_Thermocouple.InnerBackplateTemp"
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: M.Angle}}\n  {plate}: {{signal: M.Plate}}\n"
+    )
+    lines = [f"({0.004 * tick:.6f}) can0 100#{'D007FF0F' if tick % 50 < 25 else 'D0075802'}00000000" for tick in range(500)]
+    (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
+    found = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Thermocouple")
+    assert len(found["InnerBackplateTemp"]) > 10
+    assert set(np.round(found["InnerBackplateTemp"], 1)) == ({20.0, 369.5} if is_value else {20.0})
+
+
 _SHOWN = """ (1709294400.000100)  can0  123   [8]  11 22 33 44 55 66 77 88
  (1709294400.010100)  can1  18FEF131   [2]  AB CD
 

@@ -4,6 +4,7 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
+import re
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
@@ -47,6 +48,13 @@ _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
 #: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
+#: What DBCs call a raw value that is none, once words are apart; and a flag that says that all is well.
+_APART = re.compile(r"[\W_]+|(?<=[a-z])(?=[A-Z])")
+_NO_VALUE = re.compile(
+    r"(?i)\b(sna|n a|unavailable|(not|nicht) (available|valid|defined|used|verf.*)|invalid|undefined|unknown|reser\w*|init\w*|"
+    r"error\w*|fault\w*|fail\w*|(\w* )?fehler\w*|ung.ltig|no (data|signal|value))\b"
+)
+_FREE_OF = re.compile(r"(?i)(no|not|kein|ohne) (error|fault|fail|fehler)")
 
 
 class Mapped(Struct, kw_only=True):
@@ -93,8 +101,14 @@ class Time(Struct, kw_only=True):
     unit: str = "s"
     #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
     rate_Hz: Positive | None = None
+    #: Of a table that has one value in a row: the columns that name the signal and hold its value. What `signals` calls a
+    #: column is then such a name.
+    name: str | None = None
+    value: str | None = None
 
     def __post_init__(self) -> None:
+        if (self.name is None) != (self.value is None) or (self.name is not None and self.signal is None):
+            raise ValueError("expected name, value and signal together: the columns of a table with one value in a row")
         if self.signal is None and self.rate_Hz is None:
             raise ValueError("expected signal (a column), rate_Hz (rows per second), or both (a column's counts per second)")
         if self.rate_Hz is not None and self.unit != "s":
@@ -473,7 +487,7 @@ def _per_radius(unit: str) -> str:
 
 def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
-    the payload is too short or belongs to other multiplexed signals.
+    the payload is too short or belongs to other multiplexed signals, or if the DBC calls the value one that is not available.
 
     Raises:
         cantools.database.Error: the message has no room for it.
@@ -481,17 +495,23 @@ def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     from cantools.database import DecodeError
     from cantools.database.can import Message
 
+    signal = message.get_signal_by_name(name)
     if not message.is_multiplexed():
-        signal = message.get_signal_by_name(name)
         message = Message(
             message.frame_id, message.name, message.length, [signal], is_extended_frame=message.is_extended_frame
         )
+    nothing = {
+        float(signal.raw_to_scaled(raw, decode_choices=False))
+        for raw, choice in (signal.choices or {}).items()
+        if _NO_VALUE.search(text := _APART.sub(" ", str(choice))) and not _FREE_OF.match(text)
+    }
 
     def read(payload: bytes) -> float:
         try:
-            return float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
+            value = float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
         except DecodeError:
             return np.nan
+        return np.nan if value in nothing else value
 
     return read
 

@@ -63,7 +63,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         return times, rows
     if times[-1] == times[0]:
         raise InputError(f"{source}: {len(times)} values, all of them of one time")
-    going_on = steps <= _PAUSE * np.quantile(steps, _ORDINARY)
+    # A clock that counts whole seconds gives most rows the stamp of the row before them.
+    going_on = steps <= _PAUSE * np.quantile(steps[steps > 0], _ORDINARY)
     mean = float(np.mean(steps[going_on]))
     near = steps <= _ONE * mean
     if not near.any():
