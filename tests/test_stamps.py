@@ -244,9 +244,9 @@ def test_a_current_whose_sign_is_read_as_its_highest_bit_is_said(truth, tmp_path
 def test_one_stroke_like_the_other_is_no_turn():
     """Stops at 10 Hz: released in one sample, clamped by the same angle in the next."""
     clamped = np.arange(600) // 30 % 2
-    angle = Series(100_000_000 * np.arange(600), 12.0 * clamped + 0.01 * np.sin(np.arange(600.0)))
-    assert not starts_anew(angle)
-    assert starts_anew(Series(angle.time_ns, angle.values * 2.0 * np.pi / 12.0))
+    time_ns = 100_000_000 * np.arange(600)
+    assert not starts_anew(Series(time_ns, 12.0 * clamped + 0.01 * np.sin(1.3 * np.arange(600.0))))
+    assert starts_anew(Series(time_ns, np.mod(0.4 * np.arange(600.0), 12.0))) == pytest.approx(12.0, rel=0.01)
 
 
 @pytest.mark.parametrize(

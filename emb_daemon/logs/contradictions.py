@@ -36,14 +36,15 @@ _DEGREE, _TURN = np.pi / 180.0, 2.0 * np.pi
 _LEAST_COUNTS = 256
 #: Largest relative deviation of a jump from a whole turn.
 _ABOUT = 0.1
-#: Least step where a value wraps around, as a share of its range, and least number of such steps.
-_ANEW, _LEAST_JUMPS = 0.5, 3
+#: Least step where a value wraps around, as a share of its range, least number of such steps, and share of those of few
+#: samples before which the value goes the other way.
+_ANEW, _LEAST_JUMPS, _ON = 0.5, 3, 0.8
 #: How late a force follows the motor's angle where pads relax, s, and how late it may by no pads in motion that tells it; a
 #: force before its angle is another clock's. Largest delay that is looked for, and step of the search, s.
 _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0.5, 0.01
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
-#: early (it gains nothing); number of samples that are judged, and of parts of the curve.
-_LATE_BETTER, _EARLY_BETTER, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 50_000, 60
+#: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
+_LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
 #: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
@@ -179,15 +180,19 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     def left_N(lag_s: float) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
         known = np.isfinite(at)
-        if np.sum(known) < _LEAST or not np.ptp(at[known]):
+        if np.sum(known) < _LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
             return np.inf
         part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
         means = np.bincount(part, values[known]) / np.maximum(np.bincount(part), 1)
         return float(np.sqrt(np.mean((values[known] - means[part]) ** 2)))
 
     lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S, _LAG_STEP_S)
-    lag_s = float(lags[np.argmin(left := [left_N(lag) for lag in lags])])
-    gain = left_N(0.0) / max(min(left), 1.0)
+    left = np.array([left_N(lag) for lag in lags])
+    # Of a motion that repeats itself the least of the lags counts that fit, and none with which the force falls.
+    around = np.pad(left, 1, constant_values=np.inf)
+    near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]
+    lag_s = float(near[np.argmin(np.abs(near))])
+    gain = left_N(0.0) / max(np.min(left), 1.0)
     if lag_s > _LATE_S and gain > _LATE_BETTER:
         return [
             f"ClampForceRef comes {1e3 * lag_s:.0f} ms after the motor's angle that it belongs to, and pads explain some "
@@ -302,8 +307,9 @@ def starts_anew(angle: Series) -> float:
     jump = float(np.median(jumps))
     # Between samples that are far apart a motor may move as far; but not always by the same.
     alike = bool(np.all(np.abs(jumps - jump) < _ABOUT * jump)) and bool(np.all(np.abs(steps[~is_jump]) < _ANEW * jump))
-    # Nor is one stroke like the other a turn, in whatever unit.
-    return jump if not angle.is_sparse or (alike and _turn_as(jump)) else 0.0
+    # What turns on goes against its jump before it; before one stroke like the other the motor stands.
+    goes_on = bool(np.mean((before * steps)[is_jump] < 0.0) > _ON)
+    return jump if not angle.is_sparse or (alike and goes_on) else 0.0
 
 
 def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
