@@ -19,6 +19,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, starts_anew
+from emb_daemon.logs.dbc import load_foreign
 from emb_daemon.logs.read import Recorded, ids_in, read_log
 from emb_daemon.logs.resample import (
     HEADER,
@@ -35,7 +36,7 @@ from emb_daemon.logs.resample import (
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
+from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
 from emb_daemon.wire.units import TRAVELS, UNITS, conversion
 
 if TYPE_CHECKING:
@@ -101,9 +102,9 @@ class Time(Struct, kw_only=True):
     unit: str = "s"
     #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
     rate_Hz: Positive | None = None
-    #: Of a table that has one value in a row: the columns that name the signal and hold its value. What `signals` calls a
-    #: column is then such a name.
+    #: Of a table that has one value in a row: the column that names what was measured; `signals` then has such names.
     name: str | None = None
+    #: Of such a table: the column of values.
     value: str | None = None
 
     def __post_init__(self) -> None:
@@ -189,7 +190,7 @@ class Mapping:
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
         self.databases: dict[str | None, Database] = {
-            name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()
+            name: load_foreign(self.path.parent / bus.dbc) for name, bus in buses.items()
         }
         self.channels: dict[str | None, str | None] = {
             name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
@@ -393,9 +394,7 @@ class Mapping:
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             found = f"; found {ids_in(recorded.frames)}" if self.databases else ""
-            raise InputError(
-                f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
-            )
+            raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} names{found}")
         # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
@@ -412,15 +411,17 @@ class Mapping:
 
     def _clocks(self) -> str:
         clocks = [next(iter(self._sources(f"EMB_{corner}_Resolver").values()), None) for corner in CORNERS]
+        # Of a motor that stands all that was measured tells the time.
+        clocks = [*filter(None, clocks)] or [source for name in self.messages for source in self._sources(name).values()]
         names = {}
-        for source in filter(None, clocks):
+        for source in clocks:
             place, channel = [], self.channels.get(source.bus)
             if self.databases:
                 place.append(f"{self.message_of(source).frame_id:#x}")
             if channel is not None:
                 place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
-        return ", ".join(names) or "a signal"
+        return ", ".join(names)
 
     def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
         """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
