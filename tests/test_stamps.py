@@ -249,6 +249,33 @@ def test_one_stroke_like_the_other_is_no_turn():
     assert starts_anew(Series(time_ns, np.mod(0.4 * np.arange(600.0), 12.0))) == pytest.approx(12.0, rel=0.01)
 
 
+@pytest.mark.parametrize("stray", [0.0, -999.0, 1200.0])
+def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path, capsys, stray):
+    """What stands for a lost value must not be taken for an angle that starts anew, nor for motion."""
+    columns = foreignkit.sampled(truth, 250.0)
+    lost = np.random.default_rng(3).random(len(columns["time_s"])) < 0.005
+    lost[np.flatnonzero(lost) - 1] = False
+    lost &= columns["angle_rad"] > 15.0
+    log = _read(tmp_path, columns | {"angle_rad": np.where(lost, stray, columns["angle_rad"] + 5.0)})
+    told = capsys.readouterr().err
+    assert f"{np.sum(lost)} values of MotorAngle are far from both beside them: left out" in told and "start anew" not in told
+    assert np.ptp(log.samples["angle"]) == pytest.approx(np.ptp(columns["angle_rad"]), abs=0.1)
+
+
+def _phase(columns: dict) -> np.ndarray:
+    return columns["current_A"] * np.cos(4.0 * columns["angle_rad"])
+
+
+@pytest.mark.parametrize("current", [_phase, lambda columns: 0.3 * columns["speed_rad_per_s"]], ids=["phase", "duty cycle"])
+def test_what_does_not_accelerate_the_motor_is_not_its_current(truth, tmp_path, capsys, current):
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    foreignkit.write_table(tmp_path / "a.parquet", columns | {"current_A": current(columns)})
+    command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
+    assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
+    assert "the current does not accelerate the motor" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("factor", "said"),
     [(1.0, ""), (1.0 / 20.0, "times what is stated: is the angle that of a gear's output"), (-1.0, "backwards")],

@@ -49,6 +49,9 @@ _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
 _TOLD_INERTIA, _OTHER_INERTIA = 0.8, 3.0
+#: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
+#: that acceleration would then need.
+_NO_INERTIA, _MUCH = 0.5, 0.5
 #: Radii of tyres, m: what vehicle speed over wheel speed is, of a scooter's to a truck's.
 _TYRE_M = (0.15, 0.8)
 #: Speeds of a wheel that turns, rad/s, at which the two are compared, and share of them that may be far from their median.
@@ -114,6 +117,12 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
     if not np.all(np.ptp(left, axis=0) > 0.0):
         return []
     correlation = float(np.corrcoef(left.T)[0, 1])
+    told_A, needed_A = np.std(left, axis=0) * (1.0, inertia_kg_m2 / torque_constant_Nm_per_A)
+    if needed_A > _MUCH * told_A and max(abs(correlation), abs(correlation) * told_A / needed_A) < _NO_INERTIA:
+        return [
+            f"the current does not accelerate the motor (correlation {correlation:.2f}): is it a phase's, a duty cycle, "
+            "without its sign, or of another time?"
+        ]
     ratio = float(left[:, 0] @ left[:, 1] / (left[:, 1] @ left[:, 1])) * torque_constant_Nm_per_A / inertia_kg_m2
     if abs(correlation) < _TOLD_INERTIA or 1.0 / _OTHER_INERTIA < ratio < _OTHER_INERTIA:
         return []

@@ -23,7 +23,7 @@ _HALF_A_DAY_S = 43_200
 _CANHACKER = re.compile(rb"Time\s+ID\s+DLC\s+Data\b.*")
 _CANHACKER_FRAME = re.compile(rb"(\d+)[,.](\d{3})\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+(\d+)((?:\s+[0-9A-Fa-f]{2})*)\b.*")
 #: Longest pause of a bus, s; number of frames after which it was one.
-_MINUTE_S, _LONGEST_S, _STRAYS = 60, 5.0, 20
+_MINUTE_S, _LONGEST_S, _STRAYS = 60, 2.0, 20
 #: How PEAK's trace files begin, if they name their version, and a line in one of 1.0 that is no frame: the number of an error.
 _PEAK, _PEAK_ERROR = b";$FILEVERSION", re.compile(rb"[ \t]*\d+\)[^\n]*\bERROR\b[^\n]*\n?")
 #: A stray semicolon after the time at which a trace file of PEAK began; version 1.2, which is 1.3 without a reserved column

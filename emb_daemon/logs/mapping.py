@@ -33,7 +33,7 @@ from emb_daemon.logs.resample import (
     standing,
     turns_free,
 )
-from emb_daemon.logs.stamps import held_rows, in_time
+from emb_daemon.logs.stamps import held_rows, in_time, strays
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
@@ -384,6 +384,14 @@ class Mapping:
             }
             for name, signals in self.messages.items()
         }
+        for name, signals in messages.items():
+            angle = signals.get("MotorAngle")
+            if isinstance(angle, Series) and not angle.is_sparse and np.any(stray := strays(angle.values)):
+                print(
+                    f"{path}: {name}: {np.sum(stray)} values of MotorAngle are far from both beside them: left out",
+                    file=sys.stderr,
+                )
+                signals["MotorAngle"] = Series(angle.time_ns[~stray], angle.values[~stray])
         for corner in CORNERS:
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 print(f"{path}: {corner}: {line}", file=sys.stderr)
