@@ -110,7 +110,7 @@ def strays(values: np.ndarray) -> np.ndarray:
         far = _FAR * np.ptp(np.quantile(values, (0.01, 0.99)))
         before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
         stray[1:-1] = (np.minimum(np.abs(before), np.abs(after)) > far) & (np.abs(before - after) < 0.5 * far) & (far > 0.0)
-    return stray if np.mean(stray) < _FEW else np.zeros_like(stray)
+    return stray if np.sum(stray) <= _FEW * len(values) else np.zeros_like(stray)
 
 
 def held_rows(values: np.ndarray) -> np.ndarray | None:
