@@ -12,7 +12,7 @@ from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
-from emb_daemon.logs.columns import Decoder, References
+from emb_daemon.logs.columns import Decoder, References, beyond_range
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import corner_index, estimate
 from emb_daemon.offline.log import CAPACITY, collect, make_log
@@ -20,6 +20,7 @@ from emb_daemon.offline.score import force_figures, temperature_figures
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.contract import INVALID, REASONS
 from emb_daemon.wire.layout import CORNERS
+from emb_daemon.wire.receive import BAD_RANGE
 
 #: Stands for every corner in a log.
 ALL = "all"
@@ -91,6 +92,7 @@ class Replay:
     Attributes:
         corners: those that are estimated; for ``all`` known from the first log on.
         adaptation: the adaptation, if there is a state folder.
+        notes: a line for each signal of a log with values that the daemon does not use.
     """
 
     def __init__(
@@ -110,6 +112,7 @@ class Replay:
         self._pipeline: Pipeline | None = None
         self.adaptation: Adaptation | None = None
         self.corners: tuple[str, ...] = ()
+        self.notes: list[str] = []
         if corner != ALL:
             self._build((CORNERS[corner_index(corner)],))
 
@@ -167,6 +170,8 @@ class Replay:
         shift = self._on_the_drive(frames, path)
         pipeline = self._pipeline
         samples = collect(frames, pipeline)
+        if pipeline.receptions["count"][:, BAD_RANGE].any():
+            self.notes += [f"{path}: {line}" for line in beyond_range(frames)]
         if len(self.corners) == 1:
             # Views, because a row of a long log is half a kilobyte.
             mine: dict = {self.corners[0]: slice(None)}

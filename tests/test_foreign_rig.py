@@ -1,6 +1,7 @@
 """A rig that nobody here built, through every command that reads its logs: see `foreignkit`."""
 
 import json
+import math
 import zipfile
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from scipy.io import savemat
 import emb_daemon
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.resample import at_our_rate
@@ -480,6 +482,49 @@ def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
         path = path.rename(tmp_path / "b.txt")
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
     assert ("its last line is cut off" in capsys.readouterr().err) == (ending == ".jsonl")
+
+
+def _long(line: str) -> str:
+    """A row for each value: an angle every 4 ms, and what else is recorded beside it."""
+    rows = []
+    for tick in range(1000):
+        stamp = f"2026-01-01 08:{tick // 250:02d}:{tick % 250 * 0.24:06.3f}"
+        rows += [line.format(stamp, "angle", f"{math.sin(0.01 * tick):.5f}"), line.format(stamp, "mode", "RUN")]
+    return "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        (_long("{1} {0} {2}  "), "signal: column 3, name: column 1, value: column 4"),
+        ("#group,false\n,_time,_value,_field\n" + _long(",{0},{2},{1}"), "signal: _time, name: _field, value: _value"),
+        ("tag;time;value\n" + _long("{1};{0};{2}").replace(".", ","), "signal: time, name: tag, value: value"),
+    ],
+    ids=["monitor", "database", "historian"],
+)
+def test_a_table_may_have_a_row_for_each_value(tmp_path, text, time):
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ntime: {{{time}}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad, scale: 20}}\n"
+    )
+    (tmp_path / "a.txt").write_text(text)
+    found = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "a.txt"), "EMB_FL_Resolver")
+    seconds = 1e-9 * (found["time_ns"] - found["time_ns"][0])
+    assert seconds[-1] == pytest.approx(239.76, abs=0.3)
+    assert found["MotorAngle"] == pytest.approx(20.0 * np.sin(0.01 * seconds / 0.24), abs=0.1)
+    (tmp_path / "m.yaml").write_text((tmp_path / "m.yaml").read_text().replace("signal: angle", "signal: angel"))
+    with pytest.raises(InputError, match="angel: no row has this name; the table has angle, mode"):
+        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.txt")
+
+
+def test_of_sheets_alike_the_one_that_is_read_is_named(tmp_path, capsys):
+    pytest.importorskip("python_calamine", reason="NOT RUN: the formats extra is not installed")
+    rows = [["t", "x"], *([0.004 * n, math.sin(0.1 * n)] for n in range(300))]
+    _write_workbook(tmp_path / "a.xlsx", {"first": rows, "second": rows})
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: x, unit: rad}\n"
+    )
+    Mapping(tmp_path / "m.yaml").read(tmp_path / "a.xlsx")
+    assert "2 sheets have these columns (first, second); the first alone is read" in capsys.readouterr().err
 
 
 def test_stamps_of_json_lines_may_be_dates(tmp_path):

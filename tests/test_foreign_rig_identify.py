@@ -97,6 +97,18 @@ def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):
     assert "turn the angle round (`scale: -1`" in capsys.readouterr().err
 
 
+def test_an_angle_behind_a_gear_is_told_with_its_ratio(tmp_path, capsys):
+    """Its log does not seem to begin released, since its clearance is small; why is what the user has to know."""
+    motion = foreignkit.random(seconds=4.0)
+    campaign = foreignkit.write_campaign(tmp_path, random=motion)
+    columns = foreignkit.sampled(foreignkit.truth(motion), 500.0)
+    behind = {name: columns[name] / 20.0 for name in ("angle_rad", "speed_rad_per_s")}
+    foreignkit.write_table(tmp_path / "random.parquet", columns | behind)
+    mapping = str(tmp_path / "mapping.yaml")
+    assert main(["identify", str(campaign), "--mapping", mapping, "--output", str(tmp_path / "c.yaml")]) == 2
+    assert "is the angle that of a gear's output, or in another unit (`scale:" in capsys.readouterr().err
+
+
 def test_a_misspelt_log_is_an_error(tmp_path, capsys):
     campaign = foreignkit.write_campaign(tmp_path)
     campaign.write_text(campaign.read_text().replace("curves: []", "curves: [{log: slwo.parquet}]"))

@@ -264,6 +264,115 @@ def test_a_multiplexer_of_an_unknown_number_is_no_value(tmp_path):
     assert len(angle) > 90 and angle == pytest.approx(20.0, abs=0.01)
 
 
+_FAULTY = """VERSION ""
+BU_: T
+BO_ 256 M: 8 T
+ SG_ Angle : 0|16@1+ (0.01,0) [0|0] "rad" T
+ SG_ 0_COUNTER : 16|8@1+ (1,0) [0|0] "" T
+
+BO_ 1275 2017_5: 8 T
+ SG_ Angle2 : 0|16@1+ (0.01,0) [0|0] "rad" T
+
+BO_ 316494249 Long: 8 T
+ SG_ Speed : 0|16@1- (0.01,0) [0|0] "rad/s" T
+
+BO_ 1074005561 Impossible: 8 T
+ SG_ Speed : 0|16@1- (0.01,0) [0|0] "rad/s" T
+
+CM_ "a comment without its end"
+BO_ 257 Last: 8 T
+ SG_ Iq : 0|16@1- (0.01,0) [0|0] "A" T
+
+VAL_ 256 Gone 0 "no" 1 "yes" ;
+VAL_ 316494249 Speed 0 "stands" ;
+"""
+
+
+def test_a_dbc_with_faults_that_other_tools_accept_is_read(tmp_path, capsys):
+    """As those that enthusiasts keep of cars: one in six is refused by cantools for what nobody maps."""
+    (tmp_path / "x.dbc").write_text(_FAULTY)
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: M.Angle}\n"
+        "  EMB_FL_Resolver.MotorSpeed: {signal: Long.Speed}\n  EMB_FL_Current.CurrentQ: {signal: Last.Iq}\n"
+    )
+    lines = []
+    for tick in range(500):
+        at = f"({0.004 * tick:.6f}) can0"
+        lines += [f"{at} 100#D007000000000000", f"{at} 12DD51A9#0000000000000000", f"{at} 101#6400000000000000"]
+    (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
+    mapping = Mapping(tmp_path / "m.yaml")
+    told = capsys.readouterr().err
+    for left_out in (
+        "line 5 is no DBC's",
+        "line 7 is no DBC's",
+        "BO_ 1074005561",
+        "line 16 is no DBC's",
+        "says of Gone, not in",
+    ):
+        assert left_out in told
+    # What was of a message that is left out is not of the one before.
+    assert {signal.name for signal in mapping.databases[None].get_message_by_name("M").signals} == {"Angle"}
+    found = mapping.read(tmp_path / "x.log")
+    assert Decoder().columns(found, "EMB_FL_Resolver")["MotorAngle"] == pytest.approx(20.0, abs=0.01)
+    assert Decoder().columns(found, "EMB_FL_Current")["CurrentQ"][5:] == pytest.approx(1.0, abs=0.02)
+    (tmp_path / "x.dbc").write_text("this is\nno DBC at all\n" * 100)
+    with pytest.raises(InputError, match=r"x\.dbc: not a readable DBC"):
+        Mapping(tmp_path / "m.yaml")
+
+
+def test_of_a_motor_that_stands_what_is_not_in_the_log_is_named(tmp_path):
+    (tmp_path / "x.dbc").write_text(_FAULTY)
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  VEH_WheelSpeed.WheelSpeedFL: {signal: Long.Speed}\n"
+    )
+    (tmp_path / "x.log").write_text("(0.000000) can0 100#00\n(0.004000) can0 100#00\n")
+    with pytest.raises(InputError, match=r"no value of Long.Speed \(0x12dd51a9\) in it, .*; found 0x100"):
+        Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log")
+
+
+@pytest.mark.parametrize(
+    ("choice", "is_value"),
+    [
+        ("SNA", False), ("Signal not available", False), ("LWS_invalid", False), ("Error Indicator", False),
+        ("Init", False), ("nicht_verfuegbar", False), ("NotAvailable", False), ("TEMP_SNA", False),
+        ("No_Fault", True), ("Not_Pressed", True), ("Maximum", True),
+    ],
+)  # fmt: skip
+def test_what_the_dbc_calls_not_available_is_no_value(tmp_path, choice, is_value):
+    """Sent as a number, 4095 would be a backing plate of 369.5 °C."""
+    (tmp_path / "x.dbc").write_text(
+        'VERSION ""\nBU_: T\nBO_ 256 M: 8 T\n SG_ Angle : 0|16@1+ (0.01,0) [0|0] "rad" T\n'
+        f' SG_ Plate : 16|12@1+ (0.1,-40) [0|0] "degC" T\n\nVAL_ 256 Plate 4095 "{choice}" ;\n'
+    )
+    plate = "EMB_FL_Thermocouple.InnerBackplateTemp"
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: M.Angle}}\n  {plate}: {{signal: M.Plate}}\n"
+    )
+    lines = [f"({0.004 * tick:.6f}) can0 100#{'D007FF0F' if tick % 50 < 25 else 'D0075802'}00000000" for tick in range(500)]
+    (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
+    found = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Thermocouple")
+    assert len(found["InnerBackplateTemp"]) > 10
+    assert set(np.round(found["InnerBackplateTemp"], 1)) == ({20.0, 369.5} if is_value else {20.0})
+
+
+def test_traces_of_canhacker_go_on_after_a_minute(tmp_path):
+    lines = ["Time   ID     DLC Data                    Comment"]
+    for tick in range(400):
+        milliseconds = 59_000 + 4 * tick
+        # Among them a stray, as this logger has.
+        milliseconds = 4_093 if tick == 100 else milliseconds
+        lines.append(f"{milliseconds // 1000 % 60:02d},{milliseconds % 1000:03d} 100      2 D0 07                    turned")
+    lines += ["00,700 18FEF131 3 01 02 03", "00,710 200      4"]
+    (tmp_path / "a.trc").write_text("\r\n".join(lines) + "\r\n")
+    frames = read_log(tmp_path / "a.trc").frames
+    assert len(frames) == 402 and set(frames["can_id"]) == {0x100, 0x200, 0x18FEF131}
+    assert np.diff(np.delete(frames["time_ns"][:400], 100)).tolist() == [4_000_000] * 99 + [8_000_000] + [4_000_000] * 298
+    assert frames["time_ns"][99] == frames["time_ns"][100]
+    assert frames["data"][0] == 0x07D0
+    assert frames["flags"][-2:].tolist() == [EXTENDED, REMOTE]
+
+
 _SHOWN = """ (1709294400.000100)  can0  123   [8]  11 22 33 44 55 66 77 88
  (1709294400.010100)  can1  18FEF131   [2]  AB CD
 

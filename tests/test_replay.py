@@ -68,6 +68,24 @@ def test_frames_of_all_corners_are_those_of_the_corners_heard(two_corners):
     assert {0x200, 0x203} <= sent and not sent & {0x201, 0x202}
 
 
+def test_which_signal_is_out_of_range_is_said(tmp_path, capsys):
+    """The reason on the wire says no more than that something is: of a thermocouple without its wire, four frames."""
+    before, after = _cut(0, 100, 20.0), _cut(100, 110, 3000.0)
+    frames = np.concatenate([*before, *after, *_cut(110, 400, 20.0)])
+    frames["time_ns"] += 1_000_000_000
+    (tmp_path / "a.log").write_text(format_candump(frames[np.argsort(frames["time_ns"], kind="stable")]))
+    assert main(["replay", str(tmp_path / "a.log")]) == 0
+    told = capsys.readouterr()
+    assert "signal out of range" in told.out
+    for name in ("InnerBackplateTemp", "OuterBackplateTemp", "CaliperTemp"):
+        assert f"EMB_FL_Thermocouple.{name} is beyond -200 to 1400 in 4 of 160 frames, which are not used" in told.err
+    assert "MotorSpeed is beyond" not in told.err
+
+
+def _cut(first: int, end: int, backplate: float) -> list[np.ndarray]:
+    return wirekit.drive(end - first, first=first, backplate=backplate, angle=_ANGLE, speed=_SPEED, current=(1.0,))
+
+
 def test_reasons_stand_in_words_after_the_source_and_a_car_has_no_reference_columns(two_corners):
     frames = read.read_frames(two_corners / "FL.log")
     lost = np.isin(frames["can_id"], [Decoder().can_id(name) for name in ("EMB_FL_Thermocouple", "VEH_WheelSpeed")])

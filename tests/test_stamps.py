@@ -8,7 +8,10 @@ import pytest
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
+from emb_daemon.logs.columns import Decoder
+from emb_daemon.logs.contradictions import contradictions, starts_anew
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time
 from emb_daemon.offline import load_log
 
@@ -189,12 +192,137 @@ _MOTION = ("angle_rad", "speed_rad_per_s")
         (("speed_rad_per_s",), 30.0 / np.pi, "rpm taken for rad/s, or the reverse"),
         (("angle_rad",), 180.0 / np.pi, "degrees taken for radians, or the reverse"),
         (("angle_rad",), 1.0 / 12.0, "a wrong unit or gear"),
+        (("speed_rad_per_s",), 0.1, "times as fast (a wrong unit or gear)"),
+        (("plate_C",), 1372.0 / 22.0, "which no backing plate lasts: an open thermocouple"),
+        (("plate_C",), 295.0 / 22.0, "InnerBackplateTemp is never below 295 °C: are these kelvins?"),
     ],
 )
 def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said):
     columns = foreignkit.sampled(truth, 250.0)
     _read(tmp_path, _wrong(columns, *wrong, factor=factor))
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("late_s", "said"),
+    [
+        (0.1, "ms after the motor's angle that it belongs to, and pads explain some 30 ms: `mean_ms: 180`"),
+        (-0.1, "ms before the motor's angle that it belongs to, as of no brake"),
+        (0.02, ""),
+    ],
+)
+def test_a_force_of_another_clock_is_said(truth, tmp_path, capsys, late_s, said):
+    """Identification would make effects of it, and judging would call the estimate wrong."""
+    columns = foreignkit.sampled(truth, 250.0)
+    _read(tmp_path, columns | {"force_N": np.roll(columns["force_N"], round(250.0 * late_s))})
+    told = capsys.readouterr().err
+    assert said in told
+    assert bool(said) == ("that it belongs to" in told)
+
+
+@pytest.mark.parametrize(
+    ("factor", "is_said"), [(1.0, False), (3.6, True), (1.0 / 3.6, True)], ids=["m/s", "km/h as m/s", "rad/s from km/h"]
+)
+def test_a_vehicle_rolls_on_tyres(factor, is_said):
+    time_ns = 10_000_000 * np.arange(1000)
+    wheel = Series(time_ns, 20.0 * (1.0 - np.cos(1e-9 * time_ns)))
+    messages = {
+        "VEH_WheelSpeed": {"WheelSpeedFL": wheel},
+        "VEH_Status": {"VehicleSpeed": Series(time_ns, factor * 0.3 * wheel.values)},
+    }
+    lines = [line for line in contradictions("FL", messages) if "the radius of no tyre" in line]
+    assert bool(lines) == is_said
+
+
+def test_a_current_whose_sign_is_read_as_its_highest_bit_is_said(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    _read(tmp_path, columns | {"current_A": np.mod(columns["current_A"], 60.0)})
+    assert "CurrentQ jumps by about" in (told := capsys.readouterr().err)
+    assert "is it a number with a sign that is read without one" in told
+
+
+def test_one_stroke_like_the_other_is_no_turn():
+    """Stops at 10 Hz: released in one sample, clamped by the same angle in the next."""
+    clamped = np.arange(600) // 30 % 2
+    time_ns = 100_000_000 * np.arange(600)
+    assert not starts_anew(Series(time_ns, 12.0 * clamped + 0.01 * np.sin(1.3 * np.arange(600.0))))
+    assert starts_anew(Series(time_ns, np.mod(0.4 * np.arange(600.0), 12.0))) == pytest.approx(12.0, rel=0.01)
+
+
+@pytest.mark.parametrize("stray", [0.0, -999.0, 1200.0])
+def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path, capsys, stray):
+    """What stands for a lost value must not be taken for an angle that starts anew, nor for motion."""
+    columns = foreignkit.sampled(truth, 250.0)
+    lost = np.random.default_rng(3).random(len(columns["time_s"])) < 0.005
+    lost[np.flatnonzero(lost) - 1] = False
+    lost &= columns["angle_rad"] > 15.0
+    log = _read(tmp_path, columns | {"angle_rad": np.where(lost, stray, columns["angle_rad"] + 5.0)})
+    told = capsys.readouterr().err
+    assert f"{np.sum(lost)} values of MotorAngle are far from both beside them: left out" in told and "start anew" not in told
+    assert np.ptp(log.samples["angle"]) == pytest.approx(np.ptp(columns["angle_rad"]), abs=0.1)
+
+
+def _phase(columns: dict) -> np.ndarray:
+    return columns["current_A"] * np.cos(4.0 * columns["angle_rad"])
+
+
+@pytest.mark.parametrize("current", [_phase, lambda columns: 0.3 * columns["speed_rad_per_s"]], ids=["phase", "duty cycle"])
+def test_what_does_not_accelerate_the_motor_is_not_its_current(truth, tmp_path, capsys, current):
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    foreignkit.write_table(tmp_path / "a.parquet", columns | {"current_A": current(columns)})
+    command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
+    assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
+    assert "the current does not accelerate the motor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [(1.0, ""), (1.0 / 20.0, "times what is stated: is the angle that of a gear's output"), (-1.0, "backwards")],
+    ids=["the motor's", "behind a gear", "turned round"],
+)
+def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsys, factor, said):
+    """Convert cannot tell it, since an angle behind a gear is a motion like any other; a calibration can."""
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    foreignkit.write_table(tmp_path / "a.parquet", _wrong(columns, *_MOTION, factor=factor))
+    command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
+    assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
+    told = capsys.readouterr().err
+    assert said in told
+    assert bool(said) == ("the current accelerates the motor" in told)
+
+
+def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):
+    """A brake request of 37 per cent, scaled to one, would be sent as none."""
+    columns = foreignkit.sampled(truth, 250.0)
+    flag = {"request": np.where(np.arange(len(columns["time_s"])) % 100 < 50, 0.0, 0.37)}
+    mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
+    _read(tmp_path, columns | flag, mapping)
+    assert "BrakeRequest is 0 or 1, and between them in" in capsys.readouterr().err
+
+
+def test_a_clock_of_whole_seconds_is_spread_over_its_rows(capsys):
+    seconds = np.arange(2500) / 250.0
+    times, rows = in_time("x", (1e9 * np.floor(seconds)).astype(np.int64), [np.sin(seconds)])
+    assert "stamps come in bunches, one every 1e+03 ms" in capsys.readouterr().err
+    assert len(rows) == 2500
+    # Where the first of the second's rows lies is not known, how far apart they are is.
+    assert np.diff(times) == pytest.approx(4e6, rel=0.2)
+
+
+def test_late_stamps_are_no_missing_samples(truth, tmp_path):
+    """Counters that skip would be E2E errors of a log that lacks nothing; where samples are missing, they do skip."""
+    columns = foreignkit.sampled(truth, 250.0)
+    late_s = np.random.default_rng(1).normal(0.0, 0.0008, len(columns["time_s"])).clip(-0.0019, 0.0019)
+    rows = np.r_[0:300, 310 : len(late_s)]
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = {name: values[rows] for name, values in (columns | {"time_s": columns["time_s"] + late_s}).items()}
+    path = foreignkit.write_table(tmp_path / "a.parquet", table)
+    counters = Decoder().columns(Mapping(tmp_path / "mapping.yaml").read(path), "EMB_FL_Resolver")["Counter"].astype(int)
+    steps = np.diff(counters) % 15
+    assert np.flatnonzero(steps != 1).tolist() == [299]
+    assert steps[299] == 11
 
 
 def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):

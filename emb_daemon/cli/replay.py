@@ -55,8 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.calibration.parameters import moved
+    from emb_daemon.logs.contradictions import other_motor
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
+    from emb_daemon.wire.layout import CORNERS
 
     _check(arguments)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
@@ -85,6 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return 0
     results = [result for log in arguments.logs for result in replay.run_corners(log)]
+    for note in replay.notes:
+        print(note, file=sys.stderr)
+    if arguments.calibration:
+        motor = calibration.motor.torque_constant_Nm_per_A, calibration.motor.inertia_kg_m2
+        for result in results:
+            for line in other_motor(result.samples, *motor):
+                print(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}", file=sys.stderr)
     for result in results if arguments.measured_torque else ():
         if not np.isfinite(result.reference.brake_torque_Nm).any():
             raise InputError(f"{result.path}: no brake torque (BrakeTorqueRef) in it; expected without --measured-torque")

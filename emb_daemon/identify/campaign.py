@@ -12,6 +12,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Training, Trial
 from emb_daemon.jit import njit
+from emb_daemon.logs.contradictions import other_motor
 from emb_daemon.logs.read import read_with_digest
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource
@@ -185,6 +186,8 @@ class Campaign:
                 f"expected {reversals[0]:g} to {reversals[1]:g}: a log of another kind"
             )
         if lacking:
+            motor = actuator.motor_torque_constant_Nm_per_A, actuator.lumped_inertia_kg_m2
+            lacking = "; ".join([lacking, *other_motor(log.samples, *motor)])
             self.fault(f"{part}: {self.path.parent / name}: {lacking}; needed: {need}; left out")
             return None
         return log

@@ -74,6 +74,26 @@ class Decoder:
         return {"time_ns": frames["time_ns"][rows]} | dict(zip(names, values, strict=True))
 
 
+def beyond_range(frames: np.ndarray) -> list[str]:
+    """A line for each signal with values beyond its range in frames whose CRC is right: the daemon uses none of these."""
+    database, decoder, right = shipped_database("dbc/emb.dbc"), Decoder(), frames[crc_is_right(frames)]
+    lines = []
+    for message in database.messages:
+        columns = decoder.columns(right, message.name)
+        names = tuple(name for name in columns if name != "time_ns")
+        for name, layout in zip(names, signal_columns(database, message.name, names), strict=True):
+            rounding = 0.5 * layout["factor"]
+            beyond = (columns[name] < layout["low"] - rounding) | (columns[name] > layout["high"] + rounding)
+            if beyond.any():
+                first = int(np.argmax(beyond))
+                lines.append(
+                    f"{message.name}.{name} is beyond {layout['low']:g} to {layout['high']:g} in {np.sum(beyond)} of "
+                    f"{len(beyond)} frames, which are not used; the first, at "
+                    f"{1e-9 * (columns['time_ns'][first] - frames['time_ns'][0]):.3f} s, is {columns[name][first]:g}"
+                )
+    return lines
+
+
 def absent_raw(length: int) -> int:
     """Raw value of a signed reference signal that means that the rig has no such instrument: the least possible one."""
     return -(1 << (length - 1))

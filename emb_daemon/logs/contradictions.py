@@ -6,6 +6,7 @@ reported.
 
 import numpy as np
 
+from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
 from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
 
@@ -35,8 +36,28 @@ _DEGREE, _TURN = np.pi / 180.0, 2.0 * np.pi
 _LEAST_COUNTS = 256
 #: Largest relative deviation of a jump from a whole turn.
 _ABOUT = 0.1
-#: Least step where a value wraps around, as a share of its range, and least number of such steps.
-_ANEW, _LEAST_JUMPS = 0.5, 3
+#: Least step where a value wraps around, as a share of its range, least number of such steps, and share of those of few
+#: samples before which the value goes the other way.
+_ANEW, _LEAST_JUMPS, _ON = 0.5, 3, 0.8
+#: How late a force follows the motor's angle where pads relax, s, and how late it may by no pads in motion that tells it; a
+#: force before its angle is another clock's. Largest delay that is looked for, and step of the search, s.
+_RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0.5, 0.01
+#: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
+#: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
+_LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
+#: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
+#: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
+#: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
+_TOLD_INERTIA, _OTHER_INERTIA = 0.8, 3.0
+#: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
+#: that acceleration would then need.
+_NO_INERTIA, _MUCH = 0.5, 0.5
+#: Radii of tyres, m: what vehicle speed over wheel speed is, of a scooter's to a truck's.
+_TYRE_M = (0.15, 0.8)
+#: Speeds of a wheel that turns, rad/s, at which the two are compared, and share of them that may be far from their median.
+_TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
+#: Temperatures of surroundings, K, between which values in °C are likelier kelvins, and one that no backing plate lasts, °C.
+_KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
 
@@ -50,7 +71,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
 
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
-    lines = []
+    lines = [*_find_other_wheel(corner, messages), *_find_impossible_temperatures(corner, messages)]
     for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
         if found is not None and not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
@@ -72,10 +93,126 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if is_free or (force is not None and _is_of_either_sign(force)):
         return lines
     if current is not None and np.ptp(current.values):
-        lines += _find_turned_current(angle, current)
+        lines += _find_unsigned(current) or _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _find_turned_force(angle, force)
+        lines += _find_turned_force(angle, force) or _find_late_force(angle, force)
     return lines
+
+
+def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2: float) -> list[str]:
+    """A line if the current accelerates the motor of SAMPLE rows as if its inertia were far from the one stated: then angle or
+    current is in another unit, of another place, or of another motor."""
+    speed, current, angle = (samples[name].astype(float) for name in ("speed", "current_q", "angle"))
+    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
+    known = samples["has_current"] & np.isfinite(current) & np.isfinite(angle) & np.isfinite(acceleration)
+    if not known.any():
+        return []
+    moving = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
+    if len(moving) < _LEAST or not np.ptp(angle[moving]):
+        return []
+    way = (angle[moving] - angle[moving[0]]) / np.ptp(angle[moving])
+    known = np.column_stack([np.ones(len(way)), np.sign(speed[moving]), speed[moving], way, way**2, way**3])
+    columns = np.column_stack([current[moving], acceleration[moving]])
+    left = columns - known @ np.linalg.lstsq(known, columns)[0]
+    if not np.all(np.ptp(left, axis=0) > 0.0):
+        return []
+    correlation = float(np.corrcoef(left.T)[0, 1])
+    told_A, needed_A = np.std(left, axis=0) * (1.0, inertia_kg_m2 / torque_constant_Nm_per_A)
+    if needed_A > _MUCH * told_A and max(abs(correlation), abs(correlation) * told_A / needed_A) < _NO_INERTIA:
+        return [
+            f"the current does not accelerate the motor (correlation {correlation:.2f}): is it a phase's, a duty cycle, "
+            "without its sign, or of another time?"
+        ]
+    ratio = float(left[:, 0] @ left[:, 1] / (left[:, 1] @ left[:, 1])) * torque_constant_Nm_per_A / inertia_kg_m2
+    if abs(correlation) < _TOLD_INERTIA or 1.0 / _OTHER_INERTIA < ratio < _OTHER_INERTIA:
+        return []
+    if ratio < 0.0:
+        return [f"the current accelerates the motor backwards (correlation {correlation:.2f}): `scale: -1` of one of the two?"]
+    return [
+        f"the current accelerates the motor as if its inertia were {ratio:.3g} times what is stated: is the angle that of "
+        f"a gear's output, or in another unit (`scale: {ratio:.3g}` of angle and speed would agree), the current in another "
+        "unit, or is this another motor?"
+    ]
+
+
+def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
+    """A line if no tyre rolls as fast as the vehicle at the speed of its wheel."""
+    wheel = messages.get("VEH_WheelSpeed", {}).get(f"WheelSpeed{corner}")
+    vehicle = messages.get("VEH_Status", {}).get("VehicleSpeed")
+    if not isinstance(wheel, Series) or not isinstance(vehicle, Series):
+        return []
+    at = vehicle.sampled(wheel.time_ns)
+    turns = np.isfinite(at) & (wheel.values > _TURNS_RAD_PER_S)
+    if np.sum(turns) < _LEAST:
+        return []
+    radii_m = at[turns] / wheel.values[turns]
+    radius_m = float(np.median(radii_m))
+    # A bench turns its disc without a vehicle, and a wheel that slips is no question of units.
+    alike = np.mean(np.abs(radii_m - radius_m) > _ASTRAY * radius_m) <= _ASTRAY
+    if not alike or _TYRE_M[0] <= radius_m <= _TYRE_M[1]:
+        return []
+    return [
+        f"VehicleSpeed is {radius_m:.3g} m/s for each rad/s of WheelSpeed{corner}, the radius of no tyre in m: is the unit of "
+        "one of the two wrong?"
+    ]
+
+
+def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> list[str]:
+    """A line for each thermocouple whose values are kelvins, or an instrument's that measures nothing."""
+    lines = []
+    for name, values in messages.get(f"EMB_{corner}_Thermocouple", {}).items():
+        if not isinstance(values, Series) or not len(values.values):
+            continue
+        low, middle = float(np.min(values.values)), float(np.median(values.values))
+        if middle > _NO_PLATE_C:
+            lines.append(f"{name} is {middle:.4g} °C, which no backing plate lasts: an open thermocouple, or a wrong unit?")
+        elif _KELVINS[0] < low < _KELVINS[1]:
+            lines.append(f"{name} is never below {low:.4g} °C: are these kelvins? Then `unit: K`")
+    return lines
+
+
+def _find_unsigned(current: Series) -> list[str]:
+    """A line on a current that jumps between the ends of its range, as a number with a sign does that is read without one."""
+    jump = starts_anew(current)
+    if not jump or np.min(current.values) < -_FOLLOWS * jump:
+        return []
+    return [
+        f"CurrentQ jumps by about {jump:.4g} A to and fro: is it a number with a sign that is read without one (the DBC says "
+        "unsigned)?"
+    ]
+
+
+def _find_late_force(angle: Series, force: Series) -> list[str]:
+    """A line on a force that follows the angle later than pads do, or comes before it."""
+    times, values = force.time_ns[:_JUDGED], force.values[:_JUDGED]
+
+    def left_N(lag_s: float) -> float:
+        at = angle.sampled(times - round(1e9 * lag_s))
+        known = np.isfinite(at)
+        if np.sum(known) < _LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
+            return np.inf
+        part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
+        means = np.bincount(part, values[known]) / np.maximum(np.bincount(part), 1)
+        return float(np.sqrt(np.mean((values[known] - means[part]) ** 2)))
+
+    lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S, _LAG_STEP_S)
+    left = np.array([left_N(lag) for lag in lags])
+    # Of a motion that repeats itself the least of the lags counts that fit, and none with which the force falls.
+    around = np.pad(left, 1, constant_values=np.inf)
+    near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]
+    lag_s = float(near[np.argmin(np.abs(near))])
+    gain = left_N(0.0) / max(np.min(left), 1.0)
+    if lag_s > _LATE_S and gain > _LATE_BETTER:
+        return [
+            f"ClampForceRef comes {1e3 * lag_s:.0f} ms after the motor's angle that it belongs to, and pads explain some "
+            f"{1e3 * _RELAXES_S:.0f} ms: `mean_ms: {2e3 * (lag_s - _RELAXES_S):.0f}` of it, twice a delay, takes the rest back"
+        ]
+    if lag_s < -_EARLY_S and gain > _EARLY_BETTER:
+        return [
+            f"ClampForceRef comes {-1e3 * lag_s:.0f} ms before the motor's angle that it belongs to, as of no brake: were the "
+            "two stamped by two clocks?"
+        ]
+    return []
 
 
 def _find_too_fast(angle: Series) -> list[str]:
@@ -179,7 +316,9 @@ def starts_anew(angle: Series) -> float:
     jump = float(np.median(jumps))
     # Between samples that are far apart a motor may move as far; but not always by the same.
     alike = bool(np.all(np.abs(jumps - jump) < _ABOUT * jump)) and bool(np.all(np.abs(steps[~is_jump]) < _ANEW * jump))
-    return jump if alike or not angle.is_sparse else 0.0
+    # What turns on goes against its jump before it; before one stroke like the other the motor stands.
+    goes_on = bool(np.mean((before * steps)[is_jump] < 0.0) > _ON)
+    return jump if not angle.is_sparse or (alike and goes_on) else 0.0
 
 
 def _by_travel(angle: Series, other: Series) -> tuple[float, float]:

@@ -18,6 +18,12 @@ _BUSMASTER_FRAME = re.compile(
 )
 _DECIMAL = b"***DEC***"
 _HALF_A_DAY_S = 43_200
+#: How a trace of CANHacker begins, and a frame in one: ``seconds,milliseconds id length bytes``. The seconds start anew each
+#: minute.
+_CANHACKER = re.compile(rb"Time\s+ID\s+DLC\s+Data\b.*")
+_CANHACKER_FRAME = re.compile(rb"(\d+)[,.](\d{3})\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+(\d+)((?:\s+[0-9A-Fa-f]{2})*)\b.*")
+#: Longest pause of a bus, s; number of frames after which it was one.
+_MINUTE_S, _LONGEST_S, _STRAYS = 60, 2.0, 20
 #: How PEAK's trace files begin, if they name their version, and a line in one of 1.0 that is no frame: the number of an error.
 _PEAK, _PEAK_ERROR = b";$FILEVERSION", re.compile(rb"[ \t]*\d+\)[^\n]*\bERROR\b[^\n]*\n?")
 #: A stray semicolon after the time at which a trace file of PEAK began; version 1.2, which is 1.3 without a reserved column
@@ -49,6 +55,8 @@ def as_candump(content: bytes) -> bytes | None:
         return b"\n".join([b"", *(_of_gvret(line, places) for line in content.split(b"\n")[1:])])
     if first.startswith(_BUSMASTER):
         return b"\n".join(_of_busmaster(content.split(b"\n")))
+    if _CANHACKER.fullmatch(first.strip()):
+        return b"\n".join(_of_canhacker(content.split(b"\n")))
     if _SHOWN.fullmatch(first.strip()):
         return b"\n".join(map(_of_terminal, content.split(b"\n")))
     if any(map(_PEAK_ROW.fullmatch, content.split(b"\n", _FIRST_LINES)[:_FIRST_LINES])):
@@ -64,6 +72,29 @@ def tidied_trace(content: bytes) -> bytes:
     if not _PEAK_1_2.match(content):
         return content
     return _PEAK_1_2_ID.sub(rb"\1 -", _PEAK_1_2.sub(b";$FILEVERSION=1.3", content))
+
+
+def _of_canhacker(lines: list[bytes]) -> Iterator[bytes]:
+    """A stamp that jumps is not believed before others say the same: this logger's strays among frames in order."""
+    before, passed, strays = None, 0.0, 0
+    yield b""
+    for line in lines[1:]:
+        if not (found := _CANHACKER_FRAME.fullmatch(line.strip())):
+            yield line.strip()
+            continue
+        seconds, octets = float(b"%s.%s" % found.group(1, 2)), b"".join(found[5].split())
+        if before is None:
+            before = passed = seconds
+        step = (seconds - before) % _MINUTE_S
+        strays = strays + 1 if step > _LONGEST_S or seconds >= _MINUTE_S else 0
+        if strays > _STRAYS:
+            # What was believed last may have been the stray.
+            step = (seconds - before + 0.5 * _MINUTE_S) % _MINUTE_S - 0.5 * _MINUTE_S
+        if not strays or strays > _STRAYS:
+            before, passed, strays = seconds, passed + step, 0
+        # A remote frame has a length and no bytes.
+        payload = octets if int(found[4]) == len(octets) // 2 else b"R"
+        yield b"(%.6f) can0 %s#%s" % (passed, found[3].upper(), payload)
 
 
 def _names(header: bytes) -> list[bytes]:

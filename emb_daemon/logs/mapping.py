@@ -4,6 +4,7 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
+import re
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
@@ -18,6 +19,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, starts_anew
+from emb_daemon.logs.dbc import load_foreign
 from emb_daemon.logs.read import Recorded, ids_in, read_log
 from emb_daemon.logs.resample import (
     HEADER,
@@ -31,10 +33,10 @@ from emb_daemon.logs.resample import (
     standing,
     turns_free,
 )
-from emb_daemon.logs.stamps import held_rows, in_time
+from emb_daemon.logs.stamps import held_rows, in_time, strays
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
-from emb_daemon.wire.layout import CORNERS, OURS, load_database, signal_columns
+from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
 from emb_daemon.wire.units import TRAVELS, UNITS, conversion
 
 if TYPE_CHECKING:
@@ -47,6 +49,13 @@ _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
 #: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
+#: What DBCs call a raw value that is none, once words are apart; and a flag that says that all is well.
+_APART = re.compile(r"[\W_]+|(?<=[a-z])(?=[A-Z])")
+_NO_VALUE = re.compile(
+    r"(?i)\b(sna|n a|unavailable|(not|nicht) (available|valid|defined|used|verf.*)|invalid|undefined|unknown|reser\w*|init\w*|"
+    r"error\w*|fault\w*|fail\w*|(\w* )?fehler\w*|ung.ltig|no (data|signal|value))\b"
+)
+_FREE_OF = re.compile(r"(?i)(no|not|kein|ohne) (error|fault|fail|fehler)")
 
 
 class Mapped(Struct, kw_only=True):
@@ -93,8 +102,14 @@ class Time(Struct, kw_only=True):
     unit: str = "s"
     #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
     rate_Hz: Positive | None = None
+    #: Of a table that has one value in a row: the column that names what was measured; `signals` then has such names.
+    name: str | None = None
+    #: Of such a table: the column of values.
+    value: str | None = None
 
     def __post_init__(self) -> None:
+        if (self.name is None) != (self.value is None) or (self.name is not None and self.signal is None):
+            raise ValueError("expected name, value and signal together: the columns of a table with one value in a row")
         if self.signal is None and self.rate_Hz is None:
             raise ValueError("expected signal (a column), rate_Hz (rows per second), or both (a column's counts per second)")
         if self.rate_Hz is not None and self.unit != "s":
@@ -175,7 +190,7 @@ class Mapping:
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
         self.databases: dict[str | None, Database] = {
-            name: load_database(self.path.parent / bus.dbc, strict=False) for name, bus in buses.items()
+            name: load_foreign(self.path.parent / bus.dbc) for name, bus in buses.items()
         }
         self.channels: dict[str | None, str | None] = {
             name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
@@ -369,6 +384,14 @@ class Mapping:
             }
             for name, signals in self.messages.items()
         }
+        for name, signals in messages.items():
+            angle = signals.get("MotorAngle")
+            if isinstance(angle, Series) and not angle.is_sparse and np.any(stray := strays(angle.values)):
+                print(
+                    f"{path}: {name}: {np.sum(stray)} values of MotorAngle are far from both beside them: left out",
+                    file=sys.stderr,
+                )
+                signals["MotorAngle"] = Series(angle.time_ns[~stray], angle.values[~stray])
         for corner in CORNERS:
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 print(f"{path}: {corner}: {line}", file=sys.stderr)
@@ -379,9 +402,7 @@ class Mapping:
         frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
         if not len(frames):
             found = f"; found {ids_in(recorded.frames)}" if self.databases else ""
-            raise InputError(
-                f"{path}: no value of {self._clocks()} in it, which {self.path} maps to motor angle or speed{found}"
-            )
+            raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} names{found}")
         # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
@@ -398,15 +419,17 @@ class Mapping:
 
     def _clocks(self) -> str:
         clocks = [next(iter(self._sources(f"EMB_{corner}_Resolver").values()), None) for corner in CORNERS]
+        # Of a motor that stands all that was measured tells the time.
+        clocks = [*filter(None, clocks)] or [source for name in self.messages for source in self._sources(name).values()]
         names = {}
-        for source in filter(None, clocks):
+        for source in clocks:
             place, channel = [], self.channels.get(source.bus)
             if self.databases:
                 place.append(f"{self.message_of(source).frame_id:#x}")
             if channel is not None:
                 place.append(f"channel {channel}")
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
-        return ", ".join(names) or "a signal"
+        return ", ".join(names)
 
     def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
         """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
@@ -473,7 +496,7 @@ def _per_radius(unit: str) -> str:
 
 def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
-    the payload is too short or belongs to other multiplexed signals.
+    the payload is too short or belongs to other multiplexed signals, or if the DBC calls the value one that is not available.
 
     Raises:
         cantools.database.Error: the message has no room for it.
@@ -481,17 +504,23 @@ def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     from cantools.database import DecodeError
     from cantools.database.can import Message
 
+    signal = message.get_signal_by_name(name)
     if not message.is_multiplexed():
-        signal = message.get_signal_by_name(name)
         message = Message(
             message.frame_id, message.name, message.length, [signal], is_extended_frame=message.is_extended_frame
         )
+    nothing = {
+        float(signal.raw_to_scaled(raw, decode_choices=False))
+        for raw, choice in (signal.choices or {}).items()
+        if _NO_VALUE.search(text := _APART.sub(" ", str(choice))) and not _FREE_OF.match(text)
+    }
 
     def read(payload: bytes) -> float:
         try:
-            return float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
+            value = float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
         except DecodeError:
             return np.nan
+        return np.nan if value in nothing else value
 
     return read
 

@@ -36,8 +36,12 @@ _LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
 _UNKNOWN_SHARE = 0.1
 #: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
-#: Share of values outside our message's range that is too large for faults of an instrument.
-_MOST_BEYOND = 0.01
+#: Share of values outside our message's range that is too large for faults of an instrument; what a flag may be off by.
+_MOST_BEYOND, _FLAG = 0.01, 0.01
+#: Share of a cycle that a stamp may be short of a whole number of missing samples, or it is only late; share of a stamp's
+#: deviation by which the clock of numbered samples follows it: jitter is averaged over some ten samples, and a sampling period
+#: that is 5 % off leaves it a quarter of a cycle behind.
+_MISSING, _FOLLOWED = 0.25, 0.2
 #: Longest time without any motor's messages over which slow messages go on, ns: a hot brake cools for an hour.
 _SILENT_NS = 3_600_000_000_000
 #: Sampling period of a standing motor of which nothing was measured, ns.
@@ -52,8 +56,8 @@ _PAUSE = 10
 #: repeatedly: largest share of such steps.
 _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
 #: Travel from which the angle's derivative is compared with the speed, rad; least correlation of both; largest deviation of
-#: their ratio from 1, of which a filter's delay causes some hundredths.
-_WAY_RAD, _CORRELATED, _OTHER_SCALE = 1.0, 0.8, 0.1
+#: their ratio from 1, of which a filter's delay causes some hundredths, and from that of a unit that is then named.
+_WAY_RAD, _CORRELATED, _OTHER_SCALE, _NAMED = 1.0, 0.8, 0.1, 0.04
 #: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
 #: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
 _RESOLVED = 0.95
@@ -320,7 +324,7 @@ def _meaning(ratio: float) -> str:
     sign = "a direction turned round" if ratio < 0.0 else ""
     for known, text in _RATIOS.items():
         for expected in (known, 1.0 / known):
-            if abs(abs(ratio) / expected - 1.0) < _OTHER_SCALE:
+            if abs(abs(ratio) / expected - 1.0) < _NAMED:
                 return " and ".join(filter(None, [sign, text]))
     return sign if abs(abs(ratio) - 1.0) <= _OTHER_SCALE else " and ".join(filter(None, [sign, "a wrong unit or gear"]))
 
@@ -474,6 +478,12 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
                     "the samples, which make no frames; is its unit right?",
                     file=sys.stderr,
                 )
+            if length == 1 and (between := np.mean((column > _FLAG) & (column < 1.0 - _FLAG))) > _MOST_BEYOND:
+                print(
+                    f"{message.name}: {name} is 0 or 1, and between them in {100.0 * between:.3g} % of the samples; less than "
+                    "a half is sent as 0: `scale` it so that all that is meant by 1 is at least that",
+                    file=sys.stderr,
+                )
             raw = np.rint((np.where(known, column, layout["offset"]) - layout["offset"]) / layout["factor"]).astype(np.int64)
             if is_reference:
                 raw = np.where(known, raw, absent)
@@ -539,6 +549,19 @@ def is_unresolved(angle: Series, free: bool) -> bool:
     return angle.course_is_unknown if free else angle.way_is_unknown
 
 
+@njit
+def _numbered(times):
+    """The cycle of each sample, int64: every sample has one of its own, and where some are missing, so are their cycles. A
+    sample's stamp is compared with where those before it put it, because stamps that jitter are no missing samples."""
+    numbers, expected = np.zeros(len(times), np.int64), float(times[0])
+    for row in range(1, len(times)):
+        cycles = max(1, int(np.floor((times[row] - expected) / CYCLE_NS + _MISSING)))
+        numbers[row] = numbers[row - 1] + cycles
+        expected += cycles * CYCLE_NS
+        expected += _FOLLOWED * (times[row] - expected)
+    return numbers
+
+
 def _clock(angle: Series, unresolved: bool) -> tuple[np.ndarray, np.ndarray]:
     """Times of the resolver samples and the cycle that each belongs to: the rig's own samples if its period is ours or too
     long to fill, a grid of our period otherwise."""
@@ -546,6 +569,5 @@ def _clock(angle: Series, unresolved: bool) -> tuple[np.ndarray, np.ndarray]:
     if len(times) < 3:
         return times, np.arange(len(times))
     if angle.is_ours or unresolved:
-        steps = np.maximum(np.rint(np.diff(times) / CYCLE_NS).astype(np.int64), 1)
-        return times, np.concatenate([[0], np.cumsum(steps)])
+        return times, _numbered(times)
     return _grid(_stretches(times, _CARRIED_PERIODS * angle.period_ns), CYCLE_NS)

@@ -26,6 +26,8 @@ _BUNCHES = 20
 #: Least number of changes of a value that is held, and least share of them at whole multiples of the time for which it is
 #: held.
 _LEAST_CHANGES, _IN_STEP = 50, 0.98
+#: Share of the others' range that a stray is away; largest share of strays, and least number of values to tell them in.
+_FAR, _FEW, _FEWEST = 0.5, 0.02, 100
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
 
@@ -63,7 +65,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         return times, rows
     if times[-1] == times[0]:
         raise InputError(f"{source}: {len(times)} values, all of them of one time")
-    going_on = steps <= _PAUSE * np.quantile(steps, _ORDINARY)
+    # A clock that counts whole seconds gives most rows the stamp of the row before them.
+    going_on = steps <= _PAUSE * np.quantile(steps[steps > 0], _ORDINARY)
     mean = float(np.mean(steps[going_on]))
     near = steps <= _ONE * mean
     if not near.any():
@@ -97,6 +100,17 @@ def _spread(times: np.ndarray, pauses: np.ndarray, samples: int) -> np.ndarray:
         straight = savgol_filter(offset, width, 1) if 3 <= width <= len(part) else offset
         parts.append(part[0] + np.rint(straight).astype(np.int64))
     return np.maximum.accumulate(np.concatenate(parts))
+
+
+def strays(values: np.ndarray) -> np.ndarray:
+    """Which values of a column, shape (n,), are away from both beside them by over half of what the others range over, while
+    these are near each other: bits lost on the way, or a number that stands for none. None if they are not few."""
+    stray = np.zeros(len(values), bool)
+    if len(values) > _FEWEST:
+        far = _FAR * np.ptp(np.quantile(values, (0.01, 0.99)))
+        before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
+        stray[1:-1] = (np.minimum(np.abs(before), np.abs(after)) > far) & (np.abs(before - after) < 0.5 * far) & (far > 0.0)
+    return stray if np.sum(stray) <= _FEW * len(values) else np.zeros_like(stray)
 
 
 def held_rows(values: np.ndarray) -> np.ndarray | None:

@@ -89,20 +89,42 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
             f"{path}: is a table, and the mapping names no column of times; expected `time: {{signal: NAME}}`, or "
             "`time: {rate_Hz: 100}` where it has none"
         )
+    if time.name is not None:
+        table = _table(path, content, ending, [time.signal, time.name, time.value])
+        parts = {name: table.filter(_named(path, table[time.name], name)) for name in names}
+        return {name: _in_time(f"{path}: {name}", part, [time.value], time) for name, part in parts.items()}, digest
     table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
-    columns = {name: _numbers(path, table, name) for name in names}
-    seconds = _seconds(path, table, time)
+    stamps, *columns = _in_time(f"{path}", table, names, time)
+    return {name: (stamps, values) for name, values in zip(names, columns, strict=True)}, digest
+
+
+def _named(path: Path, column, name: str):
+    """Which rows of a column (pyarrow) of names have a name."""
+    import pyarrow.compute
+
+    texts = pyarrow.compute.utf8_trim_whitespace(column.cast(pyarrow.string()))
+    mine = pyarrow.compute.equal(texts, name)
+    if not pyarrow.compute.any(mine).as_py():
+        known = sorted(text for text in texts.unique().to_pylist() if text)
+        raise InputError(f"{path}: {name}: no row has this name; the table has {_some(name, known)}")
+    return mine
+
+
+def _in_time(source: str, table, names: list[str], time) -> tuple[np.ndarray, ...]:
+    """Times (int64 ns, rising) and values of the columns with ``names``; ``source`` is what messages call them."""
+    columns = [_numbers(source, table, name) for name in names]
+    seconds = _seconds(source, table, time)
     known = np.isfinite(seconds)
     if len(seconds[known]) and (largest := float(np.max(np.abs(seconds[known])))) > LATEST_S:
         told = f"`rate_Hz`, {time.rate_Hz:g}," if time.rate_Hz else f"`time.unit`, {time.unit},"
         hint = "" if time.rate_Hz else _other_unit(largest, time)
-        raise InputError(f"{path}: {time.signal}: {largest:g} s are no time; is {told} right?{hint}")
-    columns = {name: values[known] for name, values in columns.items()}
-    stamps, rows = in_time(f"{path}", np.rint(1e9 * seconds[known]).astype(np.int64), list(columns.values()))
-    return {name: (stamps, values[rows]) for name, values in columns.items()}, digest
+        raise InputError(f"{source}: {time.signal}: {largest:g} s are no time; is {told} right?{hint}")
+    columns = [values[known] for values in columns]
+    stamps, rows = in_time(source, np.rint(1e9 * seconds[known]).astype(np.int64), columns)
+    return stamps, *(values[rows] for values in columns)
 
 
-def _seconds(path: Path, table, time) -> np.ndarray:
+def _seconds(path: str, table, time) -> np.ndarray:
     """When each row was written, s."""
     if time.signal is None:
         return np.arange(table.num_rows) / time.rate_Hz
@@ -176,7 +198,13 @@ def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
         sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
     except CalamineError as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
-    rows = max(sheets, key=lambda rows: len({*names} & {cell for row in rows[:_PREAMBLE] for cell in row}), default=[])
+    with_names = [len({*names} & {cell for row in rows[:_PREAMBLE] for cell in row}) for rows in sheets]
+    most = max(with_names, default=0)
+    alike = [name for name, count in zip(book.sheet_names, with_names, strict=True) if count == most > 0]
+    if len(alike) > 1:
+        listed = ", ".join(alike[:_LISTED]) + (", …" if len(alike) > _LISTED else "")
+        print(f"{path}: {len(alike)} sheets have these columns ({listed}); the first alone is read", file=sys.stderr)
+    rows = sheets[with_names.index(most)] if sheets else []
     text = io.StringIO()
     csv.writer(text).writerows(rows)
     return text.getvalue().encode()
@@ -228,7 +256,7 @@ def _is_clock(column) -> bool:
     return pyarrow.types.is_timestamp(column.type) or pyarrow.types.is_time(column.type)
 
 
-def _numbers(path: Path, table, name: str) -> np.ndarray:
+def _numbers(path: str, table, name: str) -> np.ndarray:
     """A column's values; of dates and times of day, seconds. A few cells that are no numbers, as tools write for an overflow
     or a division by zero, are left out, with a note on stderr."""
     import pyarrow
@@ -445,6 +473,10 @@ def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
             return row - 1, mark
         if not words:
             return None
+    # Where no line is of numbers alone, rows begin with words, such as the name of what was measured.
+    for row, line in enumerate(lines):
+        if mark := next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ""):
+            return row - 1, mark
     return None
 
 

@@ -135,6 +135,10 @@ def signal_columns(database: "Database", message: str, names: tuple[str, ...]) -
     return columns
 
 
+#: Endings of descriptions of a bus that are no DBC.
+NO_DBC = (".arxml", ".kcd", ".sym")
+
+
 def load_database(path: Path, strict: bool = True) -> "Database":
     """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252).
 
@@ -146,20 +150,39 @@ def load_database(path: Path, strict: bool = True) -> "Database":
     """
     import cantools
 
-    ending = path.suffix.lower()[1:]
     try:
-        if ending in ("arxml", "kcd", "sym"):
-            return cantools.database.load_file(path, database_format=ending, strict=strict)
-        content = path.read_bytes()
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("cp1252", errors="replace")
-        return cantools.database.load_string(text, "dbc", strict=strict)
+        if (ending := path.suffix.lower()) in NO_DBC:
+            return cantools.database.load_file(path, database_format=ending[1:], strict=strict)
+        return cantools.database.load_string(read_dbc(path), "dbc", strict=strict)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected a DBC") from None
     except Exception as error:
-        raise InputError(f"{path}: not a readable DBC: {str(error).splitlines()[0]}") from None
+        raise not_readable(path, error) from None
+
+
+def not_readable(path: Path, error: Exception) -> InputError:
+    """The error for a file that cantools does not read."""
+    return InputError(f"{path}: not a readable DBC: {str(error).splitlines()[0]}")
+
+
+def read_dbc(path: Path) -> str:
+    """The text of a DBC, in UTF-8 or as Vector's tools write it.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected a DBC") from None
+    except OSError as error:
+        raise not_readable(path, error) from None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")
 
 
 def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> list[str]:
