@@ -53,27 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.calibration.parameters import moved
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
 
     _check(arguments)
-    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
-    if arguments.pad_thickness is not None:
-        calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
-    if not calibration.contact.is_in_reach:
-        clearance = calibration.contact.clearance_rad
-        print(
-            f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
-            "are clamp forces, never negative; `diagnose` takes a load of either sign",
-            file=sys.stderr,
-        )
-    if arguments.mapping and not arguments.calibration:
-        print(
-            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
-            file=sys.stderr,
-        )
+    calibration = _calibration(arguments)
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
     sign = np.asarray
     if arguments.keys:
@@ -100,6 +84,29 @@ def run(arguments: argparse.Namespace) -> int:
         for figures in report:
             _print(figures)
     return 0
+
+
+def _calibration(arguments: argparse.Namespace):
+    """The calibration with the pads that are mounted; prints to stderr for what it is none."""
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.parameters import moved
+
+    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    if arguments.pad_thickness is not None:
+        calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
+    if not calibration.contact.is_in_reach:
+        clearance = calibration.contact.clearance_rad
+        print(
+            f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
+            "are clamp forces, never negative; `diagnose` takes a load of either sign",
+            file=sys.stderr,
+        )
+    if arguments.mapping and not arguments.calibration:
+        print(
+            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
+            file=sys.stderr,
+        )
+    return calibration
 
 
 def _secure(arguments: argparse.Namespace, read):
