@@ -7,7 +7,7 @@ import numpy as np
 
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import DEPTHS_MM
-from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, motor_angle, move_motor, static_angle
+from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, growth, motor_angle, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
 from emb_daemon.plant.records import (
@@ -250,7 +250,7 @@ def _record(car, p, s, corner, counter, drive, training, truth):
     truth.time_ns, truth.corner, truth.counter = car.time_ns, corner, counter
     truth.force, truth.static_force = s.force, s.static_force
     truth.angle, truth.speed, truth.current = p.released_angle + s.angle, s.speed, s.mean_current
-    truth.contact_angle = p.released_angle + motor_angle(p, p.contact_angle - grown(p, s))
+    truth.contact_angle = p.released_angle + motor_angle(p, p.contact_angle - growth(p, s))
     truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
     for side in range(2):
         truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
@@ -341,7 +341,7 @@ def _hear(w, frames):
             training.frequency = unpack(frame.data, signals[6])
 
 
-def _released(plants: np.ndarray, ambient: float) -> np.ndarray:
+def _released_states(plants: np.ndarray, ambient: float) -> np.ndarray:
     """PLANT_STATE of brakes that stand released, everything at ``ambient`` degC."""
     states = np.zeros(len(plants), PLANT_STATE)
     for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
@@ -385,7 +385,7 @@ class Car:
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
         self.plants: np.ndarray = np.ascontiguousarray(plants, PLANT)
         self.corners: tuple[str, ...] = tuple(corners)
-        self.states: np.ndarray = _released(self.plants, ambient)
+        self.states: np.ndarray = _released_states(self.plants, ambient)
         self.trainings: np.ndarray = np.zeros(len(plants), TRAINING)
         self.truth: np.ndarray = np.zeros(len(plants), TRUTH)
         self._rng = rng = np.random.default_rng(seed)
