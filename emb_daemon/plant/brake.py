@@ -8,14 +8,14 @@ from emb_daemon.jit import Record, njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
 #: Temperature (degC) at which effects of heat are zero, and at which magnets have their full strength.
-_COLD_C, _MAGNETS_C = 22.0, 25.0
+COLD_C, _MAGNETS_C = 22.0, 25.0
 #: Signals that drawn effects may follow, and their usual sizes.
 SIGNALS = (
     "brake_torque", "disc_temperature", "surface_temperature", "clamp_force", "motor_speed", "current", "force_rate",
     "disc_speed", "pad_temperature", "friction_power",
 )  # fmt: skip
-_BRAKE_NM, _RISE_K, _FORCE_N, _SPEED, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
-_DISC_SPEED, _POWER_W = 40.0, 30000.0
+_BRAKE_NM, _RISE_K, _FORCE_N, _SPEED_RAD_PER_S, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
+_DISC_RAD_PER_S, _POWER_W = 40.0, 30000.0
 #: Shapes of drawn effects: a power, a saturation, an onset at the signal's usual size.
 POWER, SATURATION, ONSET = range(3)
 
@@ -91,21 +91,21 @@ def _signal(s, which):
     if which == 0:
         return abs(s.brake_torque) / _BRAKE_NM
     if which == 1:
-        return max(s.disc - _COLD_C, 0.0) / _RISE_K
+        return max(s.disc - COLD_C, 0.0) / _RISE_K
     if which == 2:
-        return max(0.5 * (s.surface[0] + s.surface[1]) - _COLD_C, 0.0) / _RISE_K
+        return max(0.5 * (s.surface[0] + s.surface[1]) - COLD_C, 0.0) / _RISE_K
     if which == 3:
         return max(s.force, 0.0) / _FORCE_N
     if which == 4:
-        return abs(s.speed) / _SPEED
+        return abs(s.speed) / _SPEED_RAD_PER_S
     if which == 5:
         return abs(s.current) / _CURRENT_A
     if which == 6:
         return abs(s.force_rate) / _RATE_N_PER_S
     if which == 7:
-        return abs(s.wheel_speed) / _DISC_SPEED
+        return abs(s.wheel_speed) / _DISC_RAD_PER_S
     if which == 8:
-        return max(s.pad_mean - _COLD_C, 0.0) / _RISE_K
+        return max(s.pad_mean - COLD_C, 0.0) / _RISE_K
     return abs(s.brake_torque * s.wheel_speed) / _POWER_W
 
 
@@ -158,7 +158,7 @@ def _friction_level(p, s):
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
     level *= max(1.0 + drawn_amount(e.drawn_gear_friction, s, 3, SUBSTEP_S), 0.1)
-    return level * max(1.0 - e.cold_grease.per_K * (s.caliper - _COLD_C), 0.1)
+    return level * max(1.0 - e.cold_grease.per_K * (s.caliper - COLD_C), 0.1)
 
 
 @njit
@@ -167,7 +167,7 @@ def _cold_viscosity(p, s):
     viscous = p.effects.cold_grease.viscous_Nms_per_rad
     if viscous == 0.0:
         return 0.0
-    return viscous * (2.0 ** (0.1 * max(_COLD_C - s.caliper, 0.0)) - 1.0)
+    return viscous * (2.0 ** (0.1 * max(COLD_C - s.caliper, 0.0)) - 1.0)
 
 
 @njit

@@ -7,14 +7,14 @@ are states.
 from math import ceil
 
 from emb_daemon.jit import Record, njit
-from emb_daemon.plant.brake import drawn_amount
+from emb_daemon.plant.brake import COLD_C, drawn_amount
 from emb_daemon.plant.records import CELLS
 from emb_daemon.wire.contract import CYCLE_S
 
-_STEFAN_BOLTZMANN = 5.670374419e-8
-_KELVIN = 273.15
-_REFERENCE_C = 20.0
-_CELL_M = 0.0004
+#: W/(m2 K4) (CODATA 2018), and 0 degC in K.
+_STEFAN_BOLTZMANN, _KELVIN = 5.670374419e-8, 273.15
+#: Temperature (degC) at which the properties and the friction of pads are stated, and width of a cell, m.
+_REFERENCE_C, _CELL_M = 20.0, 0.0004
 
 
 @njit
@@ -137,7 +137,7 @@ def _soften(p, s):
     rise = s.pad_mean - p.curve_temperature
     s.softening_memory += CYCLE_S / p.history_time * (rise - s.softening_memory)
     factor = 1.0 - p.softening * rise - p.softening_history * s.softening_memory
-    factor *= 1.0 - p.effects.caliper_softening.per_K * (s.caliper - 22.0)
+    factor *= 1.0 - p.effects.caliper_softening.per_K * (s.caliper - COLD_C)
     s.stiffness_factor = max(factor, 0.1)
 
 
