@@ -176,8 +176,37 @@ def _calibration(given: Calibration | str | Path | None) -> Calibration:
     return given if isinstance(given, Calibration) else load_calibration(Path(given))
 
 
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not isfinite(value) else value
+def _known(value: float | None, otherwise: float = _NAN) -> tuple[bool, float]:
+    """Whether there is a value, and the value or ``otherwise``; NaN and infinity are none."""
+    return (True, value) if value is not None and isfinite(value) else (False, otherwise)
+
+
+def _answer_of(e: np.void) -> Answer:
+    """An ESTIMATE row for programs that know no numpy."""
+    return Answer(
+        force_N=float(e["force"]),
+        sigma_N=float(e["sigma"]),
+        source=contract.SOURCES[int(e["source"])],
+        mode=contract.MODES[int(e["mode"])],
+        stiffness_force_N=float(e["stiffness_force"]),
+        torque_force_N=float(e["torque_force"]),
+        contact_angle_rad=float(e["contact_angle"]),
+        stiffness_factor=float(e["stiffness_factor"]),
+        inner_surface_C=float(e["surface"][0]),
+        inner_mean_C=float(e["mean"][0]),
+        outer_surface_C=float(e["surface"][1]),
+        outer_mean_C=float(e["mean"][1]),
+        reasons=contract.reason_words(e["reasons"]),
+    )
+
+
+#: Fields of a SAMPLE that say whether an input is there, and the reason if it is not.
+_LOST = {
+    "has_current": contract.CURRENT_LOST,
+    "has_thermocouple": contract.THERMOCOUPLE_LOST,
+    "has_wheel_speed": contract.WHEEL_SPEED_LOST,
+    "has_wheel_pulse": contract.WHEEL_PULSE_LOST,
+}
 
 
 class Estimator:
@@ -238,45 +267,18 @@ class Estimator:
                 raise ValueError(f"{name} = {value}: expected a finite number")
         if dt_s <= 0.0:
             raise ValueError(f"dt_s = {dt_s}: expected a time above zero")
-        current_A, caliper_C = _finite(current_A), _finite(caliper_C)
-        wheel_speed_rad_per_s, wheel_pulse = _finite(wheel_speed_rad_per_s), _finite(wheel_pulse)
-        sensor_force_N = _finite(sensor_force_N)
-        if backplates_C is not None and not all(map(isfinite, backplates_C)):
-            backplates_C = None
         row = self._sample[0]
         row["dt"] = dt_s if self._state["started"][0] else 0.0
         row["angle"], row["speed"] = angle_rad, speed_rad_per_s
-        row["has_current"], row["current_q"] = current_A is not None, _NAN if current_A is None else current_A
-        row["has_sensor_force"] = sensor_force_N is not None
-        row["sensor_force"] = _NAN if sensor_force_N is None else sensor_force_N
-        row["has_thermocouple"] = backplates_C is not None
-        inner, outer = backplates_C or (_NAN, _NAN)
+        row["has_current"], row["current_q"] = _known(current_A)
+        row["has_sensor_force"], row["sensor_force"] = _known(sensor_force_N)
+        row["has_thermocouple"] = backplates_C is not None and all(map(isfinite, backplates_C))
+        inner, outer = backplates_C if row["has_thermocouple"] else (_NAN, _NAN)
         row["inner_backplate"], row["outer_backplate"] = inner, outer
-        row["caliper"] = 0.5 * (inner + outer) if caliper_C is None else caliper_C
+        row["caliper"] = _known(caliper_C, 0.5 * (inner + outer))[1]
         row["has_status"], row["ambient"], row["vehicle_speed"] = True, ambient_C, vehicle_speed_m_per_s
-        row["has_wheel_speed"] = wheel_speed_rad_per_s is not None
-        row["wheel_speed"] = 0.0 if wheel_speed_rad_per_s is None else wheel_speed_rad_per_s
-        row["has_wheel_pulse"], row["wheel_pulse"] = wheel_pulse is not None, 0.0 if wheel_pulse is None else wheel_pulse
-        row["reasons"] = (
-            contract.CURRENT_LOST * (current_A is None)
-            | contract.THERMOCOUPLE_LOST * (backplates_C is None)
-            | contract.WHEEL_SPEED_LOST * (wheel_speed_rad_per_s is None)
-            | contract.WHEEL_PULSE_LOST * (wheel_pulse is None)
-        )
+        row["has_wheel_speed"], row["wheel_speed"] = _known(wheel_speed_rad_per_s, 0.0)
+        row["has_wheel_pulse"], row["wheel_pulse"] = _known(wheel_pulse, 0.0)
+        row["reasons"] = sum(reason for known, reason in _LOST.items() if not row[known])
         answer(self._sample, 1, self._state, self._parameters, self._estimate)
-        e = self._estimate[0]
-        return Answer(
-            force_N=float(e["force"]),
-            sigma_N=float(e["sigma"]),
-            source=contract.SOURCES[int(e["source"])],
-            mode=contract.MODES[int(e["mode"])],
-            stiffness_force_N=float(e["stiffness_force"]),
-            torque_force_N=float(e["torque_force"]),
-            contact_angle_rad=float(e["contact_angle"]),
-            stiffness_factor=float(e["stiffness_factor"]),
-            inner_surface_C=float(e["surface"][0]),
-            inner_mean_C=float(e["mean"][0]),
-            outer_surface_C=float(e["surface"][1]),
-            outer_mean_C=float(e["mean"][1]),
-            reasons=contract.reason_words(e["reasons"]),
-        )
+        return _answer_of(self._estimate[0])

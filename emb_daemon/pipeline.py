@@ -20,7 +20,7 @@ from emb_daemon.wire import contract
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
-from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.frames import FRAME, put
 from emb_daemon.wire.layout import LAYOUT, pack
 from emb_daemon.wire.receive import ACCEPTED, RECEPTION, SECOND_SENDER, new_reception, receive
 
@@ -385,6 +385,39 @@ def _head(b, row, index, age):
     row.reasons = reasons
 
 
+@njit
+def _status_of(e, kind):
+    """Status of one of an estimate's messages."""
+    if e.mode == contract.INIT or (kind == wire.PAD_TEMP and np.isnan(e.surface[0])):
+        return contract.STATUS_NOT_AVAILABLE
+    if e.mode == contract.FAULT:
+        return contract.STATUS_FAULT
+    return contract.STATUS_DEGRADED if e.reasons else contract.STATUS_OK
+
+
+@njit
+def _set_values(e, kind, asked, values):
+    """Signals of one of an estimate's messages, in the DBC's order and units; ``asked``: LIMITS of its corner."""
+    if kind == wire.CLAMP_FORCE:
+        values[0] = 1e-3 * e.force
+        values[1] = np.inf if e.mode == contract.INIT or e.mode == contract.FAULT else 1e-3 * e.sigma
+        values[2] = e.counter
+        values[3] = e.source
+        values[4] = e.age_cycles * (CYCLE_NS // 1_000_000)
+    elif kind == wire.PAD_TEMP:
+        values[0], values[1] = e.surface[0], e.mean[0]
+        values[2], values[3] = e.surface[1], e.mean[1]
+    elif kind == wire.ESTIMATOR_STATUS:
+        values[0] = e.mode
+        values[1] = e.stiffness_factor
+        values[2] = e.contact_angle
+        values[3] = e.reasons & 0xFFFF
+    else:
+        values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result
+        values[3], values[4] = 1e-3 * asked.low_force, 1e-3 * asked.high_force
+        values[5], values[6] = asked.dither_amplitude, asked.dither_frequency
+
+
 @entry(Array(ESTIMATE), int, Array(TRANSMISSION), Array(LAYOUT), Array(LIMITS), Array(FRAME), returns=1)
 def _broadcast(estimates, count, transmission, layout, limits, frames):
     """Encode estimates; a message is due when its period has passed. Returns the number of frames."""
@@ -396,45 +429,13 @@ def _broadcast(estimates, count, transmission, layout, limits, frames):
             period = wires.sent_cycle_ns[kind] // CYCLE_NS
             if kind != wire.CLAMP_FORCE and e.cycle // period == (e.cycle - e.elapsed_cycles) // period:
                 continue
-            usable = e.mode != contract.INIT and e.mode != contract.FAULT
-            if e.mode == contract.INIT:
-                status = contract.STATUS_NOT_AVAILABLE
-            elif not usable:
-                status = contract.STATUS_FAULT
-            else:
-                status = contract.STATUS_DEGRADED if e.reasons else contract.STATUS_OK
-            if kind == wire.CLAMP_FORCE:
-                values[0] = 1e-3 * e.force
-                values[1] = 1e-3 * e.sigma if usable else np.inf
-                values[2] = e.counter
-                values[3] = e.source
-                values[4] = e.age_cycles * (CYCLE_NS // 1_000_000)
-            elif kind == wire.PAD_TEMP:
-                values[0], values[1] = e.surface[0], e.mean[0]
-                values[2], values[3] = e.surface[1], e.mean[1]
-                if np.isnan(e.surface[0]):
-                    status = contract.STATUS_NOT_AVAILABLE
-            elif kind == wire.ESTIMATOR_STATUS:
-                values[0] = e.mode
-                values[1] = e.stiffness_factor
-                values[2] = e.contact_angle
-                values[3] = e.reasons & 0xFFFF
-            else:
-                asked = limits[e.corner]
-                values[0], values[1], values[2] = e.adapt_request, e.adapt_progress, e.adapt_result
-                values[3], values[4] = 1e-3 * asked.low_force, 1e-3 * asked.high_force
-                values[5], values[6] = asked.dither_amplitude, asked.dither_frequency
+            _set_values(e, kind, limits[e.corner], values)
             payload = np.uint64(0)
             for column in range(wires.sent_count[kind]):
                 payload |= pack(values[column], wires.sent[kind, column])
             can_id = wires.sent_id[kind, e.corner]
             counter = counters[kind, e.corner]
             counters[kind, e.corner] = (counter + 1) % COUNTER_MODULO
-            frame = frames[sent]
-            sent += 1
-            frame.time_ns = e.time_ns
-            frame.can_id = can_id
-            frame.length = 8
-            frame.flags = 0
-            frame.data = protect(can_id, payload, counter, status)
+            data = protect(can_id, payload, counter, _status_of(e, kind))
+            sent = put(frames, sent, e.time_ns, can_id, data, 0)
     return sent

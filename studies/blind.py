@@ -33,7 +33,7 @@ from emb_daemon.diagnose.selection import LASTING
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse
-from emb_daemon.plant.brake import ONSET, POWER, SATURATION, SIGNALS, drawn
+from emb_daemon.plant.brake import ONSET, POWER, SATURATION, SIGNALS, drawn_amount
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import PLANT, PLANT_STATE
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
@@ -313,7 +313,7 @@ def amounts(effect: Mapping[str, Mapping[str, float]], truth: np.ndarray) -> np.
         for key in _FOLLOWED:
             state[key] = row[key]
         state["pad_mean"] = row["mean"].mean()
-        result[index] = drawn(plant["effects"][name], state, 0, CYCLE_S)
+        result[index] = drawn_amount(plant["effects"][name], state, 0, CYCLE_S)
     return result
 
 

@@ -26,7 +26,7 @@ from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import Drive
 from emb_daemon.fleet.findings import ALL, Findings, load
 from emb_daemon.fleet.ingest import ingest_frames
-from emb_daemon.fleet.scores import Questions
+from emb_daemon.fleet.scores import Scorer
 from emb_daemon.offline import log_of
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
@@ -89,11 +89,11 @@ def day_drive(rng: np.random.Generator) -> sc.Schedule:
 def _sizes() -> dict[str, float]:
     """RMS (N) in contact that one unit of each cause makes on a typical drive."""
     frames, _ = sc.simulate_log(plant_from_calibration(_calibration()), day_drive(np.random.default_rng(0)), reference=False)
-    questions = Questions(_calibration())
-    score = questions.ask(log_of(frames), Drive("", "FL", "", 0, ""))
+    scorer = Scorer(_calibration())
+    score = scorer.score(log_of(frames), Drive("", "FL", "", 0, ""))
     size = np.sqrt(np.diag(score.products)[:-1] / score.loaded)
     found: dict[str, float] = {}
-    for cause, value in zip(questions.causes, size.tolist(), strict=True):
+    for cause, value in zip(scorer.causes, size.tolist(), strict=True):
         found.setdefault(cause.name, value)
     return found
 

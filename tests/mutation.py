@@ -132,6 +132,7 @@ SCOPE = {
     "emb_daemon/adapt/memory.py": _KEPT,
     "emb_daemon/adapt/snapshots.py": _KEPT,
     "emb_daemon/runtime/daemon.py": _RUNTIME,
+    "emb_daemon/runtime/changes.py": _RUNTIME,
     "emb_daemon/runtime/rawcan.py": _RUNTIME,
 }
 _SWAPPED = {

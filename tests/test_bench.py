@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.bench.logs import difference
-from emb_daemon.bench.loop import held_up, measure_loop, measure_start
+from emb_daemon.bench.loop import is_held_up, measure_loop, measure_start
 from emb_daemon.bench.report import text, verdict
 from emb_daemon.cli import bench
 from emb_daemon.estimator.records import ESTIMATE
@@ -114,9 +114,9 @@ def test_each_budget_can_be_missed(figures, where, value, budget):
 
 def test_a_period_is_held_up_only_if_nothing_of_the_process_ran():
     """A helper thread that keeps the interpreter to itself makes the loop wake as late, and works."""
-    assert held_up(late_ns=4_090_000, worked_ns=20_000)
-    assert not held_up(late_ns=4_090_000, worked_ns=4_000_000)
-    assert not held_up(late_ns=3_900_000, worked_ns=20_000)
+    assert is_held_up(late_ns=4_090_000, worked_ns=20_000)
+    assert not is_held_up(late_ns=4_090_000, worked_ns=4_000_000)
+    assert not is_held_up(late_ns=3_900_000, worked_ns=20_000)
 
 
 def test_what_is_missing_is_said(figures):

@@ -228,24 +228,24 @@ class TestPacer:
 
     def test_it_wakes_just_after_a_sample_is_due(self):
         pacer = Pacer(1_000_000)
-        pacer.arrived(0, 1_000_000)
+        pacer.note_arrival(0, 1_000_000)
         assert 1_000_000 + CYCLE_NS < pacer.next_wake(1_000_001) < 1_000_000 + CYCLE_NS + 500_000
 
     def test_corners_that_come_together_are_answered_together(self):
         pacer = Pacer(1_000_000)
-        pacer.arrived(0, 1_000_000)
-        pacer.arrived(1, 1_100_000)
+        pacer.note_arrival(0, 1_000_000)
+        pacer.note_arrival(1, 1_100_000)
         assert pacer.next_wake(1_100_001) >= 1_100_000 + CYCLE_NS
 
     def test_corners_apart_are_answered_apart(self):
         pacer = Pacer(1_000_000)
-        pacer.arrived(0, 1_000_000)
-        pacer.arrived(1, 3_000_000)
+        pacer.note_arrival(0, 1_000_000)
+        pacer.note_arrival(1, 3_000_000)
         assert pacer.next_wake(3_000_001) < 2_000_000 + CYCLE_NS
 
     def test_a_lost_sample_does_not_stop_the_ticks(self):
         pacer = Pacer(0)
-        pacer.arrived(0, 0)
+        pacer.note_arrival(0, 0)
         pacer.last_tick_ns = 9 * CYCLE_NS
         assert pacer.next_wake(9 * CYCLE_NS + 1) <= 10 * CYCLE_NS + 500_000
 

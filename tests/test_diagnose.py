@@ -388,7 +388,8 @@ def uneven_disc(calibration, tmp_path_factory, counted_reads):
     for name, frames in zip(("fit", "val"), _logs(calibration, 11, hidden), strict=True):
         (folder / f"{name}.log").write_text(format_candump(frames))
     arguments = ["diagnose", str(folder / "fit.log"), "--calibration", str(resource("config/calibration.yaml"))]
-    with counted_reads() as reads:
+    with counted_reads() as reads, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "86400")
         assert main([*arguments, "--validate", str(folder / "val.log"), "--output", str(folder / "out")]) == 0
     assert reads == {"fit.log": 1, "val.log": 1}, "each log is read once"
     return folder, json.loads((folder / "out" / "report.json").read_text())
@@ -434,6 +435,7 @@ def test_report_keeps_the_contract(uneven_disc):
     assert accepted == sorted(accepted, reverse=True)
     page = (folder / "out" / "report.html").read_text()
     assert "disc thickness variation" in page and "https://" not in page.split("<script")[0]
+    assert load_calibration(folder / "out" / "calibration.yaml").provenance.date == "1970-01-02", "not SOURCE_DATE_EPOCH"
 
 
 def test_replay_with_the_written_calibration_gives_the_after_figure_to_the_last_digit(uneven_disc, capsys):

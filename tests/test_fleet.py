@@ -139,7 +139,7 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
-@pytest.mark.parametrize("lives", [0, 3])
+@pytest.mark.parametrize("lives", [0, 1])
 def test_workers_may_die(tmp_path, monkeypatch, lives):
     """Dask counts a worker's death against every task that lay there: only who kills one alone is given up."""
     monkeypatch.setattr("emb_daemon.fleet.cluster._LIVES", lives)
@@ -281,7 +281,7 @@ def fleet(tmp_path_factory, calibration):
     for drives in dataset.by_unit(dataset.drives(root)).values():
         assert scores.score_unit(root, drives, calibration) == {}
     factors = {unit: {"batch": batch} for unit, batch in units.items()}
-    found = findings.find(scores.read_fleet(root, calibration), scores.Questions(calibration), "", factors, {})
+    found = findings.find(scores.read_fleet(root, calibration), scores.Scorer(calibration).causes, "", factors, {})
     findings.save(found, root)
     return root, found
 
@@ -309,8 +309,8 @@ def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monke
     drives = next(iter(dataset.by_unit(dataset.drives(root)).values()))
     path = scores.scores_path(root, drives[0].unit, drives[0].corner)
     before, asked = path.read_bytes(), []
-    ask = scores.Questions.ask
-    monkeypatch.setattr(scores.Questions, "ask", lambda self, log, drive: asked.append(drive) or ask(self, log, drive))
+    score = scores.Scorer.score
+    monkeypatch.setattr(scores.Scorer, "score", lambda self, log, drive: asked.append(drive) or score(self, log, drive))
     scores.score_unit(root, drives, calibration)
     assert not asked
     scores.score_unit(root, drives[:2], calibration)
@@ -324,7 +324,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
     log, _ = dataset.read_drive(root, drive)
     still = replace(log, samples=log.samples[:100], time_ns=log.time_ns[:100])
     with pytest.raises(InputError, match=r"the pads never touch|no brake application"):
-        scores.Questions(calibration).ask(still, drive)
+        scores.Scorer(calibration).score(still, drive)
 
 
 def test_a_training_is_learned_once(tmp_path, calibration):

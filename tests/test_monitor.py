@@ -181,14 +181,14 @@ def test_the_demo_shows_whole_columns_at_any_width(width, left_out):
     recorder = Recorder(("FL", "FR", "RL", "RR"), 1.0)
     truth = np.zeros(4, TRUTH)
     truth["force"], truth["mean"][:, 0] = 23_456.0, 345.0
-    recorder.sent(100 * S, truth)
+    recorder.note_sent(100 * S, truth)
     for corner in recorder.corners:
         frames = (
             _force(0, 23.45, corner=corner),
             wirekit.frame(f"EMB_{corner}_PadTemp", 100 * S, InnerSurfaceTemp=512.0, InnerMeanTemp=345.0),
             wirekit.frame(f"EMB_{corner}_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8),
         )
-        recorder.heard(np.concatenate(frames))
+        recorder.note_heard(np.concatenate(frames))
     daemon, live = SimpleNamespace(ticks=10, missed=0), SimpleNamespace(late=0, lost=0)
     console = Console(width=width, height=24, color_system=None, force_terminal=True)
     with console.capture() as capture:

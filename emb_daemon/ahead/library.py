@@ -112,7 +112,7 @@ def default_path() -> Path:
     return Path(sys.prefix, "lib", "emb_daemon", "kernels.so")
 
 
-def found() -> Path | None:
+def find() -> Path | None:
     """The library to look at: what `VARIABLE` names, else that at `default_path`; None if there is none, or none is to be
     used."""
     named = os.environ.get(VARIABLE)
@@ -166,7 +166,7 @@ _says = "kernels are compiled by numba"
 
 
 def load() -> str:
-    """Use the kernels of the library that is `found` in this process.
+    """Use the kernels of the library that is found by `find` in this process.
 
     Before anything that has kernels is imported. Returns why a library that is there is not used, numba being used instead;
     empty if one is used, or there is none.
@@ -175,7 +175,7 @@ def load() -> str:
         InputError: numba is not installed either.
     """
     global _loaded, _says
-    path, why = found(), ""
+    path, why = find(), ""
     if path:
         try:
             if "emb_daemon.jit" in sys.modules:

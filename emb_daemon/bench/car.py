@@ -70,13 +70,13 @@ class _Answers:
         self.latency_us: list[float] = []
         self.samples = 0
 
-    def sent(self, time_ns: int, truth: np.ndarray) -> None:
+    def note_sent(self, time_ns: int, truth: np.ndarray) -> None:
         if time_ns:
             corners = range(len(truth))
             self._sent[list(corners), truth["counter"]] = time_ns
             self.samples += len(truth)
 
-    def heard(self, frames: np.ndarray) -> None:
+    def note_heard(self, frames: np.ndarray) -> None:
         for frame in frames[np.isin(frames["can_id"], self._ids)]:
             if unpack(frame["data"], self._source) < PREDICTED:
                 corner, counter = self._ids.index(frame["can_id"]), int(unpack(frame["data"], self._counter))
@@ -96,7 +96,7 @@ def main() -> None:
     print("ready", time.process_time(), flush=True)
     bus.wait(300.0)
     bus.drain()
-    live.run(lambda: False, seconds, answers.sent, answers.heard)
+    live.run(lambda: False, seconds, answers.note_sent, answers.note_heard)
     latency = np.array(answers.latency_us or [np.nan])
     result = {"samples": answers.samples, "answered": len(answers.latency_us), "late": live.late, "lost": live.lost}
     result["in_time"] = int(np.sum(latency <= CYCLE_NS / 1e3))

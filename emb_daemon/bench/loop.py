@@ -127,7 +127,7 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     }
 
 
-def held_up(late_ns: int, worked_ns: int) -> bool:
+def is_held_up(late_ns: int, worked_ns: int) -> bool:
     """Whether the machine caused a wake-up ``late_ns`` too late, by the CPU time of the whole process meanwhile."""
     return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
 

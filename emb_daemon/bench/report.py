@@ -7,36 +7,9 @@ from typing import Any
 def verdict(result: dict[str, Any]) -> list[dict[str, Any]]:
     """Each budget: ``measured``, ``limit``, ``unit``, and ``met``, whether the machine holds it.
 
-    Budgets of the loop apply to the run with four corners, or to the last run if there was none. ``sense`` says which side of
-    the limit is good, ``margin`` the distance to it, as a share of the limit. A figure that could not be measured is NaN and
-    not met.
+    ``sense`` says which side of the limit is good, ``margin`` the distance to it, as a share of the limit. A figure that could
+    not be measured is NaN and not met.
     """
-    loop = next((loop for loop in result["loops"] if loop["corners"] == 4), result["loops"][-1])
-    logs, step, answers, empty = result["logs"], result["logs"]["step"], loop["answers"], loop["empty_loop"]
-    corners = loop["corners"]
-    wake = loop["cyclictest"] or empty
-    whose = "cyclictest's" if loop["cyclictest"] else "an empty loop's"
-    first, last = (value / 1024.0 for value in loop["resident_KiB"])
-    in_time = 100.0 * answers["in_time"] / max(answers["samples"], 1)
-    budgets = [
-        ("compiled step of one corner, both pads", step["compiled_us"], "<=", 3.0, "us"),
-        (f"tick of {corners} corners, p99", loop["tick"]["p99_us"], "<=", 500.0, "us"),
-        (
-            f"last frame of a sample to answer, p99, minus {whose} wake-up",
-            answers["p99_us"] - wake["p99_us"],
-            "<=",
-            600.0,
-            "us",
-        ),
-        (f"share of one core, {corners} corners", 100.0 * loop["core_share"], "<=", 12.0, "%"),
-        ("samples answered within their cycle", in_time, ">=", 99.9, "%"),
-        ("ticks missed, except those held up by the machine", loop["missed"] - loop["held_up"], "<=", 0, "ticks"),
-        ("start to ready, kernels compiled before", loop["ready"]["wall_s"], "<=", 3.0, "s"),
-        ("start to ready, nothing compiled", result["cold_start"]["wall_s"], "<=", 20.0, "s"),
-        ("replay of a single-corner log", logs["replay_times_real_time"], ">=", 1000.0, "times real time"),
-        (f"resident memory of the daemon, {corners} corners", last, "<=", 250.0, "MiB"),
-        ("its growth after the first second", last - first, "<=", 4.0, "MiB"),
-    ]
     return [
         {
             "budget": name,
@@ -47,7 +20,33 @@ def verdict(result: dict[str, Any]) -> list[dict[str, Any]]:
             "margin": ((limit - value) if sense == "<=" else (value - limit)) / limit if limit else None,
             "met": bool(value <= limit if sense == "<=" else value >= limit),
         }
-        for name, value, sense, limit, unit in budgets
+        for name, value, sense, limit, unit in _budgets(result)
+    ]
+
+
+def _budgets(result: dict) -> list[tuple[str, float, str, float, str]]:
+    """(budget, measured, sense, limit, unit). Those of the loop apply to the run with four corners, or to the last run if
+    there was none."""
+    loop = next((loop for loop in result["loops"] if loop["corners"] == 4), result["loops"][-1])
+    logs, step, answers, empty = result["logs"], result["logs"]["step"], loop["answers"], loop["empty_loop"]
+    corners = loop["corners"]
+    wake = loop["cyclictest"] or empty
+    whose = "cyclictest's" if loop["cyclictest"] else "an empty loop's"
+    first, last = (value / 1024.0 for value in loop["resident_KiB"])
+    response = answers["p99_us"] - wake["p99_us"]
+    in_time = 100.0 * answers["in_time"] / max(answers["samples"], 1)
+    return [
+        ("compiled step of one corner, both pads", step["compiled_us"], "<=", 3.0, "us"),
+        (f"tick of {corners} corners, p99", loop["tick"]["p99_us"], "<=", 500.0, "us"),
+        (f"last frame of a sample to answer, p99, minus {whose} wake-up", response, "<=", 600.0, "us"),
+        (f"share of one core, {corners} corners", 100.0 * loop["core_share"], "<=", 12.0, "%"),
+        ("samples answered within their cycle", in_time, ">=", 99.9, "%"),
+        ("ticks missed, except those held up by the machine", loop["missed"] - loop["held_up"], "<=", 0, "ticks"),
+        ("start to ready, kernels compiled before", loop["ready"]["wall_s"], "<=", 3.0, "s"),
+        ("start to ready, nothing compiled", result["cold_start"]["wall_s"], "<=", 20.0, "s"),
+        ("replay of a single-corner log", logs["replay_times_real_time"], ">=", 1000.0, "times real time"),
+        (f"resident memory of the daemon, {corners} corners", last, "<=", 250.0, "MiB"),
+        ("its growth after the first second", last - first, "<=", 4.0, "MiB"),
     ]
 
 

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import jit
-from emb_daemon.bench.loop import held_up
+from emb_daemon.bench.loop import is_held_up
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.runtime import daemon as loop
 from emb_daemon.runtime.journal import set_up_logging
@@ -118,7 +118,7 @@ class Ledger:
     def _attribute(self, now_ns: int, pacer: Pacer) -> None:
         """Count missed periods that the machine caused: the loop was not woken, and nothing of the process ran."""
         missed, self._missed = self._daemons[0].missed - self._missed, self._daemons[0].missed
-        if missed and held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
+        if missed and is_held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
             self._held_up += missed
 
     def _stand(self) -> tuple:

@@ -1,6 +1,9 @@
-"""Calibration files: load, hash, write."""
+"""Calibration files: load, hash, date, write."""
 
+import datetime
 import hashlib
+import os
+import time
 from pathlib import Path
 
 import msgspec
@@ -24,6 +27,13 @@ def calibration_hash(calibration: Calibration) -> str:
     """Twelve hexadecimal digits over the values, whatever the file's formatting; provenance does not count."""
     values = msgspec.to_builtins(msgspec.structs.replace(calibration, provenance=None))
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:12]
+
+
+def date_of_today() -> str:
+    """Date that a result states, ISO 8601, in universal time. ``SOURCE_DATE_EPOCH`` (s since 1970) overrides the clock, so
+    that the same inputs can give the same file."""
+    seconds = int(os.environ.get("SOURCE_DATE_EPOCH") or time.time())
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).date().isoformat()
 
 
 def dump_calibration(calibration: Calibration) -> str:

@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--seconds {arguments.seconds:g}: expected at least {_LEAST_S:g}: the first second does not count")
     from emb_daemon.ahead import library
 
-    kernels = library.found()
+    kernels = library.find()
     try:
         if kernels:
             library.check(kernels)

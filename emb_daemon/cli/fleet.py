@@ -91,11 +91,7 @@ def _ingest(arguments: argparse.Namespace) -> int:
     damaged = [known for known in done if known["fault"]]
     drives = sum(len(known["drives"]) for known in done)
     print(f"{len(done)} of {len(paths)} logs are new: {drives} drives, {len(damaged)} damaged")
-    for known in damaged:
-        print(f"  {known['fault']}", file=sys.stderr)
-    for known in done:
-        if known["notes"]:
-            print(f"  {known['notes']}", file=sys.stderr)
+    _print_faults([known["fault"] for known in damaged] + [known["notes"] for known in done if known["notes"]])
     return 0
 
 
@@ -110,9 +106,13 @@ def _replay(arguments: argparse.Namespace) -> int:
     faults = [text for text in done if isinstance(text, str)]
     seconds = sum(figures["seconds"] for figures in done if not isinstance(figures, str))
     print(f"{len(done) - len(faults)} of {len(drives)} drives replayed, {seconds / 3600.0:.2f} h")
-    for text in faults:
-        print(f"  {text}", file=sys.stderr)
+    _print_faults(faults)
     return 0
+
+
+def _print_faults(texts: list[str]) -> None:
+    for text in texts:
+        print(f"  {text}", file=sys.stderr)
 
 
 def _fault(_item: Any, reason: str) -> str:
@@ -127,10 +127,10 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     factors = findings.read_units(arguments.units) if arguments.units else {}
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(scores.score_unit, root, calibration=calibration, resume=arguments.resume)
-    done = _work(arguments, "asking drives", task, groups, lambda drives, reason: {d.digest: reason for d in drives})
+    done = _work(arguments, "scoring drives", task, groups, lambda drives, reason: {d.digest: reason for d in drives})
     silent = {digest: reason for told in done for digest, reason in told.items()}
     fleet = scores.read_fleet(root, calibration)
-    found = findings.find(fleet, scores.Questions(calibration), calibration_hash(calibration), factors, silent)
+    found = findings.find(fleet, scores.Scorer(calibration).causes, calibration_hash(calibration), factors, silent)
     findings.save(found, root)
     _print(found)
     return 0
@@ -168,9 +168,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     done = _work(arguments, "learning", task, groups, _fault)
     learned = [told for told in done if not isinstance(told, str)]
     print(f"{len(learned)} units, {sum(told['trainings'] for told in learned)} trainings accepted")
-    for text in done:
-        if isinstance(text, str):
-            print(f"  {text}", file=sys.stderr)
+    _print_faults([text for text in done if isinstance(text, str)])
     return 0
 
 

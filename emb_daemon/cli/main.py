@@ -5,6 +5,7 @@ import importlib.util
 import io
 import os
 import sys
+import types
 
 from emb_daemon import __version__
 from emb_daemon.errors import InputError, Unavailable
@@ -64,18 +65,22 @@ def main(argv: list[str] | None = None) -> int:
         # Characters that the terminal's encoding lacks are replaced; they must not end the program.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    chosen, _ = _parser(COMMANDS).parse_known_args(argv[:1])
-    module = importlib.import_module(f"emb_daemon.cli.{chosen.command}")
+    command = _parser(COMMANDS).parse_known_args(argv[:1])[0].command
+    module = importlib.import_module(f"emb_daemon.cli.{command}")
     parser = argparse.ArgumentParser(
-        prog=f"emb-daemon {chosen.command}",
-        description=COMMANDS[chosen.command][0].upper() + COMMANDS[chosen.command][1:] + ".",
+        prog=f"emb-daemon {command}",
+        description=COMMANDS[command][0].upper() + COMMANDS[command][1:] + ".",
         epilog=f"example:\n  {module.EXAMPLE}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     module.add_arguments(parser)
-    arguments = parser.parse_args(argv[1:])
+    return _status(command, module, parser.parse_args(argv[1:]))
+
+
+def _status(command: str, module: types.ModuleType, arguments: argparse.Namespace) -> int:
+    """Exit status of a command; prints the error that ended it."""
     try:
-        for library in (*_NEED.get(chosen.command, ()), *(() if chosen.command in _WITHOUT_NUMBA else ("numba",))):
+        for library in (*_NEED.get(command, ()), *(() if command in _WITHOUT_NUMBA else ("numba",))):
             if importlib.util.find_spec(library) is None:
                 raise ModuleNotFoundError(name=library)
         return module.run(arguments)
@@ -87,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
         if missing not in (*_EXTRAS, "numba"):
             raise
         package = f"'emb_daemon[{_EXTRAS[missing]}]'" if missing in _EXTRAS else missing
-        print(f"emb-daemon {chosen.command} needs {error.name}: pip install {package}", file=sys.stderr)
+        print(f"emb-daemon {command} needs {error.name}: pip install {package}", file=sys.stderr)
         return 2
     except Unavailable as error:
         print(error, file=sys.stderr)
@@ -98,10 +103,10 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     except OSError as error:
         # An error with a file name is the user's; another one may be gone later.
-        print(f"{error.filename or f'emb-daemon {chosen.command}'}: {error.strerror or error}", file=sys.stderr)
+        print(f"{error.filename or f'emb-daemon {command}'}: {error.strerror or error}", file=sys.stderr)
         return 2 if error.filename else 1
     except MemoryError:
-        print(f"emb-daemon {chosen.command}: not enough memory on this machine", file=sys.stderr)
+        print(f"emb-daemon {command}: not enough memory on this machine", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -33,28 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from emb_daemon.monitor.listener import Listener
     from emb_daemon.monitor.terminal import listen, watch
-    from emb_daemon.runtime.bus import open_bus
 
-    if arguments.json and not arguments.once:
-        raise InputError("--json: expected together with --once")
     handed_out = any(value is not None for value in (arguments.web, arguments.udp, arguments.record))
-    if handed_out and arguments.once:
-        raise InputError("--once: expected without --web, --record and --udp")
-    if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
-        raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
-    if not arguments.once and not handed_out and not sys.stdout.isatty():
-        raise InputError("monitor: the output is not a terminal; in scripts use --once, with or without --json")
+    _check(arguments, handed_out)
     options = bus_options(arguments)
-    if arguments.mapping:
-        from emb_daemon.logs.live import ReferenceBus, open_buses
-        from emb_daemon.logs.mapping import Mapping
-
-        mapping = Mapping(arguments.mapping)
-        bus = ReferenceBus(open_buses(options, mapping), mapping, Listener().ids)
-    else:
-        bus = open_bus(**options, ids=Listener().ids)
+    bus = _open_bus(arguments, options)
     title = " ".join(str(options[name]) for name in ("interface", "channel") if options[name])
     try:
         if handed_out:
@@ -74,6 +58,30 @@ def run(arguments: argparse.Namespace) -> int:
 
         print("\n".join(summary(listener, now)))
     return 0
+
+
+def _check(arguments: argparse.Namespace, handed_out: bool) -> None:
+    if arguments.json and not arguments.once:
+        raise InputError("--json: expected together with --once")
+    if handed_out and arguments.once:
+        raise InputError("--once: expected without --web, --record and --udp")
+    if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
+        raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
+    if not arguments.once and not handed_out and not sys.stdout.isatty():
+        raise InputError("monitor: the output is not a terminal; in scripts use --once, with or without --json")
+
+
+def _open_bus(arguments: argparse.Namespace, options: dict):
+    from emb_daemon.monitor.listener import Listener
+    from emb_daemon.runtime.bus import open_bus
+
+    if arguments.mapping:
+        from emb_daemon.logs.live import ReferenceBus, open_buses
+        from emb_daemon.logs.mapping import Mapping
+
+        mapping = Mapping(arguments.mapping)
+        return ReferenceBus(open_buses(options, mapping), mapping, Listener().ids)
+    return open_bus(**options, ids=Listener().ids)
 
 
 def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:

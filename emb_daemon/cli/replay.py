@@ -53,29 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.calibration.parameters import moved
-    from emb_daemon.logs.contradictions import other_motor
     from emb_daemon.logs.write import FRAME_ENDINGS, ending_of, write_frames
     from emb_daemon.replay import Replay
-    from emb_daemon.wire.layout import CORNERS
 
     _check(arguments)
-    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
-    if arguments.pad_thickness is not None:
-        calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
-    if not calibration.contact.is_in_reach:
-        clearance = calibration.contact.clearance_rad
-        print(
-            f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
-            "are clamp forces, never negative; `diagnose` takes a load of either sign",
-            file=sys.stderr,
-        )
-    if arguments.mapping and not arguments.calibration:
-        print(
-            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
-            file=sys.stderr,
-        )
+    calibration = _calibration(arguments)
     read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
     sign = np.asarray
     if arguments.keys:
@@ -90,10 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     for note in replay.notes:
         print(note, file=sys.stderr)
     if arguments.calibration:
-        motor = calibration.motor.torque_constant_Nm_per_A, calibration.motor.inertia_kg_m2
-        for result in results:
-            for line in other_motor(result.samples, *motor):
-                print(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}", file=sys.stderr)
+        _tell_other_motor(results, calibration.motor)
     for result in results if arguments.measured_torque else ():
         if not np.isfinite(result.reference.brake_torque_Nm).any():
             raise InputError(f"{result.path}: no brake torque (BrakeTorqueRef) in it; expected without --measured-torque")
@@ -109,6 +88,39 @@ def run(arguments: argparse.Namespace) -> int:
         for figures in report:
             _print(figures)
     return 0
+
+
+def _calibration(arguments: argparse.Namespace):
+    """The calibration with the pads that are mounted; prints to stderr for what it is none."""
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.parameters import moved
+
+    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    if arguments.pad_thickness is not None:
+        calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
+    if not calibration.contact.is_in_reach:
+        clearance = calibration.contact.clearance_rad
+        print(
+            f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
+            "are clamp forces, never negative; `diagnose` takes a load of either sign",
+            file=sys.stderr,
+        )
+    if arguments.mapping and not arguments.calibration:
+        print(
+            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
+            file=sys.stderr,
+        )
+    return calibration
+
+
+def _tell_other_motor(results, motor):
+    """Print to stderr where current and motion of a log are not those of the calibration's ``motor``."""
+    from emb_daemon.logs.contradictions import other_motor
+    from emb_daemon.wire.layout import CORNERS
+
+    for result in results:
+        for line in other_motor(result.samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2):
+            print(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}", file=sys.stderr)
 
 
 def _secure(arguments: argparse.Namespace, read):

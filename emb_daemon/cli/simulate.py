@@ -37,40 +37,14 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
     from emb_daemon.plant.scenarios import scenario
-    from emb_daemon.runtime.bus import open_bus
-    from emb_daemon.wire.keys import load_keys
-    from emb_daemon.wire.layout import CORNERS, default_layout
-    from emb_daemon.wire.secoc import load_links
+    from emb_daemon.wire.layout import CORNERS
 
-    if arguments.seconds is not None and not 0.0 < arguments.seconds < float("inf"):
-        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0; leave it out to run until Ctrl-C")
-    if arguments.seed < 0:
-        raise InputError(f"--seed {arguments.seed}: expected 0 or more")
-    if (arguments.keys is None) != (arguments.state is None):
-        raise InputError("--keys and --state: expected both or neither")
-    if arguments.keys and arguments.mapping:
-        raise InputError("--keys: cannot be used with --mapping, whose messages have no authentication")
+    _check(arguments)
     schedule = scenario(arguments.scenario)
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
-    seeds = [arguments.seed + index for index in range(len(corners))]
-    plants = np.array([plant_from_calibration(calibration, seed) for seed in seeds])
-    # The daemon's broadcasts, although the car itself reacts to EMB_c_AdaptRequest only.
-    ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
-    sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
-    ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
-    if arguments.mapping:
-        from emb_daemon.logs.mapping import Mapping
-        from emb_daemon.logs.simulated import open_simulated
-
-        bus = open_simulated(bus_options(arguments), Mapping(arguments.mapping), ids)
-    else:
-        bus = open_bus(**bus_options(arguments), ids=ids)
-    if arguments.keys:
-        from emb_daemon.runtime.secured import Authentication, FreshnessFile, SecuredBus
-
-        keys, file = load_keys(arguments.keys), FreshnessFile(arguments.state)
-        bus = SecuredBus(bus, Authentication(heard, sent, keys, file.begin_trip(), file))
+    plants = np.array([plant_from_calibration(calibration, arguments.seed + row) for row in range(len(corners))])
+    bus = _open_bus(arguments, corners)
     live = LiveCar(Car(plants, corners, arguments.seed, arguments.reference), bus, schedule)
     stopped = stop_signals()
     live.warm_up()
@@ -81,3 +55,38 @@ def run(arguments: argparse.Namespace) -> int:
         bus.close()
     print(f"{live.ticks} cycles, {live.late} late, {live.lost} lost, {bus.unsent} frames not sent")
     return 0
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    if arguments.seconds is not None and not 0.0 < arguments.seconds < float("inf"):
+        raise InputError(f"--seconds {arguments.seconds:g}: expected more than 0; leave it out to run until Ctrl-C")
+    if arguments.seed < 0:
+        raise InputError(f"--seed {arguments.seed}: expected 0 or more")
+    if (arguments.keys is None) != (arguments.state is None):
+        raise InputError("--keys and --state: expected both or neither")
+    if arguments.keys and arguments.mapping:
+        raise InputError("--keys: cannot be used with --mapping, whose messages have no authentication")
+
+
+def _open_bus(arguments: argparse.Namespace, corners: tuple[str, ...]):
+    from emb_daemon.runtime.bus import open_bus
+    from emb_daemon.wire.keys import load_keys
+    from emb_daemon.wire.layout import default_layout
+    from emb_daemon.wire.secoc import load_links
+
+    # The daemon's broadcasts, although the car itself reacts to EMB_c_AdaptRequest only.
+    ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
+    sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
+    ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
+    if arguments.mapping:
+        from emb_daemon.logs.mapping import Mapping
+        from emb_daemon.logs.simulated import open_simulated
+
+        return open_simulated(bus_options(arguments), Mapping(arguments.mapping), ids)
+    bus = open_bus(**bus_options(arguments), ids=ids)
+    if not arguments.keys:
+        return bus
+    from emb_daemon.runtime.secured import Authentication, FreshnessFile, SecuredBus
+
+    keys, file = load_keys(arguments.keys), FreshnessFile(arguments.state)
+    return SecuredBus(bus, Authentication(heard, sent, keys, file.begin_trip(), file))

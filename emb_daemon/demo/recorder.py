@@ -65,13 +65,13 @@ class Recorder:
         #: Listener of the live view, and number of frames that it has received.
         self._listener, self._listened = Listener(), 0
 
-    def sent(self, time_ns: int, truth: np.ndarray) -> None:
+    def note_sent(self, time_ns: int, truth: np.ndarray) -> None:
         """Note a cycle of the car that left at ``time_ns``, or was lost (0)."""
         self.truth[self.cycles] = truth
         self.sent_ns[self.cycles] = time_ns
         self.cycles += 1
 
-    def heard(self, frames: np.ndarray) -> None:
+    def note_heard(self, frames: np.ndarray) -> None:
         """Note frames that were received from the bus."""
         room = min(len(frames), len(self.frames) - self.count)
         self.frames[self.count : self.count + room] = frames[:room]

@@ -5,10 +5,10 @@ import logging
 import sys
 import tempfile
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +26,12 @@ from emb_daemon.runtime.realtime import settle_memory, use_fifo
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Period of the view and of lines, s.
 _VIEW_S, _LINE_S = 0.25, 3.0
+_COMPILING = "Loading compiled code (the first time it is compiled, which takes a minute)"
 _DAEMON_PRIORITY = 60
 #: Seed of the brakes' tolerances and of all noise.
 _SEED = 1
@@ -81,7 +86,7 @@ class Session:
 
     def run(self, show: Callable[[], None], period_s: float) -> None:
         """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
-        drive = (self._stop.is_set, self.seconds, self.recorder.sent, self.recorder.heard)
+        drive = (self._stop.is_set, self.seconds, self.recorder.note_sent, self.recorder.note_heard)
         daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")
         # The car has priority, because a real car does not wait for the daemon.
         car = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY + 1, self.live.run, *drive), name="car")
@@ -143,43 +148,47 @@ def _summary(session: Session) -> None:
     )
 
 
+def _run_with_view(session: Session, console: "Console", messages: deque[str]) -> None:
+    """On a terminal."""
+    from rich.live import Live
+
+    from emb_daemon.demo.view import render
+
+    with console.status(_COMPILING):
+        session.warm_up()
+    with Live(console=console, auto_refresh=False) as view:
+
+        def show() -> None:
+            shown = render(session.recorder, session.daemon, session.live, session.seconds, messages, console.width)
+            view.update(shown, refresh=True)
+
+        session.run(show, _VIEW_S)
+
+
+def _run_with_lines(session: Session) -> None:
+    """For output that is no terminal: a line every few seconds."""
+    from emb_daemon.demo.view import line
+
+    print(_COMPILING, flush=True)
+    session.warm_up()
+    session.run(lambda: print(line(session.recorder, session.daemon, session.live), flush=True), _LINE_S)
+
+
 def run_demo(corners: int, seconds: float, picture: Path) -> int:
     """Live view, summary, picture; returns the exit status."""
     from rich.console import Console
-    from rich.live import Live
 
     from emb_daemon.demo.picture import save_picture
-    from emb_daemon.demo.view import line, render
 
     handler = _LastMessages()
     log.handlers[:] = [handler]
     log.propagate = False
     log.setLevel(logging.INFO)
-    console = Console()
-    session = Session(corners, seconds)
-    compiling = "Loading compiled code (the first time it is compiled, which takes a minute)"
+    console, session = Console(), Session(corners, seconds)
     if console.is_terminal:
-        with console.status(compiling):
-            session.warm_up()
-        with Live(console=console, auto_refresh=False) as view:
-
-            def show() -> None:
-                shown = render(session.recorder, session.daemon, session.live, seconds, handler.lines, console.width)
-                view.update(shown, refresh=True)
-
-            session.run(show, _VIEW_S)
+        _run_with_view(session, console, handler.lines)
     else:
-        print(compiling, flush=True)
-        session.warm_up()
-        next_line = time.monotonic()
-
-        def show_line() -> None:
-            nonlocal next_line
-            if time.monotonic() >= next_line:
-                next_line += _LINE_S
-                print(line(session.recorder, session.daemon, session.live), flush=True)
-
-        session.run(show_line, 0.1)
+        _run_with_lines(session)
     if session.recorder.cycles < 2 or not session.recorder.count:
         print("ended before the first estimate", file=sys.stderr)
         return 0

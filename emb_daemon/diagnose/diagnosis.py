@@ -4,7 +4,6 @@ import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import combinations
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from emb_daemon import __version__
 from emb_daemon.calibration.curves import curve_at
+from emb_daemon.calibration.files import date_of_today
 from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import comparison, errors, whole
@@ -442,7 +442,7 @@ def with_terms(calibration: Calibration, selection: Selection) -> Calibration:
             own = [c for c in model.of_effect(term.name) if c.parameter in ("coefficient", "sine")]
             sigma = float(np.max([model.fits[c.channel].sigmas.get(c, 0.0) for c in own]))
             logs = ", ".join(model.bench.sources)
-            found = f"{datetime.now(UTC).date().isoformat()} in {logs}"
+            found = f"{date_of_today()} in {logs}"
             kept.append(msgspec.structs.replace(term, sigma=sigma if np.isfinite(sigma) else 0.0, provenance=found))
     return msgspec.structs.replace(calibration, terms=tuple(kept))
 
@@ -464,7 +464,7 @@ def _with_provenance(
         if log.path.is_file()
     )
     provenance = Provenance(
-        date=datetime.now(UTC).date().isoformat(),
+        date=date_of_today(),
         tool=f"emb-daemon diagnose {__version__}",
         campaign=old.campaign if old else "",
         logs=(old.logs if old else ()) + sources,

@@ -111,7 +111,7 @@ def _follow(signal, s, m):
 
 
 @njit
-def _remembered(q, t, k, x, dt):
+def _remember(q, t, k, x, dt):
     """Signal ``x`` of term ``k`` after its memory."""
     if q.memory == _NONE:
         return x
@@ -127,7 +127,7 @@ def _remembered(q, t, k, x, dt):
 
 
 @njit
-def _shaped(q, z):
+def _shape(q, z):
     """The term over its coefficient; a harmonic with its coefficients."""
     u = (z - q.centre) / q.scale
     if q.shape == _ODD:
@@ -180,9 +180,9 @@ def _value(q, t, k, dt, maximum_force):
     share = min(max(share, 0.0), 1.0)
     x = min(max(x, q.low), q.high)
     if q.memory == _RESPONSE:
-        shaped = _remembered(q, t, k, share * _shaped(q, x), dt)
+        shaped = _remember(q, t, k, share * _shape(q, x), dt)
     else:
-        shaped = share * _shaped(q, _remembered(q, t, k, x, dt))
+        shaped = share * _shape(q, _remember(q, t, k, x, dt))
     shaped *= _gate(q, t.signal, maximum_force)
     added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
     return min(max(added, -q.limit), q.limit)

@@ -25,7 +25,7 @@ from emb_daemon.fleet.population import (
     shared_causes,
     unit_of,
 )
-from emb_daemon.fleet.scores import Cause, Questions, Score
+from emb_daemon.fleet.scores import Cause, Score
 
 #: Drift is stated per this number of days, season per this number of kelvins.
 PER_DAYS, PER_K = 30.0, 10.0
@@ -172,11 +172,16 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
 
 
 def find(
-    fleet: Fleet, questions: Questions, calibration: str, factors: Mapping[str, Mapping[str, str]], silent: Mapping[str, str]
+    fleet: Fleet,
+    causes: Sequence[Cause],
+    calibration: str,
+    factors: Mapping[str, Mapping[str, str]],
+    silent: Mapping[str, str],
 ) -> Findings:
     """All findings from a fleet's scores.
 
     Args:
+        causes: in the order of the scores' columns.
         factors: by unit and name, properties that units share: batch, supplier.
 
     Raises:
@@ -192,14 +197,14 @@ def find(
     }
     if len(placed) < 2 * LEAST_UNITS:
         raise InputError(f"{len(placed)} units with {least} drives or more, expected at least {2 * LEAST_UNITS}")
-    return _Study(placed, questions, factors, bool(slopes)).findings(calibration, dict(silent), left_out)
+    return _Study(placed, causes, factors, bool(slopes)).findings(calibration, dict(silent), left_out)
 
 
 class _Study:
     """The vectors of the population, and the findings from them."""
 
-    def __init__(self, fleet: Fleet, questions: Questions, factors: Mapping[str, Mapping[str, str]], slopes: bool):
-        self.keys, self.scores, self.causes = list(fleet), list(fleet.values()), questions.causes
+    def __init__(self, fleet: Fleet, causes: Sequence[Cause], factors: Mapping[str, Mapping[str, str]], slopes: bool):
+        self.keys, self.scores, self.causes = list(fleet), list(fleet.values()), causes
         self.every = [score for scores in self.scores for score in scores]
         self.directions = Directions.of(self.every)
         self.start = min(score.drive.begin_ns for score in self.every)

@@ -63,12 +63,12 @@ def fleet_page(root: Path) -> Page:
 
 
 def _headline(found: Findings) -> str:
-    def counted(count: int, one: str, more: str) -> str:
+    def count_words(count: int, one: str, more: str) -> str:
         return f"{count or 'no'} {one if count == 1 else more}"
 
-    groups = counted(len({one.where for one in found.groups}), "batch shares", "batches share")
-    units = counted(len({one.where for one in (*found.outliers, *found.ageing)}), "unit is", "units are")
-    drifts = counted(len(found.drifts), "drift", "drifts")
+    groups = count_words(len({one.where for one in found.groups}), "batch shares", "batches share")
+    units = count_words(len({one.where for one in (*found.outliers, *found.ageing)}), "unit is", "units are")
+    drifts = count_words(len(found.drifts), "drift", "drifts")
     return f"{groups} a cause, {units} different from the others, {drifts}".capitalize()
 
 

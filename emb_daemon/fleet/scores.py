@@ -80,7 +80,7 @@ def is_periodic(effect: Effect) -> bool:
     return effect.harmonic is not None or any(p.group for p in effect.parameters)
 
 
-class Questions:
+class Scorer:
     """The causes under one calibration, and the computation of scores for them.
 
     Attributes:
@@ -116,7 +116,7 @@ class Questions:
             for p in probes
         )
 
-    def ask(self, log: Log, drive: Drive) -> Score:
+    def score(self, log: Log, drive: Drive) -> Score:
         """Scores of one drive.
 
         Raises:
@@ -153,18 +153,18 @@ def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
 
     ``resume``: keep existing scores of the same calibration.
     """
-    questions, path = Questions(calibration), scores_path(root, drives[0].unit, drives[0].corner)
+    scorer, path = Scorer(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
     scores = {score.drive: score for score in known if score.drive in drives}
     for drive in drives:
         if drive in scores or drive.digest in silent:
             continue
         try:
-            scores[drive] = questions.ask(read_drive(root, drive)[0], drive)
+            scores[drive] = scorer.score(read_drive(root, drive)[0], drive)
         except InputError as error:
             silent[drive.digest] = str(error)
     folder_of(path.parent)
-    _write(path, calibration, questions.causes, [scores[drive] for drive in sorted(scores)], silent)
+    _write(path, calibration, scorer.causes, [scores[drive] for drive in sorted(scores)], silent)
     return silent
 
 

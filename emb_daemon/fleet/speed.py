@@ -9,7 +9,7 @@ from pathlib import Path
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.fleet.dataset import Drive, read_drive
 from emb_daemon.fleet.ingest import Job, ingest
-from emb_daemon.fleet.scores import Questions
+from emb_daemon.fleet.scores import Scorer
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
 from emb_daemon.offline import estimate
@@ -42,7 +42,7 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
     samples, _ = samples_in(frames, (corner,))
     seconds = 1e-9 * float(frames["time_ns"][-1] - frames["time_ns"][0])
     with tempfile.TemporaryDirectory() as folder:
-        root, questions = Path(folder), Questions(calibration)
+        root, scorer = Path(folder), Scorer(calibration)
         drive = next(Drive(**entry) for entry in ingest(root, Job(path, "unit", ""))["drives"] if entry["corner"] == corner)
         work: dict[str, Callable] = {"unpack": lambda: unpack_gzip(path, raw)}
         if log_ending(path) == ".log":
@@ -52,7 +52,7 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
             "check and decode": lambda: samples_in(frames, (corner,)),
             "estimate": lambda: estimate(samples, parameters),
             "read columns": lambda: read_drive(root, drive),
-            "project on all causes": lambda: questions.ask(read_drive(root, drive)[0], drive),
+            "project on all causes": lambda: scorer.score(read_drive(root, drive)[0], drive),
             "replay from the file": lambda: Replay(calibration, corner).run(path),
             "replay from columns": lambda: estimate(read_drive(root, drive)[0].samples, parameters),
         }

@@ -1,11 +1,10 @@
 """The calibration made of what the steps found, and where its numbers come from."""
 
-import datetime
-import os
 from collections.abc import Sequence
 
 from emb_daemon import __version__
 from emb_daemon.calibration.curves import Curve
+from emb_daemon.calibration.files import date_of_today
 from emb_daemon.calibration.parameters import keys, moved, value_of
 from emb_daemon.calibration.types import Calibration, Contact, Friction, Motor, Noise, Provenance, Source, Stiffness
 from emb_daemon.identify.campaign import Campaign
@@ -73,9 +72,7 @@ def tidy(calibration: Calibration) -> Calibration:
 
 
 def provenance(campaign: Campaign, steps: tuple[Step, ...], validations: list[Validation], heat: ThermalStep) -> Provenance:
-    """Date (``SOURCE_DATE_EPOCH`` if it is set), logs, error figures and standard deviations."""
-    epoch = os.environ.get("SOURCE_DATE_EPOCH")
-    now = datetime.datetime.fromtimestamp(int(epoch), datetime.UTC) if epoch else datetime.datetime.now(datetime.UTC)
+    """Date, logs, error figures and standard deviations."""
     figures = {}
     for one in validations:
         for path in PATHS:
@@ -87,7 +84,7 @@ def provenance(campaign: Campaign, steps: tuple[Step, ...], validations: list[Va
         achieved["temperature_K"] = heat.achieved_K
     sigmas = {key: sigma for step in steps for key, sigma in step.sigmas.items()}
     return Provenance(
-        date=now.strftime("%Y-%m-%d"),
+        date=date_of_today(),
         tool=f"emb-daemon {__version__}",
         campaign=campaign.path.name,
         logs=tuple(Source(log=name, sha256=digest) for name, digest in sorted(campaign.sources.items())),

@@ -127,7 +127,7 @@ EXPORT fmi3Status fmi3Reset(fmi3Instance i) {
     return fmi3OK;
 }
 
-/* The place of a variable that may be set or told now; NULL, and a message, if there is none of that kind. */
+/* The place of a variable that may be set or read now; NULL, and a message, if there is none of that kind. */
 static void *find(instance *self, fmi3ValueReference reference, enum kind kind, bool set) {
     if (reference >= sizeof variables / sizeof *variables || variables[reference].kind != kind) {
         fail(self, "value reference %u: no variable of that type", (unsigned)reference);
@@ -168,7 +168,7 @@ ACCESS(Float64, FLOAT64)
 ACCESS(Int64, INT64)
 ACCESS(Boolean, BOOLEAN)
 
-/* The inputs are the sample at the beginning of the step; what is told at its end is the answer to them. */
+/* The inputs are the sample at the beginning of the step; the outputs at its end are the estimate from it. */
 EXPORT fmi3Status fmi3DoStep(fmi3Instance i, fmi3Float64 time, fmi3Float64 size, fmi3Boolean no_return, fmi3Boolean *event,
                              fmi3Boolean *terminate, fmi3Boolean *early_return, fmi3Float64 *last_time) {
     (void)no_return;

@@ -76,12 +76,12 @@ OUTPUTS = (
 
 #: Meaning of the fields that identify a SAMPLE.
 BOOKKEEPING = {
-    "time_ns": "of the sample, ns, on the caller's clock; told again in the estimate",
-    "cycle": "cycles of 4 ms since the first sample; told again",
-    "elapsed_cycles": "cycles since the last call; told again",
+    "time_ns": "of the sample, ns, on the caller's clock; copied into the estimate",
+    "cycle": "cycles of 4 ms since the first sample; copied",
+    "elapsed_cycles": "cycles since the last call; copied",
     "age_cycles": "cycles since the last sample; 0 but for a prediction",
-    "corner": "0 to 3 for FL, FR, RL, RR; told again",
-    "counter": "of the sample's frames; told again",
+    "corner": "0 to 3 for FL, FR, RL, RR; copied",
+    "counter": "of the sample's frames; copied",
     "dt": "s since the last sample, 0 at the first",
 }
 

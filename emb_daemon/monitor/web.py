@@ -149,7 +149,7 @@ class Datagrams:
 
 
 class Receiver(Protocol):
-    """Who is shown the bus's state."""
+    """Shows or sends the bus's state."""
 
     def show(self, listener: Listener, now_ns: int) -> None: ...
 

@@ -8,14 +8,14 @@ from emb_daemon.jit import Record, njit
 from emb_daemon.plant.records import CURVE_TERMS, HISTORY, SUBSTEP_S, SUBSTEPS, TRAVEL_POINTS
 
 #: Temperature (degC) at which effects of heat are zero, and at which magnets have their full strength.
-_COLD_C, _MAGNETS_C = 22.0, 25.0
+COLD_C, _MAGNETS_C = 22.0, 25.0
 #: Signals that drawn effects may follow, and their usual sizes.
 SIGNALS = (
     "brake_torque", "disc_temperature", "surface_temperature", "clamp_force", "motor_speed", "current", "force_rate",
     "disc_speed", "pad_temperature", "friction_power",
 )  # fmt: skip
-_BRAKE_NM, _RISE_K, _FORCE_N, _SPEED, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
-_DISC_SPEED, _POWER_W = 40.0, 30000.0
+_BRAKE_NM, _RISE_K, _FORCE_N, _SPEED_RAD_PER_S, _CURRENT_A, _RATE_N_PER_S = 1000.0, 50.0, 10000.0, 100.0, 20.0, 50000.0
+_DISC_RAD_PER_S, _POWER_W = 40.0, 30000.0
 #: Shapes of drawn effects: a power, a saturation, an onset at the signal's usual size.
 POWER, SATURATION, ONSET = range(3)
 
@@ -91,21 +91,21 @@ def _signal(s, which):
     if which == 0:
         return abs(s.brake_torque) / _BRAKE_NM
     if which == 1:
-        return max(s.disc - _COLD_C, 0.0) / _RISE_K
+        return max(s.disc - COLD_C, 0.0) / _RISE_K
     if which == 2:
-        return max(0.5 * (s.surface[0] + s.surface[1]) - _COLD_C, 0.0) / _RISE_K
+        return max(0.5 * (s.surface[0] + s.surface[1]) - COLD_C, 0.0) / _RISE_K
     if which == 3:
         return max(s.force, 0.0) / _FORCE_N
     if which == 4:
-        return abs(s.speed) / _SPEED
+        return abs(s.speed) / _SPEED_RAD_PER_S
     if which == 5:
         return abs(s.current) / _CURRENT_A
     if which == 6:
         return abs(s.force_rate) / _RATE_N_PER_S
     if which == 7:
-        return abs(s.wheel_speed) / _DISC_SPEED
+        return abs(s.wheel_speed) / _DISC_RAD_PER_S
     if which == 8:
-        return max(s.pad_mean - _COLD_C, 0.0) / _RISE_K
+        return max(s.pad_mean - COLD_C, 0.0) / _RISE_K
     return abs(s.brake_torque * s.wheel_speed) / _POWER_W
 
 
@@ -119,7 +119,7 @@ def _apply_shape(e, x):
 
 
 @njit
-def drawn(e: Record, s: Record, place: int, dt: float) -> float:
+def drawn_amount(e: Record, s: Record, place: int, dt: float) -> float:
     """Amount that one drawn effect adds, asked for every ``dt`` s."""
     if e.size == 0.0:
         return 0.0
@@ -133,7 +133,7 @@ def drawn(e: Record, s: Record, place: int, dt: float) -> float:
 
 
 @njit
-def grown(p: Record, s: Record) -> float:
+def growth(p: Record, s: Record) -> float:
     """Motor angle (rad) by which pads and disc are thicker than when cold and new: thickness variation over the turn, growth
     with the disc's temperature, less wear."""
     e = p.effects
@@ -157,8 +157,8 @@ def _friction_level(p, s):
     if e.stribeck_friction.rise != 0.0:
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
-    level *= max(1.0 + drawn(e.drawn_gear_friction, s, 3, SUBSTEP_S), 0.1)
-    return level * max(1.0 - e.cold_grease.per_K * (s.caliper - _COLD_C), 0.1)
+    level *= max(1.0 + drawn_amount(e.drawn_gear_friction, s, 3, SUBSTEP_S), 0.1)
+    return level * max(1.0 - e.cold_grease.per_K * (s.caliper - COLD_C), 0.1)
 
 
 @njit
@@ -167,7 +167,7 @@ def _cold_viscosity(p, s):
     viscous = p.effects.cold_grease.viscous_Nms_per_rad
     if viscous == 0.0:
         return 0.0
-    return viscous * (2.0 ** (0.1 * max(_COLD_C - s.caliper, 0.0)) - 1.0)
+    return viscous * (2.0 ** (0.1 * max(COLD_C - s.caliper, 0.0)) - 1.0)
 
 
 @njit
@@ -186,13 +186,13 @@ def move_motor(p: Record, s: Record, demand: float) -> None:
     s.current += (demand - s.current) * h / (p.current_time + h)
     fade = e.torque_constant_fade
     warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
-    factor = 1.0 - fade.fade_per_K * warm + drawn(e.drawn_torque_constant, s, 2, SUBSTEP_S)
+    factor = 1.0 - fade.fade_per_K * warm + drawn_amount(e.drawn_torque_constant, s, 2, SUBSTEP_S)
     factor -= e.torque_saturation.loss_per_A2 * s.current * s.current
     if e.motor_heat_fade.fade_per_A2 != 0.0:
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat
     torque = p.torque_constant * factor * s.current
-    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) * (1.0 + drawn(e.drawn_gear_gain, s, 4, SUBSTEP_S))
+    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) * (1.0 + drawn_amount(e.drawn_gear_gain, s, 4, SUBSTEP_S))
     mesh = e.gear_mesh_ripple
     if mesh.cosine != 0.0 or mesh.sine != 0.0:
         phase = mesh.order_per_turn * (p.released_angle + s.angle)
@@ -241,7 +241,8 @@ def clamp(p: Record, s: Record) -> None:
     half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
     # The clearance is the motor angle until contact when closing.
-    x = s.driven_angle + half + grown(p, s) + 1e-6 * drawn(e.drawn_thickness, s, 1, SUBSTEP_S) / p.gear_gain - p.contact_angle
+    x = s.driven_angle + half + growth(p, s) + 1e-6 * drawn_amount(e.drawn_thickness, s, 1, SUBSTEP_S) / p.gear_gain
+    x -= p.contact_angle
     s.static_force = static_curve(p, x)
     hysteresis, further = e.stiffness_hysteresis, e.second_hysteresis
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
@@ -251,7 +252,7 @@ def clamp(p: Record, s: Record) -> None:
         s.further_slip = min(max(s.further_slip + travel / further.slip_angle_rad, -1.0), 1.0)
     s.past_contact = x
     drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip + further.share * s.further_slip)
-    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + drawn(e.drawn_stiffness, s, 0, SUBSTEP_S)
+    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + drawn_amount(e.drawn_stiffness, s, 0, SUBSTEP_S)
     excitation = drive
     if e.second_relaxation.share != 0.0:
         s.slow = _settle(s.slow, s.drive, drive, e.second_relaxation.time_constant_s)

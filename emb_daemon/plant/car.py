@@ -7,7 +7,7 @@ import numpy as np
 
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import DEPTHS_MM
-from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, grown, motor_angle, move_motor, static_angle
+from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, growth, motor_angle, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
 from emb_daemon.plant.records import (
@@ -145,13 +145,18 @@ def _put(frames, count, time_ns, can_id, data):
 
 
 @njit
+def _send(w, slot, payload, frames, count, time_ns):
+    """A protected message of the car that leaves at ``time_ns``; returns the new count."""
+    counters, can_id = w.car[0].counter, w.ids[slot]
+    counter = counters[slot]
+    counters[slot] = (counter + 1) % COUNTER_MODULO
+    return _put(frames, count, time_ns, can_id, protect(can_id, payload, counter, 0))
+
+
+@njit
 def _say(w, rng, slot, payload, frames, count, due_ns, least_late):
-    """A protected message of the car. It leaves after ``due_ns`` by ``least_late`` to ``least_late`` + 1 times the jitter."""
-    car, can_id = w.car[0], w.ids[slot]
-    sent = due_ns + np.int64(1e9 * car.jitter * (least_late + rng.random()))
-    counter = car.counter[slot]
-    car.counter[slot] = (counter + 1) % COUNTER_MODULO
-    return _put(frames, count, sent, can_id, protect(can_id, payload, counter, 0))
+    """The same; it leaves after ``due_ns`` by ``least_late`` to ``least_late`` + 1 times the jitter."""
+    return _send(w, slot, payload, frames, count, due_ns + np.int64(1e9 * w.car[0].jitter * (least_late + rng.random())))
 
 
 @njit
@@ -183,10 +188,7 @@ def _sensor_frame(w, rng, row, frames, count):
     zero = p.sensor_offset + s.sensor_zero + p.sensor_per_K * (s.caliper - p.curve_temperature)
     value = (1.0 + p.sensor_gain) * s.force + zero + p.sensor_noise * rng.standard_normal()
     payload = pack(min(max(value, -p.sensor_limit), p.sensor_limit), received[slot, wire.SENSOR_FORCE])
-    counter = car.counter[slot]
-    car.counter[slot] = (counter + 1) % COUNTER_MODULO
-    can_id = w.ids[slot]
-    return _put(frames, count, car.time_ns, can_id, protect(can_id, payload, counter, 0))
+    return _send(w, slot, payload, frames, count, car.time_ns)
 
 
 @njit
@@ -248,7 +250,7 @@ def _record(car, p, s, corner, counter, drive, training, truth):
     truth.time_ns, truth.corner, truth.counter = car.time_ns, corner, counter
     truth.force, truth.static_force = s.force, s.static_force
     truth.angle, truth.speed, truth.current = p.released_angle + s.angle, s.speed, s.mean_current
-    truth.contact_angle = p.released_angle + motor_angle(p, p.contact_angle - grown(p, s))
+    truth.contact_angle = p.released_angle + motor_angle(p, p.contact_angle - growth(p, s))
     truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
     for side in range(2):
         truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
@@ -339,6 +341,19 @@ def _hear(w, frames):
             training.frequency = unpack(frame.data, signals[6])
 
 
+def _released_states(plants: np.ndarray, ambient: float) -> np.ndarray:
+    """PLANT_STATE of brakes that stand released, everything at ``ambient`` degC."""
+    states = np.zeros(len(plants), PLANT_STATE)
+    for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
+        states[field] = ambient
+    states["stiffness_factor"] = 1.0
+    states["uneven_disc"] = [any(row) for row in plants["effects"]["disc_thickness_variation"].tolist()]
+    states["angle_reading"] = plants["released_angle"]
+    states["past_contact"] = -plants["contact_angle"]
+    states["softening_memory"] = ambient - plants["curve_temperature"]
+    return states
+
+
 class Car:
     """A car with brakes on ``corners``, standing, cold and released.
 
@@ -370,15 +385,7 @@ class Car:
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
         self.plants: np.ndarray = np.ascontiguousarray(plants, PLANT)
         self.corners: tuple[str, ...] = tuple(corners)
-        self.states: np.ndarray = np.zeros(len(plants), PLANT_STATE)
-        for field in ("pads", "surface", "plate", "plate_reading", "caliper", "disc"):
-            self.states[field] = ambient
-        self.states["stiffness_factor"] = 1.0
-        variation = self.plants["effects"]["disc_thickness_variation"]
-        self.states["uneven_disc"] = [any(row) for row in variation.tolist()]
-        self.states["angle_reading"] = self.plants["released_angle"]
-        self.states["past_contact"] = -self.plants["contact_angle"]
-        self.states["softening_memory"] = ambient - self.plants["curve_temperature"]
+        self.states: np.ndarray = _released_states(self.plants, ambient)
         self.trainings: np.ndarray = np.zeros(len(plants), TRAINING)
         self.truth: np.ndarray = np.zeros(len(plants), TRUTH)
         self._rng = rng = np.random.default_rng(seed)

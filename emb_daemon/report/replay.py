@@ -9,6 +9,7 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.score import PATHS, figures, share_inside
 from emb_daemon.replay import Result
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, Panel, Style, Trace, time_figure, xy_figure
@@ -16,13 +17,11 @@ from emb_daemon.report.page import FAIL, PASS, Cell, Page
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
 
 if TYPE_CHECKING:
-    from emb_daemon.adapt.memory import Store
+    from emb_daemon.adapt.memory import Entry, Store
 
 #: Shortest interval that is visible on the complete time axis, as a share of it; intervals closer together are drawn as one.
 _SEEN = 1.0 / 1000.0
 _BINS = 120
-#: More than the travel of any brake past contact.
-_TRAVEL_RAD = 100.0
 _LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
 _STIFFNESS, _TORQUE = Style("#7fa7d1", 1.0), Style("#c2662d", 1.2, "dot")
 _INNER, _OUTER, _DISC = Style("#c2662d", 1.4), Style("#1b7f4b", 1.4), Style(INK, 1.2, "dot")
@@ -152,23 +151,8 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
         "Learned from motor current and angle in training motions, the newest last; only accepted trainings are used. "
         "Trainings before this drive are those stored in the state directory.",
     )
-    figures = (("samples", 1, 0), ("residual_ratio", 1, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1, 0))
-    rows = [
-        [
-            entry.date.replace("T", " "),
-            Cell(f"{entry.outcome} {entry.note}".strip(), PASS if entry.values else FAIL),
-            *(
-                "–" if value is None else f"{factor * value:.{digits}f}"
-                for value, factor, digits in (
-                    *((entry.evidence.get(name), factor, digits) for name, factor, digits in figures),
-                    (entry.ambient_C, 1, 0), (entry.pad_rise_K, 1, 0),
-                )
-            ),
-        ]
-        for entry in learned.history
-    ]  # fmt: skip
     headings = ["training", "outcome", "samples", "residual / noise", "up to / kN", "sigma / N", "air / °C", "pads / K"]
-    section.table(headings, rows)
+    section.table(headings, [_training(entry) for entry in learned.history])
     if learned.current is None:
         return
     values, sigmas = learned.current.values, learned.current.sigmas
@@ -180,17 +164,33 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
             for now in [parameter(calibration, key)]
         ],
     )
-    records = to_parameters(calibration), to_parameters(moved(calibration, values))
-    traces = []
-    for name, parameters, style in zip(("calibration", "learned"), records, (PALE, MODEL), strict=True):
-        angle = np.linspace(0.0, _TRAVEL_RAD, 2000)
-        force = np.polyval([*parameters["curve"][::-1], 0.0], angle)
-        inside = force <= learned.current.evidence["top_force_N"]
-        traces.append(Trace(name, angle[inside], 1e-3 * force[inside], style))
+    top_N = learned.current.evidence["top_force_N"]
+    traces = [
+        _curve("calibration", to_parameters(calibration)["curve"], top_N, PALE),
+        _curve("learned", to_parameters(moved(calibration, values))["curve"], top_N, MODEL),
+    ]
     section.figure(
         xy_figure([Panel("Characteristic curve of the cold pads", "kN", traces)], "motor angle past contact / rad"),
         "Shown up to the largest force of the training.",
     )
+
+
+def _training(entry: "Entry") -> list:
+    """A row of the table of trainings."""
+    figures = (("samples", 1.0, 0), ("residual_ratio", 1.0, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1.0, 0))
+    numbers = [(entry.evidence.get(name), factor, digits) for name, factor, digits in figures]
+    numbers += [(entry.ambient_C, 1.0, 0), (entry.pad_rise_K, 1.0, 0)]
+    return [
+        entry.date.replace("T", " "),
+        Cell(f"{entry.outcome} {entry.note}".strip(), PASS if entry.values else FAIL),
+        *("–" if value is None else f"{factor * value:.{digits}f}" for value, factor, digits in numbers),
+    ]
+
+
+def _curve(name: str, coefficients: np.ndarray, top_N: float, style: Style) -> Trace:
+    """A characteristic curve up to ``top_N``, in kN over rad past contact."""
+    angle = np.linspace(0.0, travel_at(top_N, coefficients), 200)
+    return Trace(name, angle, np.array([1e-3 * characteristic_curve(x, coefficients)[0] for x in angle]), style)
 
 
 def replay_page(

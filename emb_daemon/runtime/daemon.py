@@ -24,6 +24,7 @@ from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, Pipeline
 from emb_daemon.runtime.bus import Bus
+from emb_daemon.runtime.changes import ChangeLog
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
 from emb_daemon.runtime.shared import SharedEstimates
@@ -45,9 +46,6 @@ _TOGETHER_NS = 400_000
 #: Time for which a disturbance of bus or loop is reported with the estimates.
 _SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
-#: Changes of a corner's mode or reasons that are logged within this time, ns. A machine that is too slow makes hundreds a
-#: second, and writing them would make it slower.
-_LOGGED_CHANGES, _CHANGES_NS = 10, 10_000_000_000
 #: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
@@ -64,7 +62,7 @@ class Pacer:
         self._arrived_ns: dict[int, int] = {}
         self.last_tick_ns = now_ns
 
-    def arrived(self, corner: int, time_ns: int) -> None:
+    def note_arrival(self, corner: int, time_ns: int) -> None:
         """A sample of ``corner`` was complete at ``time_ns``."""
         self._arrived_ns[corner] = time_ns
 
@@ -168,10 +166,7 @@ class Daemon:
         self._of_files = dict(setup.calibrations)
         self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
         self._losses = (0, 0)
-        self._reported = np.full(len(CORNERS), -1, np.int64)
-        #: By corner: begin of the time in which changes are counted, and changes in it.
-        self._changes_from_ns = [-_CHANGES_NS] * len(CORNERS)
-        self._changes = [0] * len(CORNERS)
+        self._changes = ChangeLog()
         self._arrivals = np.zeros(len(CORNERS), np.int64)
 
     def stop(self) -> None:
@@ -209,8 +204,8 @@ class Daemon:
         _, count = scratch.collect(np.zeros(1, FRAME))
         count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
         scratch.broadcast(count)
-        arrivals, reported = self._arrivals.copy(), self._reported.copy()
-        _scan(scratch.estimates, count, scratch.states, scratch.receptions, arrivals, reported)
+        arrivals, known = self._arrivals.copy(), self._changes.states.copy()
+        _scan(scratch.estimates, count, scratch.states, scratch.receptions, arrivals, known)
         if self._adaptation:
             self._adaptation.warm_up(scratch.states[0], scratch.parameters[0])
         wait()
@@ -284,41 +279,14 @@ class Daemon:
         """Note when the next samples are due; log changes of mode and reasons."""
         pipeline = self.pipeline
         estimated, lost, changed = _scan(
-            pipeline.estimates, count, pipeline.states, pipeline.receptions, self._arrivals, self._reported
+            pipeline.estimates, count, pipeline.states, pipeline.receptions, self._arrivals, self._changes.states
         )
         self._estimated |= estimated
         self._lost |= lost
         for corner in range(len(CORNERS)):
             if self._arrivals[corner]:
-                pacer.arrived(corner, int(self._arrivals[corner]))
-        if changed or max(self._changes) > _LOGGED_CHANGES:
-            self._report_changes(changed, pacer.last_tick_ns)
-
-    def _report_changes(self, changed: int, now_ns: int) -> None:
-        """Log the states of ``changed`` corners. Of those that change too often, the last state follows when their time is
-        over."""
-        for corner in range(len(CORNERS)):
-            unlogged = max(self._changes[corner] - _LOGGED_CHANGES, 0)
-            if now_ns - self._changes_from_ns[corner] >= _CHANGES_NS and (unlogged or changed >> corner & 1):
-                self._changes_from_ns[corner], self._changes[corner] = now_ns, 0
-                if unlogged:
-                    self._report(corner, f", after {unlogged} changes that were not logged")
-                    continue
-            if changed >> corner & 1:
-                self._changes[corner] += 1
-                if self._changes[corner] <= _LOGGED_CHANGES:
-                    self._report(corner)
-
-    def _report(self, corner: int, after: str = "") -> None:
-        state = int(self._reported[corner])
-        mode, reasons = state >> 16, state & 0xFFFF
-        words = contract.reason_words(reasons)
-        amiss = mode in (contract.DEGRADED, contract.FAULT)
-        level = 30 if amiss else 20
-        # Disturbances of bus and loop are logged once for all corners; here they are only mentioned.
-        none = "bus or loop" if amiss else "none"
-        fields = {"corner": CORNERS[corner], "mode": contract.MODES[mode], "reasons": ", ".join(words) or none}
-        log.log(level, f"corner %(corner)s: %(mode)s (%(reasons)s){after}", fields, extra={"fields": fields})
+                pacer.note_arrival(corner, int(self._arrivals[corner]))
+        self._changes.write(changed, pacer.last_tick_ns)
 
     def _count(self, now_ns: int, pacer: Pacer) -> None:
         late = (now_ns - pacer.last_tick_ns) / CYCLE_NS - 1.0
@@ -364,7 +332,7 @@ class Daemon:
             elif self._asked is not None:
                 self._page, self._asked = self._asked, None
                 self._read_beside(self._read_calibrations, self._page)
-        for name in [name for name in self._waiting if self._released(name)]:
+        for name in [name for name in self._waiting if self._is_released(name)]:
             self._begin_anew(name, *self._waiting.pop(name))
 
     def _read_beside(self, read, *arguments) -> None:
@@ -394,7 +362,7 @@ class Daemon:
                 log.warning("corner %s: %d numbers differ from the file; adaptation is off", name, count)
         return answer
 
-    def _released(self, name: str) -> bool:
+    def _is_released(self, name: str) -> bool:
         state = self.pipeline.states[CORNERS.index(name)]
         return not (state["started"] and state["contact"]["engaged"])
 
@@ -404,7 +372,7 @@ class Daemon:
             setup = Setup(self._setup.path)
             if setup.calibrations.keys() != self._setup.calibrations.keys():
                 raise InputError(f"{setup.path}: corners: a reload cannot change them; restart the daemon")
-            calibrations = request.page.applied(setup.calibrations) if request else setup.calibrations
+            calibrations = request.page.apply(setup.calibrations) if request else setup.calibrations
         except InputError as error:
             if request:
                 request.fault = str(error)

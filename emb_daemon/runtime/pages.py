@@ -40,7 +40,7 @@ class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: dict[str, dict[str, float]]
     files: dict[str, str]
 
-    def applied(self, calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
+    def apply(self, calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
         """The calibrations of the files with the page's numbers, checked like a file.
 
         Raises:

@@ -102,7 +102,7 @@ def _encrypt(key):
 
 
 @njit
-def _transposed(x):
+def _transpose(x):
     """Of eight bytes, bit i of byte n as bit n of byte i."""
     swapped = (x ^ x >> 7) & 0x00AA00AA00AA00AA
     x ^= swapped ^ swapped << 7
@@ -119,7 +119,7 @@ def _eight(message, start, length):
     for n in range(8):
         at = start + n
         word |= (int(message[at]) if at < length else 0x80 if at == length else 0) << 8 * n
-    return _transposed(word)
+    return _transpose(word)
 
 
 @njit
@@ -140,7 +140,7 @@ def cmac(key: Record, message: Bytes, length: int, code: Bytes) -> None:
         word = 0
         for i in range(8):
             word |= (int(q[i]) >> 8 * half & 0xFF) << 8 * i
-        word = _transposed(word)
+        word = _transpose(word)
         for n in range(8):
             code[8 * half + n] = word >> 8 * n & 0xFF
 

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from emb_daemon.jit import Integer, Records, njit
+
 if TYPE_CHECKING:
     from can import Message
 
@@ -14,6 +16,20 @@ FRAME = np.dtype([("time_ns", "i8"), ("data", "u8"), ("can_id", "u4"), ("length"
 EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
 #: Set by `wire.secoc` only: authentication is required, and this frame has none.
 UNAUTHENTIC = 16
+
+
+@njit
+def put(frames: Records, count: int, time_ns: Integer, can_id: Integer, data: Integer, flags: int) -> int:
+    """Write a frame of eight bytes as the last of ``count`` + 1; returns their number."""
+    frame = frames[count]
+    frame.time_ns, frame.can_id, frame.data, frame.length, frame.flags = time_ns, can_id, data, 8, flags
+    return count + 1
+
+
+def payloads_to(can_id: int, frames: np.ndarray) -> list[bytes]:
+    """Payloads of the classic data frames of an 11-bit id."""
+    mine = frames[(frames["can_id"] == can_id) & (frames["flags"] & (EXTENDED | REMOTE | FD) == 0)]
+    return [int(frame["data"]).to_bytes(8, "little")[: frame["length"]] for frame in mine]
 
 
 def row_of(message: "Message", time_ns: int) -> tuple[int, int, int, int, int]:

@@ -6,7 +6,7 @@ signal is in which column.
 
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -222,6 +222,24 @@ def _frame_faults(message) -> list[str]:
     return faults
 
 
+def _read_message(database: "Database", shipped: "Database", name: str, names: tuple[str, ...]) -> tuple[Any, np.ndarray]:
+    """A cantools message and SIGNAL records of its named signals, in the units of the shipped DBC.
+
+    Raises:
+        InputErrors: every fault of the message.
+    """
+    message = next((known for known in database.messages if known.name == name), None)
+    faults, columns = _frame_faults(message) if message else [], np.zeros(0, SIGNAL)
+    try:
+        columns = signal_columns(database, name, names)
+        faults += _convert(columns, names, message, shipped.get_message_by_name(name))
+    except InputErrors as error:
+        faults += error.faults
+    if faults:
+        raise InputErrors(faults)
+    return message, columns
+
+
 def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
     """The LAYOUT (shape (1,)) of the messages that concern ``corners``, all others being foreign.
 
@@ -232,44 +250,33 @@ def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) ->
     """
     shipped = load_database(resource("dbc/emb.dbc"))
     database = load_database(path) if path else shipped
-    path = path or resource("dbc/emb.dbc")
     layout, faults = np.zeros(1, LAYOUT), []
     record = layout[0]
     record["slot"] = FOREIGN
 
-    def fill(message, names, columns, count_of, where):
-        found = next((known for known in database.messages if known.name == message), None)
-        here = _frame_faults(found) if found else []
+    def fill(field: str, place: int, name: str, names: tuple[str, ...]) -> Any:
+        """Write a message's signals; returns the message, or None if it is faulty."""
         try:
-            signals = signal_columns(database, message, names)
-            here += _convert(signals, names, found, shipped.get_message_by_name(message))
+            message, columns = _read_message(database, shipped, name, names)
         except InputErrors as error:
-            here += error.faults
-        if here:
-            faults.extend(f"{path}: {fault}" for fault in here)
+            faults.extend(f"{path or resource('dbc/emb.dbc')}: {fault}" for fault in error.faults)
             return None
-        columns[where][: len(names)] = signals
-        count_of[where] = len(names)
-        return found
+        record[field][place, : len(names)], record[f"{field}_count"][place] = columns, len(names)
+        return message
 
+    own = [(corner, index) for index, corner in enumerate(CORNERS) if corner in corners]
     received = {template.format(corner): (CORNER_MESSAGES * index + kind, names)
-                for index, corner in enumerate(CORNERS) if corner in corners
-                for template, (kind, names) in _RECEIVED.items()} | _VEHICLE  # fmt: skip
+                for corner, index in own for template, (kind, names) in _RECEIVED.items()} | _VEHICLE  # fmt: skip
     known = {message.name for message in database.messages}
-    for message, (slot, names) in received.items():
-        if message not in known and message.endswith(OPTIONAL):
-            continue
-        if found := fill(message, names, record["received"], record["received_count"], slot):
-            record["slot"][found.frame_id] = slot
-            record["cycle_ns"][slot] = found.cycle_time * 1_000_000
+    for name, (slot, names) in received.items():
+        optional = name.endswith(OPTIONAL) and name not in known
+        if not optional and (message := fill("received", slot, name, names)):
+            record["slot"][message.frame_id], record["cycle_ns"][slot] = slot, message.cycle_time * 1_000_000
     for kind, (template, names) in enumerate(_SENT):
-        for index, corner in enumerate(CORNERS):
-            if corner in corners and (
-                found := fill(template.format(corner), names, record["sent"], record["sent_count"], kind)
-            ):
-                record["slot"][found.frame_id] = OURS
-                record["sent_id"][kind, index] = found.frame_id
-                record["sent_cycle_ns"][kind] = found.cycle_time * 1_000_000
+        for corner, index in own:
+            if message := fill("sent", kind, template.format(corner), names):
+                record["slot"][message.frame_id], record["sent_id"][kind, index] = OURS, message.frame_id
+                record["sent_cycle_ns"][kind] = message.cycle_time * 1_000_000
     if faults:
         raise InputErrors(faults)
     return layout

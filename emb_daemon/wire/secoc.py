@@ -29,7 +29,7 @@ from emb_daemon.resources import resource
 from emb_daemon.wire.cmac import KEY, cmac, new_key
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, counter_of, protect
-from emb_daemon.wire.frames import FRAME, UNAUTHENTIC
+from emb_daemon.wire.frames import FRAME, UNAUTHENTIC, put
 from emb_daemon.wire.layout import CORNERS, OPTIONAL, load_database
 
 #: Number of the set that consists of the freshness frame alone.
@@ -182,14 +182,6 @@ def _authenticator(link, number, first, second, trip, reset, message):
     return tag >> 4
 
 
-@njit
-def _put(frames, count, time_ns, can_id, data, flags):
-    """Append a frame; returns the new count."""
-    frame = frames[count]
-    frame.time_ns, frame.can_id, frame.data, frame.length, frame.flags = time_ns, can_id, data, 8, flags
-    return count + 1
-
-
 class Signer:
     """Puts authentication frames among the frames that a process sends.
 
@@ -252,7 +244,7 @@ def _append(link, which, time_ns, first, second, signed, count):
         data = protect(
             link.freshness_id, np.uint64(link.trip) << np.uint64(16) | np.uint64(link.reset) << np.uint64(40), counter, 0
         )
-        count = _put(signed, count, time_ns, link.freshness_id, data, 0)
+        count = put(signed, count, time_ns, link.freshness_id, data, 0)
         count = _append_authentication(link, FRESHNESS_SET, time_ns, data, data, signed, count)
     link.message += 1
     return _append_authentication(link, which, time_ns, first, second, signed, count)
@@ -263,7 +255,7 @@ def _append_authentication(link, number, time_ns, first, second, signed, count):
     tag = _authenticator(link, number, first, second, link.trip, link.reset, link.message)
     payload = np.uint64(number << 16 | link.message << 20) | np.uint64(tag) << np.uint64(28)
     data = protect(link.authentication_id, payload, counter_of(first), 0)
-    return _put(signed, count, time_ns, link.authentication_id, data, 0)
+    return put(signed, count, time_ns, link.authentication_id, data, 0)
 
 
 class Verifier:
@@ -330,7 +322,7 @@ def _hold(link, which, position, frame, known, count):
     held, waiting = link.held[which, position], link.waiting[which, position]
     gone = 0
     while gone < waiting and (waiting - gone >= _MOST_HELD or frame.time_ns - held[gone].time_ns > _HELD_NS):
-        count = _put(known, count, frame.time_ns, held[gone].can_id, held[gone].data, UNAUTHENTIC)
+        count = put(known, count, frame.time_ns, held[gone].can_id, held[gone].data, UNAUTHENTIC)
         gone += 1
     for row in range(gone, waiting):
         held[row - gone] = held[row]
@@ -346,11 +338,11 @@ def _judge(link, time_ns, data, known, count):
     which = _SETS if number == FRESHNESS_SET else number
     genuine = _find_genuine(link, number, time_ns, data) if number < _SETS or number == FRESHNESS_SET else _NONE
     if genuine == _NONE:
-        return _put(known, count, time_ns, link.first_id, np.uint64(0), UNAUTHENTIC)
+        return put(known, count, time_ns, link.first_id, np.uint64(0), UNAUTHENTIC)
     if which < _SETS:
         for position in range(link.sizes[which]):
             frame = link.held[which, position, genuine >> 8 * position & 0xFF]
-            count = _put(known, count, time_ns, frame.can_id, frame.data, 0)
+            count = put(known, count, time_ns, frame.can_id, frame.data, 0)
     for position in range(link.sizes[which]):
         held, left = link.held[which, position], 0
         for row in range(link.waiting[which, position]):
@@ -358,7 +350,7 @@ def _judge(link, time_ns, data, known, count):
                 held[left] = held[row]
                 left += 1
             elif row != genuine >> 8 * position & 0xFF:
-                count = _put(known, count, time_ns, held[row].can_id, held[row].data, UNAUTHENTIC)
+                count = put(known, count, time_ns, held[row].can_id, held[row].data, UNAUTHENTIC)
         link.waiting[which, position] = left
     return count
 

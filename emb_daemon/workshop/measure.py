@@ -19,7 +19,7 @@ from emb_daemon.errors import Unavailable
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.pages import Answer, Page, PageClient, socket_path
 from emb_daemon.runtime.shared import EstimatesReader
-from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.wire.frames import FRAME, payloads_to
 from emb_daemon.workshop.image import Image
 from emb_daemon.workshop.pages import Segment
 from emb_daemon.workshop.xcp import CONNECT, ON_CAN, ON_UDP, Slave
@@ -129,9 +129,7 @@ class Can:
         self._bus.wait(timeout_s)
 
     def receive(self) -> list[bytes]:
-        frames = self._bus.drain()
-        mine = frames[(frames["can_id"] == self._request_id) & (frames["flags"] & (EXTENDED | REMOTE | FD) == 0)]
-        return [int(frame["data"]).to_bytes(8, "little")[: frame["length"]] for frame in mine]
+        return payloads_to(self._request_id, self._bus.drain())
 
     def send(self, packets: Iterable[bytes]) -> int:
         """Returns how many packets could not be sent."""

@@ -18,7 +18,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.monitor.listener import Corner, Listener
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.wire.contract import INIT, INVALID
-from emb_daemon.wire.frames import EXTENDED, FD, FRAME, REMOTE
+from emb_daemon.wire.frames import FRAME, payloads_to
 from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, ESTIMATOR_STATUS, PAD_TEMP
 from emb_daemon.workshop.trouble import Frame, TroubleMemory
 from emb_daemon.workshop.uds import FREEZE_FRAME, Server
@@ -125,10 +125,8 @@ class Diagnostics:
         # Only the newest frame of each message is used, which is five times less work.
         _, newest = np.unique(frames["can_id"][::-1], return_index=True)
         self.listener.hear(frames[::-1][newest])
-        for frame in frames[frames["can_id"] == self._request_id]:
-            if not frame["flags"] & (EXTENDED | REMOTE | FD):
-                data = int(frame["data"]).to_bytes(8, "little")[: frame["length"]]
-                self._requests.append(self._message(arbitration_id=self._request_id, data=data))
+        for data in payloads_to(self._request_id, frames):
+            self._requests.append(self._message(arbitration_id=self._request_id, data=data))
         now = time.monotonic()
         for row, corner in enumerate(self.listener.corners):
             status = corner.streams[ESTIMATOR_STATUS]
