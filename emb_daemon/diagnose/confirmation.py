@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.comparison import errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
@@ -83,15 +82,14 @@ def _against(
 
     beside = judges if judges and whole(judges) == main else None
 
-    def unseen(left_out: EpisodeErrors, calibration: Calibration) -> EpisodeErrors:
-        return EpisodeErrors.joined([left_out, errors(beside, calibration)]) if beside else left_out
+    def unseen(left_out: EpisodeErrors, without: str = "") -> EpisodeErrors:
+        if beside is None:
+            return left_out
+        return EpisodeErrors.joined([left_out, errors(beside, bench.calibrated(selection.applied(without)))])
 
-    def without(suspect: str) -> EpisodeErrors:
-        return unseen(left_out_errors(selection, suspect), bench.calibrated(selection.applied(suspect)))
-
-    worse = harm(unseen(before, bench.calibration), unseen(after, bench.calibrated(selection.applied())), main)
-    if worse and selection.suspects:
-        rest = {suspect: without(suspect).rmse(main) for suspect in selection.suspects}
+    was = EpisodeErrors.joined([before, errors(beside, bench.calibration)]) if beside else before
+    if (worse := harm(was, unseen(after), main)) and selection.suspects:
+        rest = {suspect: unseen(left_out_errors(selection, suspect), suspect).rmse(main) for suspect in selection.suspects}
         where = "left-out episodes and validation logs" if beside else "left-out episodes"
         return min(rest, key=rest.__getitem__), f"{worse} on {where}"
     if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
