@@ -372,7 +372,7 @@ def test_a_term_is_made_for_a_cooling_that_is_no_line_over_the_speed_and_none_fo
 
 
 def test_what_is_left_of_the_temperatures_is_said_where_no_term_is_made(monkeypatch):
-    monkeypatch.setattr(grammar, "_best_fitted", lambda selection, *_: selection)
+    monkeypatch.setattr(grammar, "_one_more", lambda selection, _: selection)
     terms, left_K, follows = find_terms(_hidden(lambda speed: speed**2 / 18.0, np.random.default_rng(5)), START)
     assert not terms and left_K > 2.0 and follows == "disc_speed"
 

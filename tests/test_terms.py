@@ -19,7 +19,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.effects import terms
 from emb_daemon.errors import InputErrors, InvalidValue
-from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.offline import estimate
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.resources import resource
@@ -168,6 +168,18 @@ def test_memories_lag_slip_and_respond():
     there_and_back = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)])
     slip = over(Term(**base, memory="slip", memory_scale=0.2, low=0.0, high=1.0), there_and_back)
     assert slip[100] == pytest.approx(0.5) and slip[-1] == pytest.approx(-0.5) and slip[121] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_pads_brake_a_disc_until_it_stands():
+    """Below half a radian per second there is no power to divide by a speed, but the torque is there as before."""
+    state, sample, seen = new_state(), np.zeros(1, SAMPLE), []
+    sample["has_wheel_speed"], sample["dt"] = True, DT
+    for power, speed in ((0.0, 0.3), (900.0, 1.0), (0.0, 0.3), (0.0, 0.1), (0.0, 0.0), (0.0, 0.3)):
+        state[0]["power"], sample["wheel_speed"] = power, speed
+        signal = state[0]["effects"]["terms"]["signal"]
+        terms._follow(signal, state[0], sample[0])
+        seen.append(float(signal[list(terms.SIGNALS).index("brake_torque")]))
+    assert seen == [0.0, 900.0, 900.0, 900.0, 0.0, 0.0]
 
 
 def test_gates():

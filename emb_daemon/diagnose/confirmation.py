@@ -43,7 +43,7 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
 
     def judged(tried: Selection) -> tuple[EpisodeErrors, tuple[str, str] | None]:
         after = left_out_errors(tried)
-        return after, _against(tried, before, after, held) or (_veto(tried, judges) if judges else None)
+        return after, _against(tried, judges, before, after, held) or (_veto(tried, judges) if judges else None)
 
     while True:
         for name in _beyond_bounds(selection):
@@ -65,16 +65,33 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
 
 
 def _against(
-    selection: Selection, before: EpisodeErrors, after: EpisodeErrors, held: Mapping[str, np.ndarray]
+    selection: Selection,
+    judges: Bench | None,
+    before: EpisodeErrors,
+    after: EpisodeErrors,
+    held: Mapping[str, np.ndarray],
 ) -> tuple[str, str] | None:
-    """The suspect that left-out episodes speak against most, and what they say; ``held`` by channel, residuals before in N."""
+    """The suspect that left-out episodes speak against most, and what they say; ``held`` by channel, residuals before in N.
+
+    Validation logs, on which the whole estimator runs as well and which fitted nothing either, speak of its error together
+    with them: in one log, where its contact angle wanders may hide what it gains."""
     bench = selection.model.bench
     main = whole(bench)
     if rise := _own_harm(selection, held):
         return rise
-    if (worse := harm(before, after, main)) and selection.suspects:
-        rest = {suspect: left_out_errors(selection, suspect).rmse(main) for suspect in selection.suspects}
-        return min(rest, key=rest.__getitem__), f"{worse} on left-out episodes"
+
+    beside = judges if judges and whole(judges) == main else None
+
+    def unseen(left_out: EpisodeErrors, without: str = "") -> EpisodeErrors:
+        if beside is None:
+            return left_out
+        return EpisodeErrors.joined([left_out, errors(beside, bench.calibrated(selection.applied(without)))])
+
+    was = EpisodeErrors.joined([before, errors(beside, bench.calibration)]) if beside else before
+    if (worse := harm(was, unseen(after), main)) and selection.suspects:
+        rest = {suspect: unseen(left_out_errors(selection, suspect), suspect).rmse(main) for suspect in selection.suspects}
+        where = "left-out episodes and validation logs" if beside else "left-out episodes"
+        return min(rest, key=rest.__getitem__), f"{worse} on {where}"
     if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
         own, told = ruined
         rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}

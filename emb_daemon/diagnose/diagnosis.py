@@ -125,8 +125,8 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the calibration's models lack on ``fit_logs``, add it, and judge on ``validate``.
 
-    Validation logs choose nothing, but have a veto. Without them the fit logs judge: each quarter of their episodes by
-    parameters from the other three.
+    Validation logs fit nothing, but have a veto, and a say where left-out episodes are asked whether the force got worse.
+    Without them the fit logs judge: each quarter of their episodes by parameters from the other three.
 
     Raises:
         InputError: the logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves.

@@ -233,8 +233,11 @@ def _wanted(selection: Selection, channel: str) -> bool:
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:
-    """With the best term for one channel, accepted if it is proven, else with what speaks against it; where that is that it is
-    too large or does not hold, with the best that is as good."""
+    """With the best term for one channel, accepted if it is proven, else with what speaks against it.
+
+    The screen goes by lines drawn from where nothing has been fitted yet. What another place could do of a small step it
+    cannot do of a large effect, and heat does not answer in proportion at all. So what is as good on the screen is fitted
+    with everything else, and what then describes the rest most shortly is taken."""
     model, screening = selection.model, selection.screening
     search = _search(model, channel)
     if search is None:
@@ -245,35 +248,47 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if not prospects or (straight and model.rms(prospects[0].evidence.gain, channel) < floor):
         return selection
     shares = _shares(search.screen, prospects)
-    if not straight:
-        return _best_fitted(selection, search, prospects, shares)
-    for prospect in _most_chosen(prospects, shares):
-        name = _name(prospect.form, selection)
-        selection = _with(selection, search, prospect, prospects, shares)
+    fitted: list[tuple[Prospect, Selection]] = []
+    refused = selection
+    for prospect in _most_chosen(prospects, shares) if straight else _first_means(prospects):
+        if straight and (prospect.means in [other.means for other, _ in fitted] or len(fitted) == _FITTED):
+            continue
+        if straight and not fitted and prospect.evidence.gain < AS_GOOD * prospects[0].evidence.gain:
+            break
+        found = _with(selection, search, prospect, prospects, shares)
+        candidate = found.candidates[_name(prospect.form, selection)]
+        if candidate.accepted:
+            fitted.append((prospect, found))
+            continue
+        refused = refused.noted([candidate])
         # Where these logs cannot tell forms apart, one that is more than its port may bear, or that no fit leads to, is not
         # the one.
-        if selection.candidates[name].reason not in (TOO_LARGE, _NOT_HELD):
+        if straight and not fitted and candidate.reason not in (TOO_LARGE, _NOT_HELD):
             break
-    return selection
+    if not fitted:
+        return refused
+    prospect, found = min(fitted, key=lambda one: _description(one[1], channel) if straight else one[1].model.noise(channel))
+    shares = _shares_fitted(model, channel, fitted)
+    at_port = sum(share for (port, _), share in shares.items() if port == prospect.form.port)
+    sure = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[prospect.means]:.0f} %"
+    candidate = found.candidates[_name(prospect.form, selection)]
+    if at_port < _SAME_PORT:
+        return selection.noted([replace(candidate, accepted=False, reason=sure)])
+    return found.noted([replace(candidate, reason=f"{candidate.reason}; {sure}")])
 
 
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
     """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
-    more is chance."""
-    equal = [p for p in prospects if p.evidence.gain >= AS_GOOD * prospects[0].evidence.gain]
-    return sorted(equal, key=lambda p: -shares[p.means])
+    more is chance. Then what gains less, but is chosen by enough of these."""
+    least = AS_GOOD * prospects[0].evidence.gain
+    equal = sorted((p for p in prospects if p.evidence.gain >= least), key=lambda p: -shares[p.means])
+    return [*equal, *(p for p in prospects if p.evidence.gain < least and shares[p.means] >= _RIVAL)]
 
 
-def _best_fitted(
-    selection: Selection, search: Search, prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]
-) -> Selection:
-    """With the one of several prospects that leaves least when it is fitted with everything else. Heat does not answer in
-    proportion: what another conductance could do of a term in a small step, it cannot in one of the term's size."""
+def _first_means(prospects: Sequence[Prospect]) -> list[Prospect]:
+    """All shapes of the first ports and signals."""
     means = list(dict.fromkeys(prospect.means for prospect in prospects))[:_FITTED]
-    tried = [_with(selection, search, p, prospects, shares) for p in prospects if p.means in means]
-    accepted = [found for found in tried if len(found.accepted) > len(selection.accepted)]
-    refused = selection.noted(found.candidates[name] for found in tried for name in found.candidates)
-    return min(accepted, key=lambda found: found.model.noise(search.channel), default=refused)
+    return [prospect for prospect in prospects if prospect.means in means]
 
 
 def _with(
@@ -287,13 +302,11 @@ def _with(
     model, screening, channel = selection.model, selection.screening, search.channel
     rivals = _as_good(best, [p for p in prospects if p is not best], shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
-    at_port = sum(share for (port, _), share in shares.items() if port == best.form.port)
-    made_of = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[best.means]:.0f} %"
-    manoeuvre = None
+    unsure, manoeuvre = "", None
     if rivals:
         manoeuvre = _manoeuvre(best.form, rivals[0].form)
         alike = ", ".join(_words(p.form) for p in rivals)
-        made_of += f"; these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
+        unsure = f"these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
     ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
     largest = _largest_beside(selection, best, channel)
     objections = {
@@ -305,12 +318,11 @@ def _with(
             best.evidence.gain, channel
         )
         < _BESIDE * largest,
-        made_of: at_port < _SAME_PORT,
     }
     against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
         made_effect(best.form, _name(best.form, selection)), channel, evidence=best.evidence, p_value=best.evidence.p_value,
-        q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or made_of,
+        q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or unsure,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
         confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
         alike=tuple((p.form.port, p.form.signals) for p in rivals), undecided_N=search.undecided(best, rivals),
@@ -421,16 +433,36 @@ def _manoeuvre(form: Form, other: Form) -> str:
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:
-    """Share of resampled episodes in which each port and signal would be chosen, by the shortest description as well."""
+    """Share of resampled episodes in which each port and signal would be chosen by the screen, by the shortest description as
+    well."""
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
-    episodes = scores[0].u.shape[1]
-    weights = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
+    weights = _resampled(scores[0].u.shape[1])
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
-    alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, episodes)
+    alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, weights.shape[1])
     alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
-    left = np.maximum(1.0 - gains / np.maximum(alone, NOTHING), 1e-3)
+    return _chosen(prospects, 1.0 - gains / np.maximum(alone, NOTHING), weights.shape[1])
+
+
+def _shares_fitted(model: Model, channel: str, fitted: Sequence[tuple[Prospect, Selection]]) -> dict[tuple[str, str], float]:
+    """The same by what is left of left-out episodes once each is fitted; ``model``: without any of them."""
+    samples = LASTING[channel]
+    noise = noise_left(model, channel, samples)
+    alone, *left = (m.left_out(channel, samples=samples) for m in (model, *(found.model for _, found in fitted)))
+    weights = _resampled(len(alone))
+    share = (np.array(left) @ weights.T - noise) / np.maximum(weights @ alone - noise, NOTHING)
+    return _chosen([prospect for prospect, _ in fitted], share, len(alone))
+
+
+def _resampled(episodes: int) -> np.ndarray:
+    """How often each episode is in each bootstrap, shape (bootstraps, episodes)."""
+    return np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
+
+
+def _chosen(prospects: Sequence[Prospect], left: np.ndarray, episodes: int) -> dict[tuple[str, str], float]:
+    """Share of bootstraps in which each port and signal has the shortest description; ``left``: share of the squared error, of
+    each prospect in each bootstrap."""
     numbers = np.array([prospect.form.numbers for prospect in prospects])
-    chosen = np.argmin(description_length(left, numbers[:, None], episodes), axis=0)
+    chosen = np.argmin(description_length(np.maximum(left, 1e-3), numbers[:, None], episodes), axis=0)
     shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)
     for index, count in zip(*np.unique(chosen, return_counts=True), strict=True):
         shares[prospects[index].means] += count / _BOOTSTRAPS
@@ -457,8 +489,8 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
     evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0), LASTING[channel])
     gain = model.rms(evidence.gain, channel)
+    model = _arrived(model, channel)
     if not bench.straight:
-        model = _arrived(model, channel)
         gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel, made=True):
@@ -470,4 +502,5 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     where = " on left-out episodes" if bench.straight else ""
     explained = f"q = {candidate.q_value:.1g} over the whole grammar, gains {gain:.3g} {UNITS[channel]}{where}"
-    return replace(selection, model=model).noted([replace(candidate, reason=f"{explained}; {candidate.reason}")])
+    reason = "; ".join(filter(None, (explained, candidate.reason)))
+    return replace(selection, model=model).noted([replace(candidate, reason=reason)])

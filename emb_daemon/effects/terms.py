@@ -100,7 +100,11 @@ def _follow(signal, s, m):
     signal[_CALIPER] = m.caliper if m.has_thermocouple else np.nan
     wheel = m.wheel_speed if m.has_wheel_speed else 0.0
     signal[_WHEEL] = wheel
-    signal[_BRAKE] = s.power / wheel if wheel > TURNING_RAD_PER_S else 0.0
+    if wheel > TURNING_RAD_PER_S:
+        signal[_BRAKE] = s.power / wheel
+    elif not wheel > 0.0:
+        # Until the disc stands the pads go on braking it, though too slowly for a power.
+        signal[_BRAKE] = 0.0
     signal[_ENERGY] += s.power * m.dt
     clamped = force > CLAMPED_N
     signal[_CLAMPED] = signal[_CLAMPED] + m.dt if clamped else 0.0
