@@ -200,3 +200,14 @@ def test_a_motor_that_closes_at_power_on_comes_from_where_nobody_knows(p, seen):
     estimates = estimate(rows, p)
     assert _covered(estimates, force)
     assert np.all(_unknown(estimates)[: released.start]) and not np.any(_unknown(estimates)[released.start + 100 :])
+
+
+def test_a_log_at_a_reduced_rate_that_begins_on_the_way_has_its_released_position_later(p):
+    """Ten samples a second, the first of a motor that has closed by 0.3 rad already: the first release shows from where."""
+    up = brake.clamp(p, 12.0, 1.0, dt=0.1)
+    path = np.concatenate([up + 0.3 * (up < up[-1]), np.full(20, up[-1]), up[::-1], np.zeros(20)])
+    rows, force = brake.samples(p, np.concatenate([path, up]), dt=0.1)
+    rows["brake_request"] = force > 50.0
+    estimates = estimate(rows, p)
+    assert estimates["contact_angle"][len(up)] - p["clearance"] == pytest.approx(0.3, abs=0.2)
+    assert estimates["contact_angle"][len(path)] - p["clearance"] == pytest.approx(0.0, abs=0.01)

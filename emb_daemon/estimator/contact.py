@@ -158,10 +158,14 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         s.unknown = False
     elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
         place_contact(s, p, m.angle)
-        s.unknown = False
+        s.unknown, s.start_angle = False, m.angle
         if not loose:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
+    elif s.start_angle == np.inf and released and loose and s.still_s >= _STILL_S and s.past_contact < 0.0:
+        # A log at a reduced rate that began on the way counts as open, but its first angle was no released position.
+        place_contact(s, p, m.angle)
+        s.start_angle = m.angle
     elif not s.seen:
         # At a request the brake may be clamped, which friction may hold without torque, or on its way. Frames at a reduced
         # rate tell nothing of it, and such logs begin with an open brake.
