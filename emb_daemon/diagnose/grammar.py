@@ -268,7 +268,8 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if not fitted:
         return refused
     prospect, found = min(fitted, key=lambda one: _description(one[1], channel) if straight else one[1].model.noise(channel))
-    shares = _shares_fitted(model, channel, fitted)
+    if len(fitted) > 1:
+        shares = _shares_fitted(model, channel, fitted)
     at_port = sum(share for (port, _), share in shares.items() if port == prospect.form.port)
     sure = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[prospect.means]:.0f} %"
     candidate = found.candidates[_name(prospect.form, selection)]

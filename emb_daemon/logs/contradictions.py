@@ -193,7 +193,7 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
             return np.inf
         part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
         means = np.bincount(part, values[known]) / np.maximum(np.bincount(part), 1)
-        return float(np.sqrt(np.mean((values[known] - means[part]) ** 2)))
+        return float(np.std(values[known] - means[part]))
 
     lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S, _LAG_STEP_S)
     left = np.array([left_N(lag) for lag in lags])
