@@ -8,6 +8,7 @@ import naive
 import numpy as np
 import pytest
 
+from emb_daemon.estimator import restart
 from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
@@ -909,3 +910,13 @@ def test_whether_pads_that_are_apart_still_push_is_not_known(p):
     state["creep"], state["held"] = (0.03, 0.02), (4000.0, 8000.0)
     creeps = estimate(rows[-1:], p, state)[0]
     assert released["sigma"] < 100.0 and creeps["sigma"] == pytest.approx(280.0, rel=0.1)
+
+
+def test_what_pads_creep_is_known_after_a_restart(p):
+    rows, _ = brake.samples(p, brake.stops(p, 4, 1, held_s=3.0), creep=(0.06, 0.7))
+    rows, state, restarted, snapshot = brake.noisy(rows, p), new_state(), new_state(), np.zeros(1, restart.SNAPSHOT)[0]
+    estimate(rows, p, state)
+    assert restart.take_snapshot(state[0], p, snapshot)
+    restart.resume(restarted[0], p, snapshot, 60.0)
+    estimate(rows[:1], p, restarted)
+    assert restarted[0]["creep"].sum() == state[0]["creep"].sum() == pytest.approx(0.06, abs=0.03)
