@@ -455,16 +455,14 @@ def _follow_offset(s):
 
 
 @njit
-def _follow_contact(s, p):
+def _follow_contact(s):
     """When the pads touch, the last stop and its release have shown the contact angle. If it has moved by more than the filter
-    expected since the stop before, its walk is enlarged; what that stop said for a slow change is due to the jump."""
+    expected since the stop before, its walk is enlarged."""
     contact, known = s.contact_angle - s.contact_anchor, s.covariance[CONTACT, CONTACT]
     if s.contact_age_s > 0.0:
         moved = contact - s.contact_before
         walk = max(moved * moved - _SURELY * (known + s.contact_known), 0.0) / s.contact_age_s
         s.contact_walk = 0.5 * (s.contact_walk + walk)
-        if walk > 0.0:
-            _open(s, p, SLOW_CHANGE)
     s.contact_before, s.contact_known, s.contact_age_s = contact, known, 1e-9
 
 
@@ -477,7 +475,7 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     if s.contact.engaged:
         if not s.braked:
             _follow_offset(s)
-            _follow_contact(s, p)
+            _follow_contact(s)
         s.braked = True
     elif released and s.braked:
         s.braked = False
