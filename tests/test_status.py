@@ -111,9 +111,9 @@ def test_stuck_thermocouple_and_contradicted_wheel(seen):
     assert seen.facts() == {"thermocouple_stuck", "wheel_contradicted"}
 
 
-@pytest.mark.parametrize("scale", [0.3, 3.0])
-def test_a_learned_value_at_its_bound(seen, scale):
-    seen.state["scale"] = scale
+@pytest.mark.parametrize(("name", "value"), [("scale", 0.3), ("scale", 3.0), ("creep", (0.5, 0.0)), ("creep", (0.0, -0.5))])
+def test_a_learned_value_at_its_bound(seen, name, value):
+    seen.state[name] = value
     assert seen.facts() == {"bound_reached"}
 
 

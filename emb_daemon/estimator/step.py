@@ -35,7 +35,15 @@ from emb_daemon.estimator.status import (
     ZERO_WANDERS,
     tell_status,
 )
-from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE, add_softening, set_friction, set_priors, softening_sigma
+from emb_daemon.estimator.unknown import (
+    LEAST_SCALE,
+    MOST_CREEP,
+    MOST_SCALE,
+    add_softening,
+    set_friction,
+    set_priors,
+    softening_sigma,
+)
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
@@ -197,7 +205,7 @@ def _look(s, p, m, facts, out):
         facts |= WHEEL_CONTRADICTED
     if s.wander.found and p.clearance_sigma > 0.0:
         facts |= ZERO_WANDERS
-    if not LEAST_SCALE < s.scale < MOST_SCALE:
+    if not LEAST_SCALE < s.scale < MOST_SCALE or max(abs(s.creep[0]), abs(s.creep[1])) >= MOST_CREEP:
         facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         facts |= BEYOND_RANGE
