@@ -139,7 +139,7 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
-@pytest.mark.parametrize("lives", [0, 1])
+@pytest.mark.parametrize("lives", [0, 3])
 def test_workers_may_die(tmp_path, monkeypatch, lives):
     """Dask counts a worker's death against every task that lay there: only who kills one alone is given up."""
     monkeypatch.setattr("emb_daemon.fleet.cluster._LIVES", lives)
