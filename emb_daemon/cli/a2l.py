@@ -1,16 +1,16 @@
 """emb-daemon a2l."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_id_arguments, host_and_port
+from emb_daemon.cli.paths import CONFIG_HELP, add_path
 
 EXAMPLE = "emb-daemon a2l --config /etc/emb_daemon/emb.yaml --output emb_daemon.a2l --udp 192.168.1.10:5555"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="A2L file to write")
+    add_path(parser, "--config", CONFIG_HELP, required=True)
+    add_path(parser, "--output", "A2L file to write", required=True)
     transport = parser.add_mutually_exclusive_group()
     transport.add_argument("--udp", metavar="HOST:PORT", help="address of the XCP server, to be stated in the file")
     transport.add_argument("--can", action="store_true", help="state in the file that the XCP server is on CAN")

@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from emb_daemon.cli.paths import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon adaptation show --state /var/lib/emb_daemon"
@@ -13,9 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "action", choices=("show", "reset", "history"), help="print the values in use, delete them, or print all trainings"
     )
-    parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="state directory (default: $STATE_DIRECTORY or /var/lib/emb_daemon)"
-    )
+    add_path(parser, "--state", "state directory (default: $STATE_DIRECTORY or /var/lib/emb_daemon)", "DIR")
     parser.add_argument("--corner", help="FL, FR, RL or RR (default: all)")
     parser.add_argument("--yes", action="store_true", help="reset without asking, for scripts")
 

@@ -1,16 +1,16 @@
 """emb-daemon check."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.cli.paths import add_path
 from emb_daemon.errors import InputError, InputErrors
 
 EXAMPLE = "emb-daemon check --config config/emb.yaml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    add_path(parser, "--config", "configuration, such as config/emb.yaml")
     add_mapping_argument(parser)
 
 

@@ -4,9 +4,9 @@ import argparse
 import os
 import platform
 import tempfile
-from pathlib import Path
 
 from emb_daemon.ahead.library import TARGETS, default_path, installed_digest
+from emb_daemon.cli.paths import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
@@ -14,7 +14,7 @@ EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = "library to write (%(default)s, where run looks), or .o for an object to link"
-    parser.add_argument("--output", type=Path, default=default_path(), metavar="FILE", help=where)
+    add_path(parser, "--output", where, default=default_path())
     parser.add_argument(
         "--target", default=platform.machine(), metavar="MACHINE", help="x86_64 or aarch64, or its triple (this machine)"
     )

@@ -1,18 +1,18 @@
 """emb-daemon convert."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 
 EXAMPLE = "emb-daemon convert bench.csv --mapping my_rig.yaml --output bench.log"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, metavar="LOG", help=LOG_HELP)
+    add_path(parser, "log", LOG_HELP, "LOG")
     add_mapping_argument(parser, required=True)
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help=".log, .blf, .asc, .trc or .mf4")
+    add_path(parser, "--output", ".log, .blf, .asc, .trc or .mf4", required=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon demo --corners 4 --seconds 30"
@@ -12,7 +13,7 @@ EXAMPLE = "emb-daemon demo --corners 4 --seconds 30"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
     parser.add_argument("--seconds", type=float, default=30.0, metavar="S", help="length of the drive (30)")
-    parser.add_argument("--picture", type=Path, default=Path("emb-daemon-demo.png"), metavar="FILE", help="where to save it")
+    add_path(parser, "--picture", "where to save it", default=Path("emb-daemon-demo.png"))
 
 
 def run(arguments: argparse.Namespace) -> int:

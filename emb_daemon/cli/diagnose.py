@@ -2,10 +2,10 @@
 
 import argparse
 import json
-from pathlib import Path
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.cli.logoptions import add_mapping_argument, log_reader
+from emb_daemon.cli.paths import add_path
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 
@@ -13,19 +13,10 @@ EXAMPLE = "emb-daemon diagnose fit.log.gz --calibration config/calibration.yaml 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", type=Path, metavar="FIT_LOG", help="logs to find effects in")
-    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration to start from")
-    parser.add_argument(
-        "--validate",
-        nargs="+",
-        type=Path,
-        default=[],
-        metavar="LOG",
-        help="logs for validation only (default: episodes left out)",
-    )
-    parser.add_argument(
-        "--output", type=Path, required=True, metavar="DIR", help="folder for calibration.yaml, report.json, report.html"
-    )
+    add_path(parser, "logs", "logs to find effects in", "FIT_LOG", nargs="+")
+    add_path(parser, "--calibration", "calibration to start from", required=True)
+    add_path(parser, "--validate", "logs for validation only (default: episodes left out)", "LOG", nargs="+", default=[])
+    add_path(parser, "--output", "folder for calibration.yaml, report.json, report.html", "DIR", required=True)
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL)")
 

@@ -1,10 +1,10 @@
 """emb-daemon effect."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon effect export calibration.yaml term:gear_friction:motor_angle --output screw_friction.py"
@@ -14,9 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     does = "write a term that diagnose found as an effect file"
     export = commands.add_parser("export", help=does, description=does.capitalize() + ".")
-    export.add_argument("calibration", type=Path, metavar="CALIBRATION", help="calibration that contains the term")
+    add_path(export, "calibration", "calibration that contains the term", "CALIBRATION")
     export.add_argument("term", metavar="TERM", help="name of the term in the calibration")
-    export.add_argument("--output", type=Path, required=True, metavar="FILE", help="effect file to write")
+    add_path(export, "--output", "effect file to write", required=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,27 +1,19 @@
 """emb-daemon export."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.ahead.library import default_path
 from emb_daemon.atomic import write_atomically
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 
 EXAMPLE = "emb-daemon export --calibration calibration.yaml --output brake.fmu"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration of the actuator")
-    parser.add_argument(
-        "--output", type=Path, required=True, metavar="FILE", help="file to write; .h: C header, .fmu: FMI 3.0 co-simulation"
-    )
-    parser.add_argument(
-        "--kernels",
-        type=Path,
-        default=default_path(),
-        metavar="FILE",
-        help="for .fmu: library that compile made (%(default)s)",
-    )
+    add_path(parser, "--calibration", "calibration of the actuator", required=True)
+    add_path(parser, "--output", "file to write; .h: C header, .fmu: FMI 3.0 co-simulation", required=True)
+    add_path(parser, "--kernels", "for .fmu: library that compile made (%(default)s)", default=default_path())
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,11 +4,11 @@ import argparse
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import CALIBRATION_HELP, add_path
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
@@ -25,10 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         for name, (_, text) in _COMMANDS.items()
     }
     ingest = parsers["ingest"]
-    ingest.add_argument(
-        "logs", nargs="+", type=Path, metavar="LOG", help="log files of any format that replay reads, or folders"
-    )
-    ingest.add_argument("--output", type=Path, required=True, metavar="DIR", help="data set; created if it does not exist")
+    add_path(ingest, "logs", "log files of any format that replay reads, or folders", "LOG", nargs="+")
+    add_path(ingest, "--output", "data set; created if it does not exist", "DIR", required=True)
     ingest.add_argument(
         "--unit",
         metavar="REGEX",
@@ -36,12 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_mapping_argument(ingest)
     for name in ("replay", "learn", "diagnose", "prior", "report"):
-        parsers[name].add_argument("data", type=Path, metavar="DIR", help="data set of emb-daemon fleet ingest")
-    parsers["bench"].add_argument("log", type=Path, metavar="LOG", help="a log of a minute or more")
+        add_path(parsers[name], "data", "data set of emb-daemon fleet ingest", "DIR")
+    add_path(parsers["bench"], "log", "a log of a minute or more", "LOG")
     for name in ("replay", "learn", "diagnose", "prior", "bench"):
-        parsers[name].add_argument(
-            "--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A"
-        )
+        add_path(parsers[name], "--calibration", CALIBRATION_HELP)
     for name in ("replay", "learn", "diagnose"):
         parsers[name].add_argument(
             "--resume", action="store_true", help="continue: keep existing results of the same calibration"
@@ -51,11 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--scheduler", metavar="ADDRESS", help="address of a Dask cluster whose workers see DIR (default: this machine)"
         )
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
-    parsers["diagnose"].add_argument(
-        "--units", type=Path, metavar="FILE.csv", help="what units have in common: columns unit, batch, supplier, ..."
-    )
-    parsers["prior"].add_argument("--output", type=Path, required=True, metavar="FILE.yaml", help="the calibration to write")
-    parsers["report"].add_argument("--output", type=Path, required=True, metavar="FILE.html", help="the page to write")
+    add_path(parsers["diagnose"], "--units", "what units have in common: columns unit, batch, supplier, ...", "FILE.csv")
+    add_path(parsers["prior"], "--output", "the calibration to write", "FILE.yaml", required=True)
+    add_path(parsers["report"], "--output", "the page to write", "FILE.html", required=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 
@@ -16,21 +17,11 @@ EXAMPLE = "emb-daemon identify campaign.yaml --output calibration.yaml --report 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "campaign",
-        nargs="?",
-        type=Path,
-        metavar="CAMPAIGN.yaml",
-        help="campaign file: which log was recorded for which purpose",
-    )
+    add_path(parser, "campaign", "campaign file: which log was recorded for which purpose", "CAMPAIGN.yaml", nargs="?")
     add_mapping_argument(parser)
-    parser.add_argument("--output", type=Path, metavar="CALIBRATION.yaml", help="calibration to write")
-    parser.add_argument(
-        "--report", type=Path, metavar="DIR", help="folder for report.html: every step with data, fit, residual"
-    )
-    parser.add_argument(
-        "--example", type=Path, metavar="DIR", help="only write the files of a simulated rig into DIR, to start from"
-    )
+    add_path(parser, "--output", "calibration to write", "CALIBRATION.yaml")
+    add_path(parser, "--report", "folder for report.html: every step with data, fit, residual", "DIR")
+    add_path(parser, "--example", "only write the files of a simulated rig into DIR, to start from", "DIR")
 
 
 def run(arguments: argparse.Namespace) -> int:

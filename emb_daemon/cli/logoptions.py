@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emb_daemon.cli.paths import add_path
+
 if TYPE_CHECKING:
     from emb_daemon.logs.mapping import Mapping
 
@@ -17,13 +19,7 @@ LOG_HELP = (
 
 
 def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False) -> None:
-    parser.add_argument(
-        "--mapping",
-        type=Path,
-        metavar="FILE",
-        required=required,
-        help="YAML file that maps another rig's signals to the daemon's",
-    )
+    add_path(parser, "--mapping", "YAML file that maps another rig's signals to the daemon's", required=required)
 
 
 def open_mapping(path: Path) -> "Mapping":

@@ -3,11 +3,11 @@
 import argparse
 import json
 import sys
-from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options, host_and_port
 from emb_daemon.cli.logoptions import add_mapping_argument
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import add_path
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     page = f"serve a page with live plots, and /metrics for Prometheus, to this machine only (port {_PORT})"
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
-    parser.add_argument("--record", type=Path, metavar="FILE", help="record everything received into an MCAP file")
+    add_path(parser, "--record", "record everything received into an MCAP file")
     parser.add_argument("--udp", metavar="HOST:PORT", help="send JSON datagrams, 50 a second, for PlotJuggler")
     add_mapping_argument(parser)
     add_bus_arguments(parser)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
 from emb_daemon.cli.outputs import check_output
+from emb_daemon.cli.paths import CALIBRATION_HELP, add_path
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 
@@ -16,8 +17,8 @@ EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml -
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help=LOG_HELP)
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
+    add_path(parser, "logs", LOG_HELP, "LOG", nargs="+")
+    add_path(parser, "--calibration", CALIBRATION_HELP)
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
     for option, default, help in (
@@ -31,22 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--measured-torque", action="store_true", help="use the rig's brake torque sensor for the heat model (a car has none)"
     )
-    parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="adapt: read learned values from DIR, learn, and store them there"
-    )
-    parser.add_argument(
-        "--keys", type=Path, metavar="FILE", help="accept only authentic frames, and authenticate those of --output"
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="FILE",
-        help="estimates as .csv, .parquet or .signals.mf4, or the frames that the daemon would have sent as .log, .blf, .asc, "
-        ".trc or .mf4",
-    )
-    parser.add_argument(
-        "--report", type=Path, metavar="FILE.html", help="write an HTML report: forces, errors, temperatures, events"
-    )
+    add_path(parser, "--state", "adapt: read learned values from DIR, learn, and store them there", "DIR")
+    add_path(parser, "--keys", "accept only authentic frames, and authenticate those of --output")
+    frames = "the frames that the daemon would have sent as .log, .blf, .asc, .trc or .mf4"
+    add_path(parser, "--output", f"estimates as .csv, .parquet or .signals.mf4, or {frames}")
+    add_path(parser, "--report", "write an HTML report: forces, errors, temperatures, events", "FILE.html")
     parser.add_argument("--json", action="store_true", help="print error figures as JSON")
 
 

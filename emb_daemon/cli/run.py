@@ -8,18 +8,16 @@ from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
+from emb_daemon.cli.paths import add_path
 
 EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", required=True, type=Path, metavar="FILE", help="configuration, such as config/emb.yaml")
+    add_path(parser, "--config", "configuration, such as config/emb.yaml", required=True)
     add_mapping_argument(parser)
-    parser.add_argument(
-        "--share",
-        type=Path,
-        metavar="FILE",
-        help="share the estimates of every tick in FILE, which must be in a folder kept in memory; xcp reads it",
+    add_path(
+        parser, "--share", "share the estimates of every tick in FILE, which must be in a folder kept in memory; xcp reads it"
     )
     add_bus_arguments(parser)
 

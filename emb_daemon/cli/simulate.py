@@ -1,10 +1,10 @@
 """emb-daemon simulate."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
 from emb_daemon.cli.logoptions import add_mapping_argument
+from emb_daemon.cli.paths import add_path
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
@@ -16,15 +16,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds (default: on Ctrl-C or SIGTERM)")
     parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="calibration of the simulated brake (default: the shipped one)"
-    )
+    add_path(parser, "--calibration", "calibration of the simulated brake (default: the shipped one)")
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
     add_mapping_argument(parser)
-    parser.add_argument(
-        "--keys", type=Path, metavar="FILE", help="authenticate sent frames, accept only authentic ones (SecOC)"
-    )
-    parser.add_argument("--state", type=Path, metavar="DIR", help="with --keys: folder for the trip counter")
+    add_path(parser, "--keys", "authenticate sent frames, accept only authentic ones (SecOC)")
+    add_path(parser, "--state", "with --keys: folder for the trip counter", "DIR")
     parser.add_argument("--seed", type=int, default=0, help="random seed of tolerances and noise (0)")
     add_bus_arguments(parser)
 

@@ -2,9 +2,9 @@
 
 import argparse
 import sys
-from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids
+from emb_daemon.cli.paths import CONFIG_HELP, add_path
 from emb_daemon.cli.serving import serve
 from emb_daemon.errors import InputError
 
@@ -12,11 +12,10 @@ EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
-    parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="the daemon's state directory; trouble codes are stored there too "
-        "(default: $STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon)"
-    )  # fmt: skip
+    add_path(parser, "--config", CONFIG_HELP, required=True)
+    default = "$STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon"
+    state = f"the daemon's state directory; trouble codes are stored there too (default: {default})"
+    add_path(parser, "--state", state, "DIR")
     add_id_arguments(parser, 0x710, 0x718)
     add_bus_arguments(parser)
 

@@ -1,9 +1,9 @@
 """emb-daemon xcp."""
 
 import argparse
-from pathlib import Path
 
 from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids, host_and_port
+from emb_daemon.cli.paths import CONFIG_HELP, add_path
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
@@ -13,10 +13,8 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the daemon's configuration")
-    parser.add_argument(
-        "--share", type=Path, required=True, metavar="FILE", help="the file given to emb-daemon run as --share"
-    )
+    add_path(parser, "--config", CONFIG_HELP, required=True)
+    add_path(parser, "--share", "the file given to emb-daemon run as --share", required=True)
     transport = parser.add_mutually_exclusive_group(required=True)
     transport.add_argument(
         "--udp",
