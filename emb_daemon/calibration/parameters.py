@@ -12,7 +12,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import msgspec
@@ -123,17 +123,7 @@ def value_of(calibration: Calibration, key: str) -> float:
     Raises:
         InputError: no number has that key; names near ones.
     """
-    found: Any = calibration
-    try:
-        parts = _parts(key)
-        for depth, part in enumerate(parts):
-            if depth == 1 and parts[0] == "effects" and part not in found:
-                found = _neutral(part)
-            else:
-                found = getattr(found, part) if isinstance(found, msgspec.Struct) else found[part]
-    except _NO_NUMBER:
-        found = None
-    if type(found) is not float:
+    if (found := _number_at(calibration, key)) is None:
         raise _unknown(calibration, key)
     return found
 
@@ -149,13 +139,11 @@ def moved(calibration: Calibration, values: Mapping[str, float], *, checked: boo
         InputError: no number has a key; names near ones.
         InputErrors: ``checked``, and the result is not what a calibration file may hold; lists every fault.
     """
-    changed = calibration
-    for key, value in values.items():
-        number = float(value)
-        try:
-            changed = _set(changed, _parts(key), number)
-        except _NO_NUMBER:
-            raise _unknown(calibration, key) from None
+    numbers = [float(value) for value in values.values()]
+    try:
+        changed = _set(calibration, _tree(tuple(values)), numbers) if values else calibration
+    except _NO_NUMBER:
+        raise _unknown(calibration, next(key for key in values if _number_at(calibration, key) is None)) from None
     return _validate(changed, values) if checked else changed
 
 
@@ -207,21 +195,54 @@ def _neutral(effect: str) -> dict[str, float]:
     }
 
 
-def _set(node: Any, parts: tuple[str | int, ...], value: float) -> Any:
-    """A copy of ``node`` with the number at ``parts`` below it set; everything outside of the path is shared."""
-    if not parts:
+def _number_at(calibration: Calibration, key: str) -> float | None:
+    """The number at a key; None if there is none."""
+    found: Any = calibration
+    try:
+        parts = _parts(key)
+        for depth, part in enumerate(parts):
+            if depth == 1 and parts[0] == "effects" and part not in found:
+                found = _neutral(part)
+            else:
+                found = getattr(found, part) if isinstance(found, msgspec.Struct) else found[part]
+    except _NO_NUMBER:
+        return None
+    return found if type(found) is float else None
+
+
+@lru_cache(256)
+def _tree(keys: tuple[str, ...]) -> dict[str | int, Any]:
+    """Names and indices of all keys as a tree with the keys' positions as leaves; fits move the same keys again and again."""
+    tree: dict[str | int, Any] = {}
+    for position, key in enumerate(keys):
+        *path, last = _parts(key) or (key,)
+        node = tree
+        for part in path:
+            node = node.setdefault(part, {})
+        node[last] = position
+    return tree
+
+
+def _set(node: Any, tree: Any, numbers: list[float]) -> Any:
+    """A copy of ``node`` with ``numbers`` where the `_tree` below it has their positions; everything else is shared."""
+    if isinstance(tree, int):
         if type(node) is not float:
             raise TypeError
-        return value
-    part, rest = parts[0], parts[1:]
+        return numbers[tree]
     if isinstance(node, msgspec.Struct):
         # Without __post_init__: `_validate` checks the whole.
         result = node.__copy__()
-        msgspec.structs.force_setattr(result, part, _set(getattr(node, part), rest, value))
+        for part, below in tree.items():
+            msgspec.structs.force_setattr(result, part, _set(getattr(node, part), below, numbers))
         return result
     if isinstance(node, dict):
-        return {**node, part: _set(node[part] if part in node else _neutral(part), rest, value)}
-    return (*node[:part], _set(node[part], rest, value), *node[part + 1 :])
+        return node | {
+            part: _set(node[part] if part in node else _neutral(part), below, numbers) for part, below in tree.items()
+        }
+    items = list(node)
+    for part, below in tree.items():
+        items[part] = _set(items[part], below, numbers)
+    return tuple(items)
 
 
 def _validate(calibration: Calibration, values: Mapping[str, float]) -> Calibration:

@@ -6,6 +6,7 @@ nor hide one, so every candidate is tested with all of its channel's base coordi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -216,6 +217,26 @@ def effect_coordinates(
     return result
 
 
+@lru_cache(256)
+def _moves(coordinates: tuple[Coordinate, ...], log: int | None) -> tuple[dict[str, int], np.ndarray, np.ndarray]:
+    """How keys follow coordinates on a log, or on all.
+
+    Returns:
+        (position of each key; positions of key and coordinate, and weight, of each move, shape (3, moves); number of
+        coordinates of single logs, lowest and highest of each key, shape (3, keys)).
+    """
+    places: dict[str, int] = {}
+    moves, limits = [], {}
+    for column, coordinate in enumerate(coordinates):
+        if log is None or coordinate.log in (None, log):
+            for move in coordinate.moves:
+                place = places.setdefault(move.key, len(places))
+                moves.append((place, column, move.weight))
+                of_logs = limits.get(place, (0,))[0] + (coordinate.log is not None)
+                limits[place] = of_logs, move.low, move.high
+    return places, np.array(moves).T.reshape(3, -1), np.array([*limits.values()]).T.reshape(3, -1)
+
+
 def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, float]:
     """What coordinates say of the calibration's numbers.
 
@@ -223,22 +244,16 @@ def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, f
         middle: motor angle in rad about which harmonics are fitted, see `about_middle`.
         log: only what acts on this log; None: what acts on single logs counts with its mean.
     """
-    sums: dict[str, float] = {}
-    counts: dict[str, int] = {}
-    limits: dict[str, tuple[float, float]] = {}
-    for coordinate, value in values.items():
-        if log is not None and coordinate.log not in (None, log):
-            continue
-        for move in coordinate.moves:
-            sums[move.key] = sums.get(move.key, 0.0) + move.weight * value
-            counts[move.key] = counts.get(move.key, 0) + (coordinate.log is not None)
-            limits[move.key] = move.low, move.high
-    found = {key: total / max(counts[key], 1) for key, total in sums.items()}
-    for order, cosine, sine, (low, high) in _HARMONICS:
-        if order in found:
-            found[cosine], found[sine] = _turn(found.get(cosine, 0.0), found.get(sine, 0.0), found[order] * middle)
-            limits[cosine] = limits[sine] = limits.get(cosine, (low, high))
-    return {key: min(max(value, limits[key][0]), limits[key][1]) for key, value in found.items()}
+    places, (key, column, weight), (of_logs, lowest, highest) = _moves(tuple(values), log)
+    moved_by = weight * np.fromiter(values.values(), float, len(values))[column.astype(int)]
+    sums = np.bincount(key.astype(int), moved_by, len(places)) / np.maximum(of_logs, 1.0)
+    found = dict(zip(places, np.minimum(np.maximum(sums, lowest), highest).tolist(), strict=True))
+    for order, *parts, bounds in _HARMONICS:
+        if order in places:
+            least, most = (lowest[places[parts[0]]], highest[places[parts[0]]]) if parts[0] in places else bounds
+            turned = _turn(*(sums[places[part]] if part in places else 0.0 for part in parts), sums[places[order]] * middle)
+            found |= {part: min(max(value, least), most) for part, value in zip(parts, turned, strict=True)}
+    return found
 
 
 def about_middle(values: Values, middle: float) -> dict[Coordinate, float]:

@@ -280,7 +280,7 @@ class Bench:
 
         def one(trial: Trial) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
             trace, heat = run_with_heat(trial.log.samples, self._parameters(trial, values))
-            return self.compare(trial, trace), heat
+            return {channel: self.residual_of(trial, trace, channel) for channel in self.channels}, heat
 
         parts, heat = zip(*self.map(one, self.trials), strict=True)
         return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
@@ -288,10 +288,18 @@ class Bench:
     def _parameters(self, trial: Trial, values: Values) -> np.void:
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
-    def compare(self, trial: Trial, trace: np.ndarray) -> dict[str, np.ndarray]:
-        """Residuals of a run (TRACE rows)."""
-        samples, force = trial.log.samples, trial.force_N
-        judged = force if self.has_reference else trace["force"]
+    def residual_of(self, trial: Trial, trace: np.ndarray, channel: str) -> np.ndarray:
+        """One channel's residual of a run (TRACE rows)."""
+        if channel == "stiffness":
+            return np.nan_to_num(trial.force_N - trace["force"])
+        if channel == "temperature":
+            temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]
+            return np.nan_to_num(trial.temperature_C - temperature).ravel()
+        return self._brake_torque_left(trial, trace) if channel == "brake_torque" else self._torque_left(trial, trace)
+
+    def _torque_left(self, trial: Trial, trace: np.ndarray) -> np.ndarray:
+        """Motor torque that the clamp force does not explain, as force; without a reference, the force of the other path."""
+        judged = trial.force_N if self.has_reference else trace["force"]
         mean = judged.copy()
         mean[1:] = 0.5 * (judged[1:] + judged[:-1])
         if not self.has_reference:
@@ -303,22 +311,19 @@ class Bench:
             # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
             load = left / trace["torque_constant"] * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
-        told = samples["dt"] <= ONE_CYCLE_S
+        told = trial.log.samples["dt"] <= ONE_CYCLE_S
         if self.turns_free:
             # Without a load friction holds a motor that stands, whatever its current below that of friction.
             told &= ~trial.stands
-        torque = np.where(told, np.nan_to_num(load, nan=0.0), 0.0)
-        result = {"stiffness": np.nan_to_num(force - trace["force"]), "torque": torque, "innovation": torque}
-        if "temperature" in self.channels:
-            temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]
-            result["temperature"] = np.nan_to_num(trial.temperature_C - temperature).ravel()
-        if "brake_torque" in self.channels:
-            wheel = np.where(samples["has_wheel_speed"], samples["wheel_speed"], 0.0)
-            sliding = (wheel > _SLIDING) & (trace["power"] > 0.0) & (trial.brake_torque_Nm > 0.0)
-            sliding &= np.nan_to_num(force, nan=0.0) > _TOUCHING_N if self.has_reference else True
-            left = trial.brake_torque_Nm - trace["power"] / np.maximum(wheel, _SLIDING)
-            result["brake_torque"] = np.where(sliding, left, 0.0)
-        return result
+        return np.where(told, np.nan_to_num(load, nan=0.0), 0.0)
+
+    def _brake_torque_left(self, trial: Trial, trace: np.ndarray) -> np.ndarray:
+        samples = trial.log.samples
+        wheel = np.where(samples["has_wheel_speed"], samples["wheel_speed"], 0.0)
+        sliding = (wheel > _SLIDING) & (trace["power"] > 0.0) & (trial.brake_torque_Nm > 0.0)
+        sliding &= np.nan_to_num(trial.force_N, nan=0.0) > _TOUCHING_N if self.has_reference else True
+        left = trial.brake_torque_Nm - trace["power"] / np.maximum(wheel, _SLIDING)
+        return np.where(sliding, left, 0.0)
 
     def regressors(
         self,
@@ -349,7 +354,7 @@ class Bench:
         for trial, known in zip(self.trials, heat, strict=True):
             samples, parameters = trial.log.samples, self._parameters(trial, values)
             trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
-            parts.append(self.compare(trial, trace)[channel])
+            parts.append(self.residual_of(trial, trace, channel))
         return np.concatenate(parts)
 
 

@@ -43,7 +43,8 @@ _MMSGHDR = np.dtype(
         "itemsize": 64,
     }
 )
-_CONTROL_BYTES = 64
+#: Room for control messages, in words of eight bytes, which is how they are aligned: length, level with type, content.
+_CONTROL_WORDS = 8
 #: Largest number of frames that one call takes or sends.
 _CAPACITY = 1024
 #: Errors of a socket whose interface was deleted, and errors after which the next call may succeed.
@@ -60,7 +61,7 @@ class _Batch:
 
     def __init__(self, frame_bytes: int, control: bool):
         self.raw = np.zeros(_CAPACITY, _CAN_FRAME)
-        self.control = np.zeros((_CAPACITY, _CONTROL_BYTES), np.uint8)
+        self.control = np.zeros((_CAPACITY, _CONTROL_WORDS), np.int64)
         self._iov = np.zeros(_CAPACITY, _IOVEC)
         self.headers = np.zeros(_CAPACITY, _MMSGHDR)
         rows = np.arange(_CAPACITY, dtype=np.uint64)
@@ -69,14 +70,12 @@ class _Batch:
         self.headers["iov"] = self._iov.ctypes.data + rows * _IOVEC.itemsize
         self.headers["iov_length"] = 1
         if control:
-            self.headers["control"] = self.control.ctypes.data + rows * _CONTROL_BYTES
-            self.headers["control_length"] = _CONTROL_BYTES
+            self.headers["control"] = self.control.ctypes.data + 8 * _CONTROL_WORDS * rows
+            self.headers["control_length"] = 8 * _CONTROL_WORDS
         self.address = ctypes.c_void_p(self.headers.ctypes.data)
 
 
-@entry(
-    Array(_CAN_FRAME), Array(_MMSGHDR), Array(np.uint8, 2), int, bool, int, int, int, Array(FRAME), returns=2
-)  # fmt: skip
+@entry(Array(_CAN_FRAME), Array(_MMSGHDR), Array(np.int64, 2), int, bool, int, int, int, Array(FRAME), returns=2)
 def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, now_ns, frames):
     """Frames with times on the monotonic clock; returns how many there are, and the socket's drop counter or -1.
 
@@ -97,30 +96,19 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
         frame.length = source.length
         frame.data = source.data
         stamp = source.time_ns if stamped else now_ns
-        at, end = 0, np.int64(headers[index].control_length)
-        bytes_ = control[index]
-        while at + 16 <= end:
-            size, kind = np.int64(0), np.int64(0)
-            for byte in range(8):
-                size |= np.int64(bytes_[at + byte]) << (8 * byte)
-            for byte in range(4):
-                kind |= np.int64(bytes_[at + 12 + byte]) << (8 * byte)
-            if size < 16 or at + size > end:
+        at, words = 0, control[index]
+        while 8 * (at + 2) <= np.int64(headers[index].control_length):
+            size, kind = words[at], words[at + 1] >> 32
+            if size < 16 or 8 * at + size > headers[index].control_length:
                 break
             if kind == _SO_TIMESTAMPNS and size >= 32:
-                seconds, nanoseconds = np.int64(0), np.int64(0)
-                for byte in range(8):
-                    seconds |= np.int64(bytes_[at + 16 + byte]) << (8 * byte)
-                    nanoseconds |= np.int64(bytes_[at + 24 + byte]) << (8 * byte)
-                stamp = seconds * 1_000_000_000 + nanoseconds // 1000 * 1000 - offset_ns
+                stamp = words[at + 2] * 1_000_000_000 + words[at + 3] // 1000 * 1000 - offset_ns
             elif kind == _SO_RXQ_OVFL and size >= 20:
-                drops = np.int64(0)
-                for byte in range(4):
-                    drops |= np.int64(bytes_[at + 16 + byte]) << (8 * byte)
-            at += (size + 7) // 8 * 8
+                drops = words[at + 2] & 0xFFFF_FFFF
+            at += (size + 7) // 8
         frame.time_ns = min(max(stamp, earliest_ns), now_ns)
         earliest_ns = frame.time_ns
-        headers[index].control_length = _CONTROL_BYTES
+        headers[index].control_length = 8 * _CONTROL_WORDS
     return count, drops
 
 
