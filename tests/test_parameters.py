@@ -55,6 +55,14 @@ def test_moving_a_key_moves_that_number_alone(key, value):
     assert moved(after, {key: before[key]}) == _CALIBRATION
 
 
+@given(st.dictionaries(st.sampled_from(_KEYS + _EFFECT_KEYS), st.floats(allow_nan=False, allow_infinity=False)))
+def test_keys_move_together_as_they_do_one_by_one(values):
+    after = _OFF
+    for key, value in values.items():
+        after = moved(after, {key: value})
+    assert moved(_OFF, values) == after
+
+
 @given(st.sampled_from(_KEYS + _EFFECT_KEYS))
 def test_a_step_is_felt_and_stays_in_bounds_on_one_side(key):
     found = parameter(_CALIBRATION, key)
@@ -124,9 +132,12 @@ def test_no_text_crashes(key):
 
 
 @pytest.mark.parametrize("key", ["", "motor", "format", "actuator", "adaptation.enabled", "provenance.figures", "effects"])
-def test_what_is_no_number_is_no_parameter(key):
-    with pytest.raises(InputError):
-        value_of(_CALIBRATION, key)
+@pytest.mark.parametrize(
+    "use", [value_of, lambda calibration, key: moved(calibration, {"contact.clearance_rad": 7.0, key: 1.0})]
+)
+def test_what_is_no_number_is_no_parameter(use, key):
+    with pytest.raises(InputError, match=f"^{re.escape(key)}: not a number"):
+        use(_CALIBRATION, key)
 
 
 @pytest.mark.parametrize(
