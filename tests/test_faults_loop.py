@@ -265,6 +265,22 @@ def test_a_frame_that_comes_while_the_loop_is_held_up_keeps_its_stamp(monkeypatc
         assert bus.drain()["time_ns"][0] <= sent[0] + _CLOCKS_NS
 
 
+def test_frames_without_room_are_counted_beside_their_stamps():
+    """The kernel says with each frame how many were dropped before it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs:
+        ours.bind(("127.0.0.1", 0))
+        for option, value in ((rawcan._SO_TIMESTAMPNS, 1), (rawcan._SO_RXQ_OVFL, 1), (socket.SO_RCVBUF, 4096)):
+            ours.setsockopt(socket.SOL_SOCKET, option, value)
+        theirs.connect(ours.getsockname())
+        bus = RawCanSocket(ours)
+        for _ in range(200):
+            theirs.send(bytes(16))
+        heard = len(bus.drain())
+        theirs.send(bytes(16))
+        assert len(bus.drain()) == 1
+        assert 0 < heard < 200 and bus.dropped == 200 - heard
+
+
 def test_a_peer_that_is_gone_sends_nothing():
     """The end of a socket pair reads as empty messages for ever."""
     near, far = socket_pair()
