@@ -150,7 +150,7 @@ class Search:
     def forms(self) -> list[Form]:
         """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed."""
         every = enumerate_forms(self.covered, self.ports)
-        return [form for form in every if self.model.bench.clamps or form.gate == "always"]
+        return [form for form in every if form.gate == "always" or self.model.bench.clamps]
 
     @cached_property
     def gains(self) -> np.ndarray:
