@@ -164,7 +164,10 @@ def test_memories_lag_slip_and_respond():
     np.testing.assert_allclose(response, 0.25 * lag, rtol=1e-9)
     # Signals that stay at their edge for ever would make more of it than a friction may lose or gain.
     hot = Term(**base | {"port": "gear_friction", "coefficient": 12.0}, memory="response", memory_scale=2.0, low=0.0, high=1.0)
-    np.testing.assert_allclose(over(hot, x)[10:], np.minimum(24.0 * lag, 0.9), rtol=1e-9)
+    np.testing.assert_allclose(over(hot, x)[10:], np.minimum(24.0 * lag, 2.0), rtol=1e-9)
+    np.testing.assert_allclose(
+        over(msgspec.structs.replace(hot, coefficient=-12.0), x)[10:], np.maximum(-24.0 * lag, -0.9), rtol=1e-9
+    )
     there_and_back = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)])
     slip = over(Term(**base, memory="slip", memory_scale=0.2, low=0.0, high=1.0), there_and_back)
     assert slip[100] == pytest.approx(0.5) and slip[-1] == pytest.approx(-0.5) and slip[121] == pytest.approx(0.0, abs=1e-9)
@@ -310,6 +313,21 @@ def test_friction_may_grow_by_more_than_it_may_fall(port, coefficient, said):
     """No friction is negative, but of three times as much a machine does not become another one."""
     with pytest.raises(InvalidValue, match=said) if said else contextlib.nullcontext():
         constant(port, coefficient)
+
+
+@pytest.mark.parametrize(("port", "least", "most"), [("gear_friction", -0.9, 2.0), ("gear_gain", -0.9, 0.9)])
+def test_a_product_is_held_at_what_its_port_may_bear(port, least, most):
+    """Two signals are hardly at their largest at once: where they would be, it may be more than a machine has."""
+    of = {"port": port, "signal": "clamp_force", "other": "motor_speed", "other_high": 100.0, "low": 0.0, "high": 1e4}
+    signals = np.zeros((2, len(terms.SIGNALS)))
+    signals[:, list(terms.SIGNALS).index("clamp_force")] = 1e4
+    signals[:, list(terms.SIGNALS).index("motor_speed")] = 10.0, 100.0
+    for coefficient, most_added in ((3.4, most), (-3.4, least)):
+        term = Term(name="term:x", shape="odd_power", scale=1e4, coefficient=coefficient, **of)
+        record = np.zeros(1, terms.PARAMETERS)[0]
+        fill_terms(record, (term,))
+        added = terms.evaluate(record["term"][0], signals, np.full(2, DT), 3e4)
+        np.testing.assert_allclose(added, [0.1 * coefficient, most_added])
 
 
 @given(

@@ -115,7 +115,7 @@ class Term(Struct, kw_only=True):
 
     @property
     def limit(self) -> float:
-        """Most that it may subtract, and that a response may add, in the port's unit."""
+        """Most that it may subtract, in the port's unit."""
         return _MOST_AT.get(self.port, _FACTOR)
 
     @property
@@ -127,7 +127,7 @@ class Term(Struct, kw_only=True):
     def is_held(self) -> bool:
         """Whether the kernel holds it within its limits: how long its signal stays says what a response reaches, and two
         signals are hardly at their largest at once."""
-        return self.memory == "response" or (self.other is not None and self.growth == self.limit)
+        return self.memory == "response" or self.other is not None
 
     @property
     def is_bounded(self) -> bool:
@@ -168,7 +168,7 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
-        row["limit"] = term.limit if term.is_held else np.inf
+        row["limit"], row["growth"] = (term.limit, term.growth) if term.is_held else (np.inf, np.inf)
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

@@ -337,20 +337,21 @@ def _left(
         if channel not in after:
             continue
         found: list[Dependence] = []
+        # What a calibration's own data left is in its noise already, sample by sample.
+        samples = 1 if model.bench.own_data else LASTING[channel]
         if channel in FORCE_CHANNELS:
-            # What a calibration's own data left is in its noise already, sample by sample.
-            gains = screening.dependence(model, channel, 1 if model.bench.own_data else LASTING[channel])
+            gains = screening.dependence(model, channel, samples)
             gains = {name: pair for name, pair in gains.items() if name not in NO_RIVALS.get(channel, ())}
             least = screening.floor(model, channel)
             if not model.bench.own_data:
-                least = max(least, least_dependence(model.residual[channel], LASTING[channel]))
+                least = max(least, least_dependence(model.residual[channel], samples))
             found = dependences(channel, gains, model.counted(channel), least)
-        first, last = rms_known(before[channel]), rms_known(after[channel])
-        known = screening.achieved(model, channel, force, rise)
+        first, last = (rms_known(residual[channel], judging.episode[channel], samples) for residual in (before, after))
+        known = screening.achieved(model, channel, force, rise, samples)
         if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):
             # Where the brake torque is measured the pads' friction has no share in it.
             first, last = (rms_known(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
-            known = screening.achieved(model, channel, force, np.zeros(0))
+            known = screening.achieved(model, channel, force, np.zeros(0), samples)
             found = _heat_dependences(selection, augmented) if is_beyond(last, known) else []
         share = (last / first) ** 2 if first > 0.0 else 0.0
         result[channel] = Left(channel, last, known, share, tuple(found))

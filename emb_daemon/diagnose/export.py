@@ -132,7 +132,7 @@ def _kernel(term: Term) -> list[str]:
     if not harmonic:
         body = f"p.coefficient * {body}"
     if term.is_held and np.isfinite(term.limit):
-        body = f"min(max({body}, -{term.limit!r}), {term.limit!r})"
+        body = f"min(max({body}, -{term.limit!r}), {term.growth!r})"
     z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
     arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
     return [

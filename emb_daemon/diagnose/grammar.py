@@ -34,7 +34,6 @@ from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, Candidate
 from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
-from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import MOST, PORTS, SIGNALS
 from emb_daemon.offline.run import held
@@ -224,12 +223,9 @@ def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
 
 def _wanted(selection: Selection, channel: str) -> bool:
     """Whether enough is left, of what lasts longer than noise, for a term to be made up."""
-    model, screening = selection.model, selection.screening
-    known = screening.achieved(model, channel, screening.signals["clamp_force"], np.zeros(0))
-    if is_beyond(np.sqrt(model.noise(channel)), known):
-        return True
-    screen = Screen(model, channel, 1 if channel == CHANNEL_OF_HEAT else COARSE)
-    return rmse(screen.residual[:, 0] * screen.means.per_mean) >= screening.floor(model, channel, made=True)
+    screen = Screen(selection.model, channel, 1 if channel == CHANNEL_OF_HEAT else COARSE)
+    floor = selection.screening.floor(selection.model, channel, made=True)
+    return rmse(screen.residual[:, 0] * screen.means.per_mean) >= floor
 
 
 def _one_more(selection: Selection, channel: str) -> Selection:

@@ -11,7 +11,6 @@ from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, le
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
-from emb_daemon.offline.score import rmse
 
 #: Least number of samples that are worth one, when priors are weighed against data: twenty milliseconds, the shortest time
 #: over which a residual of either path stays the same.
@@ -24,10 +23,11 @@ TOLERANCE, _EVALUATIONS = 2e-3, 8
 _TURNS, _RIGHT_K, LITTLE = 5, 0.75, 0.98
 
 
-def rms_known(residual: np.ndarray) -> float:
-    """RMS of a channel's residual where there is one: it is zero where nothing was measured."""
-    counted = residual[residual != 0.0]
-    return rmse(counted) if len(counted) else 0.0
+def rms_known(residual: np.ndarray, episode: np.ndarray | None = None, samples: int = 1) -> float:
+    """RMS of a channel's residual where there is one: it is zero where nothing was measured; of its means over so many
+    ``samples`` of an ``episode`` each (`Averaging`)."""
+    means = residual if episode is None else Averaging(episode, samples).of(residual[:, None])
+    return float(np.sqrt(np.square(means).sum() / max(np.count_nonzero(residual), 1)))
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,7 @@ class Model:
 
     def lasting(self, channel: str, samples: int) -> float:
         """Mean square of what lasts over so many samples of the residual."""
-        means = Averaging(self.bench.episode[channel], samples)
-        return float(np.square(means.of(self.residual[channel][:, None])).sum()) / self.counted(channel)
+        return rms_known(self.residual[channel], self.bench.episode[channel], samples) ** 2
 
     def inflation(self, channel: str) -> float:
         """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""

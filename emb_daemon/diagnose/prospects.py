@@ -148,8 +148,9 @@ class Search:
 
     @cached_property
     def forms(self) -> list[Form]:
-        """All of one signal but ripples."""
-        return enumerate_forms(self.covered, self.ports)
+        """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed."""
+        every = enumerate_forms(self.covered, self.ports)
+        return [form for form in every if form.gate == "always" or self.model.bench.clamps]
 
     @cached_property
     def gains(self) -> np.ndarray:
@@ -210,8 +211,8 @@ class Search:
         more often is a constant there, and its shape says something else."""
         if not term.is_held:
             return True
-        values = values_of(self.model.bench, term, self.signals)
-        return bool(np.quantile(np.abs(values), _HELD) <= term.limit)
+        values = _evaluate(self.model.bench, _unheld(term), self.signals)
+        return bool(np.quantile(np.maximum(-values / term.limit, values / term.growth), _HELD) <= 1.0)
 
     def of_means(self, port: str, signals: tuple[str, ...]) -> list[Prospect]:
         """The best forms of some signals at a port, through the estimator."""
@@ -327,11 +328,6 @@ def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
     return _evaluate(bench, record_of(replace(form, port=form.port or PORTS[0])), signals)
 
 
-def values_of(bench: Bench, term: Term, signals: list[np.ndarray]) -> np.ndarray:
-    """What a term adds at its port at every sample if nothing holds it."""
-    return _evaluate(bench, _unheld(term), signals)
-
-
 def _evaluate(bench: Bench, record: np.void, signals: list[np.ndarray]) -> np.ndarray:
     largest = bench.calibration.stiffness.maximum_force_N
     parts = zip(bench.trials, signals, strict=True)
@@ -346,9 +342,10 @@ def record_of(form: Form) -> np.void:
 
 
 def _unheld(term: Term) -> np.void:
+    """A term (TERM) that nothing limits."""
     parameters = np.zeros(1, PARAMETERS)[0]
     fill_terms(parameters, (term,))
-    parameters["term"][0]["limit"] = np.inf
+    parameters["term"][0]["limit"] = parameters["term"][0]["growth"] = np.inf
     return parameters["term"][0]
 
 

@@ -20,7 +20,9 @@ from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by
 from emb_daemon.diagnose.episodes import episodes, standing
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.speeds import denoised
+from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import OF_THE_MOTOR
+from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.logs.columns import nearest
@@ -43,6 +45,8 @@ _BRAKING_NM = 20.0
 #: Below it most of the current turns the machine itself, and a constant fitted to the load would be less than half of the
 #: motor's (regression dilution).
 _FOR_THE_LOAD = 0.5
+#: Step of the current by which the torque of one ampere more is found, A.
+_MORE_A = 0.1
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -138,6 +142,15 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
     products = rest.T @ rest
     size = products[0, 0] * products[1, 1]
     return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
+
+
+def _follows_current(effects: np.void) -> bool:
+    """Whether the torque constant follows the current of its own sample, by the effects of PARAMETERS."""
+    own = [e for e in REGISTRY if (e.hook, e.signal) == ("torque_constant", "current")]
+    terms, current = effects["terms"], list(SIGNALS).index("current")
+    there = [t for t in terms["term"][: terms["count"]] if t["port"] == PORTS.index("torque_constant")]
+    direct = [t for t in there if not t["memory"] and current in (t["signal"], t["other"])]
+    return bool(direct) or any(effects[e.name][p.name] for e in own for p in e.amplitudes)
 
 
 class Bench:
@@ -279,8 +292,10 @@ class Bench:
         """Residual by channel over all logs, and the heat of each log (`held_heat.run_with_heat`)."""
 
         def one(trial: Trial) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-            trace, heat = run_with_heat(trial.log.samples, self._parameters(trial, values))
-            return {channel: self.residual_of(trial, trace, channel) for channel in self.channels}, heat
+            parameters = self._parameters(trial, values)
+            trace, heat = run_with_heat(trial.log.samples, parameters)
+            per_ampere = self._per_ampere(trial, parameters, heat)
+            return {channel: self.residual_of(trial, trace, channel, per_ampere) for channel in self.channels}, heat
 
         parts, heat = zip(*self.map(one, self.trials), strict=True)
         return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
@@ -288,16 +303,29 @@ class Bench:
     def _parameters(self, trial: Trial, values: Values) -> np.void:
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
-    def residual_of(self, trial: Trial, trace: np.ndarray, channel: str) -> np.ndarray:
-        """One channel's residual of a run (TRACE rows)."""
+    def _per_ampere(self, trial: Trial, parameters: np.void, heat: np.ndarray | None) -> np.ndarray | None:
+        """Torque (N m) of one ampere more at each sample of a run, where the constant itself follows the current: the noise of
+        that counts so much there, which least squares would reduce by a wrong exponent."""
+        if heat is None or not _follows_current(parameters["effects"]):
+            return None
+        samples = trial.log.samples.copy()
+        now = run_held(samples, parameters, heat)
+        samples["current_q"] += _MORE_A
+        more = (run_held(samples, parameters, heat)["torque"] - now["torque"]) / _MORE_A
+        return np.clip(more, 0.5 * now["torque_constant"], 2.0 * now["torque_constant"])
+
+    def residual_of(self, trial: Trial, trace: np.ndarray, channel: str, per_ampere: np.ndarray | None = None) -> np.ndarray:
+        """One channel's residual of a run (TRACE rows); ``per_ampere``: N m, the torque constant if none is given."""
         if channel == "stiffness":
             return np.nan_to_num(trial.force_N - trace["force"])
         if channel == "temperature":
             temperature = np.where(trace["temperature_known"][:, None], trace["temperature"], np.nan)[trial.temperature_rows]
             return np.nan_to_num(trial.temperature_C - temperature).ravel()
-        return self._brake_torque_left(trial, trace) if channel == "brake_torque" else self._torque_left(trial, trace)
+        if channel == "brake_torque":
+            return self._brake_torque_left(trial, trace)
+        return self._torque_left(trial, trace, per_ampere)
 
-    def _torque_left(self, trial: Trial, trace: np.ndarray) -> np.ndarray:
+    def _torque_left(self, trial: Trial, trace: np.ndarray, per_ampere: np.ndarray | None) -> np.ndarray:
         """Motor torque that the clamp force does not explain, as force; without a reference, the force of the other path."""
         judged = trial.force_N if self.has_reference else trace["force"]
         mean = judged.copy()
@@ -309,7 +337,7 @@ class Bench:
             load = left / trace["leverage"]
         else:
             # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
-            load = left / trace["torque_constant"] * self.newton_per_ampere
+            load = left / (trace["torque_constant"] if per_ampere is None else per_ampere) * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
         told = trial.log.samples["dt"] <= ONE_CYCLE_S
         if self.turns_free:
@@ -354,7 +382,8 @@ class Bench:
         for trial, known in zip(self.trials, heat, strict=True):
             samples, parameters = trial.log.samples, self._parameters(trial, values)
             trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
-            parts.append(self.residual_of(trial, trace, channel))
+            per_ampere = self._per_ampere(trial, parameters, known)
+            parts.append(self.residual_of(trial, trace, channel, per_ampere))
         return np.concatenate(parts)
 
 

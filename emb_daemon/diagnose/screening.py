@@ -129,13 +129,13 @@ class Screening:
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         return float(max(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), share * self._size[channel]))
 
-    def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
+    def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray, samples: int = 1) -> float:
         """RMS that a channel's residual need not exceed: what the calibration achieved on its own data, by what it states
         (`unexplained.achieved`), or where these are its own data by what of the residual is noise or does not matter."""
         if self.bench.own_data:
             noise = sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1))
             return max(noise, self.floor(model, channel, made=True))
-        return achieved(self.bench.calibration, channel, force_N, rise_K)
+        return achieved(self.bench.calibration, channel, force_N, rise_K, samples)
 
     # -- tests --------------------------------------------------------------------------------------------------------
 

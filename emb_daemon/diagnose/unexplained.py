@@ -65,8 +65,9 @@ class Left:
     """What is left of one channel's residual.
 
     Attributes:
-        rms: of the residual after everything, on the judging logs, in the channel's unit.
-        achieved: what the calibration achieved on its own data, by its figures and its noise; NaN where it does not say.
+        rms: of what lasts of the residual after everything, on the judging logs, in the channel's unit.
+        achieved: the same of what the calibration achieved on its own data, by its figures and its noise; NaN where it does
+            not say.
         share: of the mean square there was before, that is left.
         dependences: on signals, strongest first.
     """
@@ -109,30 +110,44 @@ def sample_noise(residual: np.ndarray, places: int = 1) -> float:
     return float(np.sqrt(0.5)) * rmse((later - earlier)[(later != 0.0) & (earlier != 0.0)])
 
 
-def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray) -> float:
+def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray, samples: int = 1) -> float:
     """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
     nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.
 
     Args:
         force_N: clamp forces of the judging logs.
         rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
+        samples: over which the residual is averaged; of the paths' errors that leaves what their correlation times say.
     """
     figures = calibration.provenance.achieved if calibration.provenance else {}
     noise, motor = calibration.noise, calibration.motor
     # Without a reference the current is held against the stiffness path: its error comes on top.
     paths = {"stiffness": ("stiffness",), "torque": ("torque",), "innovation": ("stiffness", "torque")}.get(channel, ())
+    # What a unit's gear has of its own (`noise.torque_relative`) is fitted before anything is called unexplained.
     own = {
         "stiffness": np.hypot(noise.stiffness_N, noise.stiffness_relative * force_N),
         "torque": np.sqrt(
             (motor.torque_constant_Nm_per_A * noise.current_A / motor.gear_gain_m_per_rad) ** 2
             + 2.0 * (motor.inertia_kg_m2 * noise.speed_rad_per_s / CYCLE_S / motor.gear_gain_m_per_rad) ** 2
-            + (noise.torque_relative * force_N) ** 2
         ),
     }
+    times_s = {"stiffness": noise.stiffness_correlation_s, "torque": noise.current_correlation_s}
     total = 0.0
     for path in paths:
-        total += max(figures.get(f"{path}_N", 0.0), rmse(own[path])) ** 2
+        share = _lasting(times_s[path], samples)
+        stated = share * rmse(own[path])
+        if path == "torque":
+            stated = np.hypot(stated, noise.torque_lasting * rmse(force_N))
+        total += max(share * figures.get(f"{path}_N", 0.0), stated) ** 2
     if channel == "temperature":
         heated = _FRICTION_SHARE * rmse(rise_K) if np.isfinite(rise_K).any() else 0.0
         total = max(figures.get("temperature_K", 0.0), calibration.thermal.sigma_K) ** 2 + heated**2
     return float(np.sqrt(total)) if total else float("nan")
+
+
+def _lasting(time_s: float, samples: int) -> float:
+    """Share (RMS) of an error with a correlation time (first order) that its means over so many ``samples`` keep."""
+    if samples == 1:
+        return 1.0
+    own = time_s / (samples * CYCLE_S)
+    return float(np.sqrt(2.0 * own * (1.0 - own * (1.0 - np.exp(-1.0 / own)))))

@@ -65,7 +65,7 @@ CLAMPED_N = 150.0
 TERM = np.dtype(
     [
         *fields("i8", "port signal memory shape gate other"),
-        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit other_from other_high"),
+        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit growth other_from other_high"),
     ],
     align=True,
 )
@@ -189,7 +189,7 @@ def _value(q, t, k, dt, maximum_force):
         shaped = share * _shape(q, _remember(q, t, k, x, dt))
     shaped *= _gate(q, t.signal, maximum_force)
     added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
-    return min(max(added, -q.limit), q.limit)
+    return min(max(added, -q.limit), q.growth)
 
 
 @njit
