@@ -537,6 +537,31 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
 
 
 @pytest.mark.parametrize(
+    ("late_s", "mean_ms", "said"),
+    [
+        (0.0, None, "CurrentQ comes 7 ms before the load that it belongs to: is it a value of the moment? Then `mean_ms: 0`"),
+        (0.0, 0, ""),
+        (0.01, 0, "CurrentQ comes 10 ms after the load that it belongs to: a `mean_ms` longer by 20"),
+        (0.01, 20, ""),
+    ],
+)
+def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_s, mean_ms, said):
+    """A drive of 67 Hz against a torque sensor, whose current is no mean: half a period is a fifth of a load at 5 Hz."""
+    time_s = 0.015 * np.arange(1500)
+
+    def current(at_s):
+        return 20.0 * np.sin(2.0 * np.pi * 5.0 * at_s) + 10.0 * np.sin(2.0 * np.pi * 3.1 * at_s)
+
+    speed = 5.0 * np.sin(2.0 * np.pi * 0.4 * time_s)
+    columns = {"time_s": time_s, "angle_rad": -2.0 * np.cos(2.0 * np.pi * 0.4 * time_s), "speed_rad_per_s": speed}
+    columns |= {"current_A": current(time_s - late_s) + np.sign(speed), "force_N": 1000.0 * current(time_s)}
+    mapped = "" if mean_ms is None else f", mean_ms: {mean_ms}"
+    _read(tmp_path, columns | {"plate_C": 22.0 + 0.0 * time_s}, foreignkit.COLUMNS.replace("unit: A", f"unit: A{mapped}"))
+    told = capsys.readouterr().err
+    assert said in told and ("that it belongs to" in told) == bool(said)
+
+
+@pytest.mark.parametrize(
     ("factor", "said"),
     [
         (1.0, []),
