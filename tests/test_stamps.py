@@ -8,8 +8,9 @@ import pytest
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import contradictions, starts_anew
+from emb_daemon.logs.contradictions import contradictions, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time
@@ -291,6 +292,17 @@ def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsy
     told = capsys.readouterr().err
     assert said in told
     assert bool(said) == ("the current accelerates the motor" in told)
+
+
+def test_rare_samples_tell_no_inertia():
+    """Between two of them a motor is accelerated and braked again: some 8 times the inertia would come out."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.random(seconds=120.0)), 20.0, means=False)
+    samples = np.zeros(len(columns["time_s"]), SAMPLE)
+    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
+    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
+        samples[field] = columns[column]
+    motor = foreignkit.calibration().motor
+    assert not other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2)
 
 
 def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):

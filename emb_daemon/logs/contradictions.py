@@ -109,7 +109,8 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
     speed, current, angle = (samples[name].astype(float) for name in ("speed", "current_q", "angle"))
     acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
     known = samples["has_current"] & np.isfinite(current) & np.isfinite(angle) & np.isfinite(acceleration)
-    if not known.any():
+    # Between rare samples a motor is accelerated and braked again.
+    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
         return []
     moving = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
     if len(moving) < _LEAST or not np.ptp(angle[moving]):
