@@ -45,9 +45,10 @@ _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
-#: Longest delay of a current that is looked for, and step of the search, s; how many times less of the current the load and
-#: the motion must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose current is none 5.7.
-_LONGEST_CURRENT_S, _CURRENT_STEP_S, _CURRENT_BETTER = 0.03, 0.001, 1.5
+#: Least delay of a current that is said, half a cycle of ours, and longest that is looked for, ms; how many times less of the
+#: current the load and the motion must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose
+#: current is not 5.7.
+_LEAST_CURRENT_MS, _LONGEST_CURRENT_MS, _CURRENT_BETTER = 2, 30, 1.5
 #: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
@@ -227,25 +228,25 @@ def _find_late_current(speed: Series, current: Series, force: Series | None) -> 
     columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
     known = np.all(np.isfinite(columns), axis=1)
 
-    def left_A(lag_s: float) -> float:
-        values = current.sampled(times + round(1e9 * lag_s))
+    def left_A(lag_ms: int) -> float:
+        values = current.sampled(times + 1_000_000 * lag_ms)
         mine = known & np.isfinite(values)
         if np.sum(mine) < _LEAST:
             return np.inf
         return float(np.std(values[mine] - columns[mine] @ np.linalg.lstsq(columns[mine], values[mine])[0]))
 
-    lags = np.arange(-_LONGEST_CURRENT_S, _LONGEST_CURRENT_S + _CURRENT_STEP_S, _CURRENT_STEP_S)
-    left = np.array([left_A(lag) for lag in lags])
-    best = int(np.argmin(left))
+    left = {lag_ms: left_A(lag_ms) for lag_ms in range(-_LONGEST_CURRENT_MS, _LONGEST_CURRENT_MS + 1)}
+    late_ms = min(left, key=left.__getitem__)
     # At the end of the search it is no delay but a slow motion, in which all is alike.
-    if not 0 < best < len(lags) - 1 or not np.isfinite(left[best]) or left_A(0.0) < _CURRENT_BETTER * left[best]:
+    if not _LEAST_CURRENT_MS <= abs(late_ms) < _LONGEST_CURRENT_MS or not left[0] > _CURRENT_BETTER * left[late_ms]:
         return []
-    late_ms = 1e3 * float(lags[best])
-    what = "the acceleration" if force is None else "the load"
+    what, other = ("the acceleration", "are angle and speed") if force is None else ("the load", "is ClampForceRef")
     if late_ms > 0.0:
-        return [f"CurrentQ comes {late_ms:.0f} ms after {what} that it belongs to: a `mean_ms` longer by {2.0 * late_ms:.0f}?"]
-    line = f"CurrentQ comes {-late_ms:.0f} ms before {what} that it belongs to: is it a value of the moment? Then `mean_ms: 0`"
-    return [line + ("" if force is None else f"; or is ClampForceRef late? Then `mean_ms: {-2.0 * late_ms:.0f}` of that")]
+        return [f"CurrentQ comes {late_ms} ms after {what} that it belongs to: a `mean_ms` longer by {2 * late_ms}?"]
+    return [
+        f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: is it a value of the moment? Then `mean_ms: 0`; "
+        f"or {other} late? Then `mean_ms: {-2 * late_ms}` there"
+    ]
 
 
 def _find_too_fast(angle: Series) -> list[str]:
