@@ -13,7 +13,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import contradictions, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time
+from emb_daemon.logs.stamps import held_rows, in_time, strays
 from emb_daemon.offline import load_log
 
 
@@ -261,6 +261,15 @@ def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path,
     told = capsys.readouterr().err
     assert f"{np.sum(lost)} values of MotorAngle are far from both beside them: left out" in told and "start anew" not in told
     assert np.ptp(log.samples["angle"]) == pytest.approx(np.ptp(columns["angle_rad"]), abs=0.1)
+
+
+def test_a_rare_stroke_is_no_stray():
+    """Of a brake that stands nearly always the range of the angle is its resolver's noise, and a stroke is far beyond it."""
+    angle = np.random.default_rng(5).normal(0.0, 0.001, 5000)
+    angle[2000:2030] += np.interp(np.arange(30), [0, 4, 25, 29], [0.0, 20.0, 20.0, 0.0])
+    assert not np.any(strays(angle))
+    angle[1000] = 10.0
+    assert np.flatnonzero(strays(angle)).tolist() == [1000]
 
 
 def _phase(columns: dict) -> np.ndarray:
