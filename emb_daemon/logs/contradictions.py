@@ -91,7 +91,8 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     moves = not (speed is None or current is None or is_unresolved(angle or speed.integral(), is_free))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
-        lines += _find_late_current(speed, current, force)
+        # What relaxes in pads looks like a delay.
+        lines += _find_late_current(speed, current, force) if is_free or _is_of_either_sign(force) else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # Travel alone does not show directions; current and force do.
         return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
