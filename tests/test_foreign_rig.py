@@ -149,6 +149,7 @@ def _table(count: int, row: str = "{t:.3f},{a:.1f},25.0,1.5,22,0") -> str:
 
 
 _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
+_PAIRS = _HEADER.replace(",", ",,") + ",\n"
 
 
 @pytest.mark.parametrize(
@@ -158,6 +159,7 @@ _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
         ("Measured on Monday\n\n" + _HEADER + "\n" + "s,rad,rad/s,A,degC,N\n" + _table(100), ""),
         (_HEADER + ",\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,"), ""),
+        (_HEADER + ",\n" + _table(100), ""),
         ("\ufeff" + _HEADER.replace(",", "\t") + "\r\n" + _table(100).replace(",", "\t").replace("\n", "\r\n"), ""),
         (_HEADER + "\n" + _table(100) + "0.400,10.0,25", "1 rows with another number of cells than 6 left out"),
         (f"{_HEADER}\n{_table(100)}{_HEADER}\n", "1 cells are no numbers, left out, the first of them 'angle_rad'"),
@@ -165,11 +167,13 @@ _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
         ((_HEADER + "\n" + _table(100)).replace("\n", "\r"), ""),
         ((_HEADER + "\n" + _table(100)).replace(",", "|"), ""),
         (("# a tool's words\n# " + _HEADER + "\n" + _table(100, " {t:8.3f}, {a:.1f},25.0,1.5,22,0")).replace(",", "  "), ""),
+        (_PAIRS + 6 * "X,Y," + "\n" + _table(100, "7,{t:.3f},7,{a:.1f},7,25,7,1.5,7,22,7,0"), ""),
+        (_PAIRS + _table(100, "{t:.3f},0,{a:.1f},0,25.0,0,1.5,0,22,0,0,0"), ""),
         ("sep=;\n" + (_HEADER + "\n" + _table(100, "{t:g},{a:g},25,1.5,22,0")).replace(",", ";").replace(".", ","), ""),
     ],
     ids=[
-        "comments", "units", "comma at the ends", "comma at the rows' ends", "tabs", "cut off", "two headers", "words",
-        "old Mac", "bars", "blanks", "late decimal commas",
+        "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
+        "two headers", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside", "late decimal commas",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):

@@ -8,11 +8,12 @@ import pytest
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import contradictions, starts_anew
+from emb_daemon.logs.contradictions import contradictions, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time
+from emb_daemon.logs.stamps import held_rows, in_time, strays
 from emb_daemon.offline import load_log
 
 
@@ -262,6 +263,15 @@ def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path,
     assert np.ptp(log.samples["angle"]) == pytest.approx(np.ptp(columns["angle_rad"]), abs=0.1)
 
 
+def test_a_rare_stroke_is_no_stray():
+    """Of a brake that stands nearly always the range of the angle is its resolver's noise, and a stroke is far beyond it."""
+    angle = np.random.default_rng(5).normal(0.0, 0.001, 5000)
+    angle[2000:2030] += np.interp(np.arange(30), [0, 4, 25, 29], [0.0, 20.0, 20.0, 0.0])
+    assert not np.any(strays(angle))
+    angle[1000] = 10.0
+    assert np.flatnonzero(strays(angle)).tolist() == [1000]
+
+
 def _phase(columns: dict) -> np.ndarray:
     return columns["current_A"] * np.cos(4.0 * columns["angle_rad"])
 
@@ -291,6 +301,17 @@ def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsy
     told = capsys.readouterr().err
     assert said in told
     assert bool(said) == ("the current accelerates the motor" in told)
+
+
+def test_rare_samples_tell_no_inertia():
+    """Between two of them a motor is accelerated and braked again: some 8 times the inertia would come out."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.random(seconds=120.0)), 20.0, means=False)
+    samples = np.zeros(len(columns["time_s"]), SAMPLE)
+    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
+    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
+        samples[field] = columns[column]
+    motor = foreignkit.calibration().motor
+    assert not other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2)
 
 
 def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):
@@ -534,6 +555,33 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
     _read(tmp_path, columns, foreignkit.COLUMNS if load else free)
     told = capsys.readouterr().err
     assert said in told and ("scale: -1" in told) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("late_s", "mean_ms", "said"),
+    [
+        (0.0, None, "CurrentQ comes 7 ms before the load that it belongs to: is it a value of the moment? Then `mean_ms: 0`"),
+        (0.0, 0, ""),
+        (0.01, 0, "CurrentQ comes 10 ms after the load that it belongs to: a `mean_ms` longer by 20"),
+        (0.01, 20, ""),
+        (-0.001, 0, ""),
+        (0.05, 0, ""),
+    ],
+)
+def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_s, mean_ms, said):
+    """A drive of 67 Hz against a torque sensor, whose current is no mean: half a period is a fifth of a load at 5 Hz."""
+    time_s = 0.015 * np.arange(1500)
+
+    def current(at_s):
+        return 20.0 * np.sin(2.0 * np.pi * 5.0 * at_s) + 10.0 * np.sin(2.0 * np.pi * 3.1 * at_s)
+
+    speed = 5.0 * np.sin(2.0 * np.pi * 0.4 * time_s)
+    columns = {"time_s": time_s, "angle_rad": -2.0 * np.cos(2.0 * np.pi * 0.4 * time_s), "speed_rad_per_s": speed}
+    columns |= {"current_A": current(time_s - late_s) + np.sign(speed), "force_N": 1000.0 * current(time_s)}
+    mapped = "" if mean_ms is None else f", mean_ms: {mean_ms}"
+    _read(tmp_path, columns | {"plate_C": 22.0 + 0.0 * time_s}, foreignkit.COLUMNS.replace("unit: A", f"unit: A{mapped}"))
+    told = capsys.readouterr().err
+    assert said in told and ("that it belongs to" in told) == bool(said)
 
 
 @pytest.mark.parametrize(

@@ -381,8 +381,8 @@ def test_a_dbc_of_ones_own_is_read_in_its_units(tmp_path, unit, factor, offset, 
 
 @pytest.mark.parametrize(
     ("unit", "target", "value"),
-    [("Degrees", "rad", np.pi / 180.0), ("U/min", "rad/s", np.pi / 30.0), ("KPH", "m/s", 1.0 / 3.6), ("Amps", "A", 1.0),
-     ("Celsius", "degC", 1.0), ("mV", "V", 1e-3)],
+    [("Degrees", "rad", np.pi / 180.0), ("U/min", "rad/s", np.pi / 30.0), ("U", "rad", 2.0 * np.pi), ("KPH", "m/s", 1.0 / 3.6),
+     ("Amps", "A", 1.0), ("Celsius", "degC", 1.0), ("mV", "V", 1e-3)],
 )  # fmt: skip
 def test_a_unit_may_be_spelt_in_other_ways(unit, target, value):
     assert conversion(unit, target)[0] == pytest.approx(value)

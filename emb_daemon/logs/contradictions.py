@@ -45,6 +45,10 @@ _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
+#: Least delay of a current that is said, half a cycle of ours, and longest that is looked for, ms; how many times less of the
+#: current the load and the motion must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose
+#: current is not 5.7.
+_LEAST_CURRENT_MS, _LONGEST_CURRENT_MS, _CURRENT_BETTER = 2, 30, 1.5
 #: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
@@ -87,6 +91,8 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     moves = not (speed is None or current is None or is_unresolved(angle or speed.integral(), is_free))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
+        # What relaxes in pads looks like a delay.
+        lines += _find_late_current(speed, current, force) if is_free or _is_of_either_sign(force) else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # Travel alone does not show directions; current and force do.
         return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
@@ -105,7 +111,8 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
     speed, current, angle = (samples[name].astype(float) for name in ("speed", "current_q", "angle"))
     acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
     known = samples["has_current"] & np.isfinite(current) & np.isfinite(angle) & np.isfinite(acceleration)
-    if not known.any():
+    # Between rare samples a motor is accelerated and braked again.
+    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
         return []
     moving = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
     if len(moving) < _LEAST or not np.ptp(angle[moving]):
@@ -213,6 +220,34 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
             "two stamped by two clocks?"
         ]
     return []
+
+
+def _find_late_current(speed: Series, current: Series, force: Series | None) -> list[str]:
+    """A line on a current of another time than the load and the acceleration that it explains."""
+    times = current.time_ns[:_JUDGED]
+    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
+    columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
+    known = np.all(np.isfinite(columns), axis=1)
+
+    def left_A(lag_ms: int) -> float:
+        values = current.sampled(times + 1_000_000 * lag_ms)
+        mine = known & np.isfinite(values)
+        if np.sum(mine) < _LEAST:
+            return np.inf
+        return float(np.std(values[mine] - columns[mine] @ np.linalg.lstsq(columns[mine], values[mine])[0]))
+
+    left = {lag_ms: left_A(lag_ms) for lag_ms in range(-_LONGEST_CURRENT_MS, _LONGEST_CURRENT_MS + 1)}
+    late_ms = min(left, key=left.__getitem__)
+    # At the end of the search it is no delay but a slow motion, in which all is alike.
+    if not _LEAST_CURRENT_MS <= abs(late_ms) < _LONGEST_CURRENT_MS or not left[0] > _CURRENT_BETTER * left[late_ms]:
+        return []
+    what, other = ("the acceleration", "are angle and speed") if force is None else ("the load", "is ClampForceRef")
+    if late_ms > 0.0:
+        return [f"CurrentQ comes {late_ms} ms after {what} that it belongs to: a `mean_ms` longer by {2 * late_ms}?"]
+    return [
+        f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: is it a value of the moment? Then `mean_ms: 0`; "
+        f"or {other} late? Then `mean_ms: {-2 * late_ms}` there"
+    ]
 
 
 def _find_too_fast(angle: Series) -> list[str]:

@@ -26,8 +26,9 @@ _BUNCHES = 20
 #: Least number of changes of a value that is held, and least share of them at whole multiples of the time for which it is
 #: held.
 _LEAST_CHANGES, _IN_STEP = 50, 0.98
-#: Share of the others' range that a stray is away; largest share of strays, and least number of values to tell them in.
-_FAR, _FEW, _FEWEST = 0.5, 0.02, 100
+#: Share of the others' range that a stray is away, and of ordinary steps (normal noise's are 2.3 standard deviations); largest
+#: share of strays, and least number of values to tell them in.
+_FAR, _STEPS, _FEW, _FEWEST = 0.5, 5.0, 0.02, 100
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
 
@@ -103,11 +104,13 @@ def _spread(times: np.ndarray, pauses: np.ndarray, samples: int) -> np.ndarray:
 
 
 def strays(values: np.ndarray) -> np.ndarray:
-    """Which values of a column, shape (n,), are away from both beside them by over half of what the others range over, while
-    these are near each other: bits lost on the way, or a number that stands for none. None if they are not few."""
+    """Which values of a column, shape (n,), are away from both beside them by over half of what the others range over and by
+    more than noise, while these are near each other: bits lost on the way, or a number that stands for none. None if they are
+    not few."""
     stray = np.zeros(len(values), bool)
     if len(values) > _FEWEST:
-        far = _FAR * np.ptp(np.quantile(values, (0.01, 0.99)))
+        step = np.quantile(np.abs(np.diff(values)), 0.9)
+        far = max(_FAR * np.ptp(np.quantile(values, (0.01, 0.99))), _STEPS * step)
         before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
         stray[1:-1] = (np.minimum(np.abs(before), np.abs(after)) > far) & (np.abs(before - after) < 0.5 * far) & (far > 0.0)
     return stray if np.sum(stray) <= _FEW * len(values) else np.zeros_like(stray)

@@ -366,6 +366,12 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         cells.pop()
     elif len(first) > len(cells):
         cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units])
+    if _are_pairs(cells, rows[units:]):
+        print(
+            f"{path}: a name stands over two columns, a time and its value: the value is taken; `column 1` is a time",
+            file=sys.stderr,
+        )
+        cells = ["", *cells[:-1]]
     odd = []
 
     def leave_out(row) -> str:
@@ -396,6 +402,12 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
     return table
+
+
+def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
+    """Whether each name stands over two columns, of which the first are the same time in each row."""
+    alternate = len(names) > 2 and all(names[::2]) and not any(names[1::2])
+    return alternate and any(rows) and all(len({*row[: len(names) : 2]} - {""}) == 1 for row in rows if row)
 
 
 def _unterminated(content: bytes) -> bytes:

@@ -33,10 +33,10 @@ UNITS = {
 _SPELLINGS = {
     "degree": "deg", "degrees": "deg", "degree/s": "deg/s", "degrees/s": "deg/s", "deg/sec": "deg/s", "dps": "deg/s",
     "radian": "rad", "radians": "rad", "rad/sec": "rad/s", "rad.s-1": "rad/s", "u/min": "rpm", "upm": "rpm", "min-1": "rpm",
-    "revolutions": "rev", "turns": "rev", "amp": "A", "amps": "A", "ampere": "A", "volt": "V", "volts": "V",
-    "celsius": "degC", "deg c": "degC", "degc": "degC", "ºc": "degC", "° c": "degC", "kelvin": "K", "deg f": "degF",
-    "km/hr": "km/h", "kmh": "km/h", "kmph": "km/h", "km/h": "km/h", "kph": "km/h", "newton": "N", "newtons": "N", "n*m": "Nm",
-    "newton meter": "Nm", "percent": "%",
+    "revolutions": "rev", "turns": "rev", "u": "rev", "rev/min": "rpm", "amp": "A", "amps": "A", "ampere": "A",
+    "volt": "V", "volts": "V", "celsius": "degC", "deg c": "degC", "degc": "degC", "ºc": "degC", "° c": "degC", "kelvin": "K",
+    "deg f": "degF", "km/hr": "km/h", "kmh": "km/h", "kmph": "km/h", "km/h": "km/h", "kph": "km/h", "newton": "N",
+    "newtons": "N", "n*m": "Nm", "newton meter": "Nm", "percent": "%",
 }  # fmt: skip
 #: For an axis whose travel is measured instead of its motor's angle.
 TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", "m/min", "in/s")
