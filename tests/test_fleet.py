@@ -70,7 +70,7 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
-def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs):
+def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
     log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
@@ -79,12 +79,15 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs):
     [known] = _ingested(tmp_path / "fleet", source)
     assert not known["fault"] and "cut off" in known["notes"]
     assert jobs(tmp_path / "fleet", [log]) == []
+    [half] = dataset.drives(tmp_path / "fleet")
+    replay_drive(tmp_path / "fleet", half, calibration)
+    assert len([name for name in _content(tmp_path / "fleet") if half.digest in name]) == 3
     log.write_bytes(text)
     assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--workers", "1"]) == 0
     [drive] = dataset.drives(tmp_path / "fleet")
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
-    assert len(list((tmp_path / "fleet/drives").rglob("*.parquet"))) == 1
+    assert not [name for name in _content(tmp_path / "fleet") if half.digest in name], "the report would count both"
 
 
 def test_copies_of_a_log_are_one_drive_of_each_unit(tmp_path, logs):
@@ -342,6 +345,9 @@ def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monke
     scores.score_unit(root, drives[:2], calibration)
     scores.score_unit(root, drives, calibration)
     assert asked == drives[2:] and path.read_bytes() == before
+    gone = replace(drives[0], digest="f" * 16)
+    assert list(scores.score_unit(root, [*drives, gone], calibration)) == [gone.digest]
+    assert not scores.score_unit(root, drives, calibration), "why a drive that is gone said nothing"
 
 
 def test_a_drive_that_says_nothing_says_why(fleet, calibration):

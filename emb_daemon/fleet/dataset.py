@@ -178,6 +178,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def forget(root: Path, drives: Iterable[Drive]) -> None:
-    """Remove the samples of drives that no result names any more."""
+    """Remove samples, estimates and figures of drives that no result names any more."""
     for drive in drives:
-        Path(root, "drives", drive.partition, f"{drive.digest}.parquet").unlink(missing_ok=True)
+        for kind, ending in (("drives", "parquet"), ("estimates", "parquet"), ("figures", "json")):
+            Path(root, kind, drive.partition, f"{drive.digest}.{ending}").unlink(missing_ok=True)
