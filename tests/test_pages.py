@@ -223,13 +223,14 @@ def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
     assert ask(daemon, page({CLEARANCE: 7.0})).refused == "could not be checked" and in_use(daemon) == of({})
 
 
-def test_a_page_that_was_checked_too_late_is_not_taken(daemon):
+@pytest.mark.parametrize(("asked_s", "taken"), [(1, True), (4, False)])
+def test_a_page_that_was_checked_too_late_is_not_taken(daemon, asked_s, taken):
     """Whoever asked for it no longer waits."""
     request = Request(page({CLEARANCE: 7.0}))
-    request.asked_ns -= 4 * 10**9
+    request.asked_ns -= asked_s * 10**9
     daemon.ask_page(request)
     follow(daemon, lambda: daemon._asked is None and daemon._page is None)
-    assert request.wait().later and in_use(daemon) == of({})
+    assert request.wait().later != taken and in_use(daemon) == of({CLEARANCE: 7.0} if taken else {})
 
 
 def test_a_reload_that_waits_comes_first(daemon, folder):
