@@ -122,7 +122,11 @@ SCOPE = {
     "emb_daemon/estimator/monitor.py": ["tests/test_monitor_bounds.py"],
     "emb_daemon/estimator/hypotheses.py": ["tests/test_hypotheses.py", "-k", _HYPOTHESES],
     "emb_daemon/estimator/status.py": ["tests/test_status.py"],
-    "emb_daemon/estimator/step.py": ["tests/test_status.py", "tests/test_step.py"],
+    "emb_daemon/estimator/step.py": [
+        "tests/test_status.py",
+        "tests/test_step.py",
+        "tests/test_lateness.py::test_what_the_calibration_knows_or_holds_for_exact_is_not_undone",
+    ],
     "emb_daemon/adapt/training.py": _TRAINING,
     "emb_daemon/adapt/adaptation.py": _TRAINING,
     "emb_daemon/diagnose/episodes.py": _EVIDENCE,

@@ -26,7 +26,7 @@ from emb_daemon.logs.write import write_frames
 from emb_daemon.plant.scenarios import city_drive
 from emb_daemon.runtime import bus, daemon
 
-_LIBM = {"cos", "exp", "hypot", "log", "pow", "sin", "sincos"}
+_LIBM = {"exp", "log", "pow", "sin", "sincos"}
 _LIBC = {"memcpy", "memmove", "memset"}
 
 

@@ -5,6 +5,7 @@ import errno
 import logging
 import os
 import socket
+import struct
 import time
 from pathlib import Path
 
@@ -195,6 +196,24 @@ def test_step_of_the_real_time_clock(monkeypatch):
         assert np.array_equal(heard["data"], np.arange(3))
         assert np.all(np.diff(heard["time_ns"]) >= 0) and heard["time_ns"][0] >= last - 1_000_000_000
         assert heard["time_ns"][-1] <= time.monotonic_ns()
+    near.close()
+    far.close()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_the_kernel_says_beside_a_frame_is_read(order):
+    """Its stamp and how many frames it dropped, as control messages in either order."""
+    near, far = socket_pair()
+    time.sleep(0.005)
+    arrived_ns, stamp_ns = time.monotonic_ns(), time.time_ns()
+    time.sleep(0.005)
+    stamp = struct.pack("=QiiQQ", 32, socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, *divmod(stamp_ns, 1_000_000_000))
+    drops = struct.pack("=QiiI4x", 20, socket.SOL_SOCKET, rawcan._SO_RXQ_OVFL, 0x01020304)
+    content = b"".join((stamp, drops)[::order])
+    near._received.control[0, : len(content)] = np.frombuffer(content, np.uint8)
+    near._received.headers["length"][0], near._received.headers["control_length"][0] = 16, len(content)
+    assert near._take(1, time.monotonic_ns()) == (1, 0x01020304)
+    assert abs(near._frames["time_ns"][0] - arrived_ns) < _CLOCKS_NS
     near.close()
     far.close()
 

@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
-def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs):
+def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
     log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
@@ -78,12 +79,40 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs):
     [known] = _ingested(tmp_path / "fleet", source)
     assert not known["fault"] and "cut off" in known["notes"]
     assert jobs(tmp_path / "fleet", [log]) == []
+    [half] = dataset.drives(tmp_path / "fleet")
+    replay_drive(tmp_path / "fleet", half, calibration)
+    assert len([name for name in _content(tmp_path / "fleet") if half.digest in name]) == 3
     log.write_bytes(text)
-    _ingested(tmp_path / "fleet", source)
+    assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--workers", "1"]) == 0
     [drive] = dataset.drives(tmp_path / "fleet")
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
-    assert len(list((tmp_path / "fleet/drives").rglob("*.parquet"))) == 1
+    assert not [name for name in _content(tmp_path / "fleet") if half.digest in name], "the report would count both"
+
+
+def test_copies_of_a_log_are_one_drive_of_each_unit(tmp_path, logs):
+    text = (logs / "car0/drive.0.log.gz").read_bytes()
+    for name in ("car0/day.log.gz", "car0/newest.log.gz", "car1/day.log.gz"):
+        path = tmp_path / "logs" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(text)
+    assert len(_ingested(tmp_path / "fleet", tmp_path / "logs")) == 3
+    assert jobs(tmp_path / "fleet", log_files([tmp_path / "logs"])) == []
+    assert [drive.unit for drive in dataset.drives(tmp_path / "fleet")] == ["car0", "car1"]
+
+
+def test_a_log_that_was_rotated_is_kept(tmp_path, logs):
+    """Its path has another content now, and its content another path."""
+    source, command = tmp_path / "car", ["fleet", "ingest", str(tmp_path / "car"), "--output", str(tmp_path / "fleet")]
+    source.mkdir()
+    shutil.copy(logs / "car0/drive.0.log.gz", source / "day.log.gz")
+    assert main([*command, "--workers", "1"]) == 0
+    (source / "day.log.gz").rename(source / "day.1.log.gz")
+    shutil.copy(logs / "car0/drive.1.log.gz", source / "day.log.gz")
+    assert main([*command, "--workers", "1"]) == 0
+    drives = dataset.drives(tmp_path / "fleet")
+    assert [drive.day for drive in drives] == ["2026-10-01", "2026-10-03"]
+    assert all(len(dataset.read_drive(tmp_path / "fleet", drive)[0].samples) == 750 for drive in drives)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x1f\x8b\x08\x00rubbish", b"no candump\n", b"(1.0) can0 7FF#00\n"])
@@ -316,6 +345,9 @@ def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monke
     scores.score_unit(root, drives[:2], calibration)
     scores.score_unit(root, drives, calibration)
     assert asked == drives[2:] and path.read_bytes() == before
+    gone = replace(drives[0], digest="f" * 16)
+    assert list(scores.score_unit(root, [*drives, gone], calibration)) == [gone.digest]
+    assert not scores.score_unit(root, drives, calibration), "why a drive that is gone said nothing"
 
 
 def test_a_drive_that_says_nothing_says_why(fleet, calibration):

@@ -485,6 +485,16 @@ def test_two_that_are_alike_wait_for_more_strokes(p, opened):
     assert settle(s, p, True, 0.004)
 
 
+def test_a_jump_that_is_expected_needs_as_much_evidence_as_another(p, opened):
+    """Odds of e^5 against the first hypothesis, from those of a jump that nobody expects."""
+    s = opened[0]
+    s["alternatives"]["prior"][STIFFNESS_JUMP] = -1.0
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP] = -1.0 + 10.9
+    assert not settle(s, p, True, 0.004)
+    s["alternatives"]["log_odds"][STIFFNESS_JUMP] = -1.0 + 11.1
+    assert settle(s, p, True, 0.004)
+
+
 def _stop(s, p, jumps):
     """One stop and the release after it, with a change of contact proven there or not."""
     s["contact"]["engaged"] = True

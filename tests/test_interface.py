@@ -103,7 +103,7 @@ def test_in_c_every_byte_is_replays(exported, compiled, drive):
 
 
 def test_on_aarch64_the_numbers_are_the_same(exported, compiled, drive):
-    """Run in qemu with Debian's libm for aarch64, which rounds some results of `hypot` the other way."""
+    """Run in qemu with Debian's libm for aarch64, which may round the other way."""
     if not shutil.which("qemu-aarch64") or not shutil.which("aarch64-linux-gnu-gcc"):
         pytest.skip("NOT RUN: qemu-user and gcc-aarch64-linux-gnu are not installed")
     (exported / "rows64.c").write_text(_ROWS)

@@ -223,13 +223,14 @@ def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
     assert ask(daemon, page({CLEARANCE: 7.0})).refused == "could not be checked" and in_use(daemon) == of({})
 
 
-def test_a_page_that_was_checked_too_late_is_not_taken(daemon):
+@pytest.mark.parametrize(("asked_s", "taken"), [(1, True), (4, False)])
+def test_a_page_that_was_checked_too_late_is_not_taken(daemon, asked_s, taken):
     """Whoever asked for it no longer waits."""
     request = Request(page({CLEARANCE: 7.0}))
-    request.asked_ns -= 4 * 10**9
+    request.asked_ns -= asked_s * 10**9
     daemon.ask_page(request)
     follow(daemon, lambda: daemon._asked is None and daemon._page is None)
-    assert request.wait().later and in_use(daemon) == of({})
+    assert request.wait().later != taken and in_use(daemon) == of({CLEARANCE: 7.0} if taken else {})
 
 
 def test_a_reload_that_waits_comes_first(daemon, folder):
@@ -379,6 +380,16 @@ class _Bench:
 
     def used(self):
         return self.do("BBB", 0xEA, 1, 0)[3]
+
+
+@pytest.mark.parametrize("transport, command, said", [
+    (ON_UDP, "ff 00", "05 80 fc 78 05 01 01"), (ON_CAN, "ff 00", "05 80 08 08 00 01 01"), (ON_UDP, "fd", "00 00 00 00 00"),
+    (ON_UDP, "fb", "00 00 00 00 00 00 00"), (ON_UDP, "da", "93 10 00 04 00 00 00"), (ON_UDP, "d9", "01 ff 01 00 34 01 00"),
+    (ON_CAN, "d9", "01 07 01 00 52 01 00"), (ON_UDP, "d7 00 00 00", "84 10 02 04 06 00"), (ON_UDP, "e9", "01 00"),
+    (ON_UDP, "e8 01 00 00 00", "02 00 00 00 00"), (ON_UDP, "e7 00 00 00", "3f 00"), (ON_UDP, "e7 00 00 01", "0f 00"),
+])  # fmt: skip
+def test_a_tool_is_told_byte_by_byte_what_the_standard_puts_there(transport, command, said):
+    assert _Bench(transport).slave.answer(bytes.fromhex(command)).hex(" ") == f"ff {said}"
 
 
 def test_the_working_page_is_asked_for_when_it_is_set_and_the_files_show_what_they_say():

@@ -21,6 +21,8 @@ from emb_daemon.adapt import files
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory, hold
 from emb_daemon.adapt.snapshots import Snapshots, from_fields, to_fields
+from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import Unavailable
 
 INNER = np.dtype([("phase", "f8"), ("seen", "?")])
@@ -185,6 +187,16 @@ def test_a_restart_goes_on_with_the_first_sample(driven, tmp_path):
     loop.run(parked(0.5))
     state = loop.pipeline.states[0]
     assert state["resumed"] and state["clearance"] == pytest.approx(contact_angle, abs=0.05)
+
+
+def test_a_calibration_that_is_replaced_before_the_first_sample_takes_no_snapshot_of_the_old_one(driven, tmp_path):
+    loop, _, stopped_ns = driven
+    restarted(loop, tmp_path, lambda time_ns: stopped_ns + 10**18 + 60 * 10**9)
+    other = moved(loop.calibration, {"contact.clearance_rad": 7.0})
+    loop.adaptation.replace("FL", other, loop.adaptation.read("FL", other))
+    loop.pipeline.begin_anew(0, to_parameters(other))
+    loop.run(parked(0.5))
+    assert loop.pipeline.states[0]["started"] and not loop.pipeline.states[0]["resumed"]
 
 
 @pytest.mark.parametrize(

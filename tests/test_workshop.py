@@ -119,6 +119,16 @@ def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
             assert bool(s & CONFIRMED) == (entry.frame is not None) == (entry.occurrences > 0)
 
 
+@pytest.mark.parametrize(
+    ("value", "unsigned", "signed"),
+    [(None, "ffff", "8000"), (1e9, "fffe", "7fff"), (-1e9, "0000", "8001"), (3.0, "0003", "001e")],
+)
+def test_no_value_is_taken_for_one_that_is_not_to_be_used(value, unsigned, signed):
+    factor = value and 1e-4 * value
+    frame = Frame(1, DEGRADED, 2, value, value, (value,) * 4, value, factor).encode()
+    assert frame.hex() == f"00000001{DEGRADED:02x}02" + 2 * unsigned + 5 * signed + unsigned
+
+
 def test_every_reason_of_every_corner_has_a_code_of_its_own():
     codes = {code_of(corner, reason) for corner in range(len(CORNERS)) for reason in range(len(REASONS))}
     assert len(codes) == trouble.CODES

@@ -81,7 +81,10 @@ def _ingest(arguments: argparse.Namespace) -> int:
     root = dataset.folder_of(arguments.output.absolute())
     paths = ingest.log_files(arguments.logs)
     jobs = ingest.jobs(root, paths, arguments.unit or ingest.UNIT_OF_PATH, arguments.mapping and arguments.mapping.absolute())
+    before = dataset.named(root)
     done = _work(arguments, "reading logs", partial(ingest.ingest, root), jobs, partial(ingest.give_up, root))
+    # Not before all are read: another file may now have the content, as when logs are rotated.
+    dataset.forget(root, before - dataset.named(root))
     damaged = [known for known in done if known["fault"]]
     drives = sum(len(known["drives"]) for known in done)
     print(f"{len(done)} of {len(paths)} logs are new: {drives} drives, {len(damaged)} damaged")

@@ -3,15 +3,18 @@
 ::
 
     drives/unit=…/corner=…/day=…/DIGEST.parquet     samples of one log, DIGEST the beginning of the log's SHA-256
-    ingested/DIGEST.json                            result for each log file, damaged ones included
+    ingested/PATH.json                              result for each log file, damaged ones included; PATH likewise of its path
     estimates/…, figures/…                          `fleet replay`, partitioned alike
     evidence/…, learned/…                           `fleet diagnose`, `fleet learn`: one file for each unit and corner
 
-Files are complete at every moment and are never changed; writing a file again gives the same bytes.
+Files are complete at every moment and are never changed; writing a file again gives the same bytes. Copies of one log are one
+drive of each unit that has them.
 """
 
 import datetime
+import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -136,10 +139,14 @@ def drives(root: Path) -> list[Drive]:
     Raises:
         InputError: nothing was ingested.
     """
-    found = [Drive(**entry) for known in read_results(root) for entry in known["drives"]]
-    if not found:
+    if not (found := named(root)):
         raise InputError(f"{root}: holds no drives, expected a data set of emb-daemon fleet ingest")
     return sorted(found)
+
+
+def named(root: Path) -> set[Drive]:
+    """The drives that results name."""
+    return {Drive(**entry) for known in read_results(root) for entry in known["drives"]}
 
 
 def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
@@ -153,12 +160,15 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
 def read_results(root: Path) -> list[dict[str, Any]]:
     """Result for each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged file: of its path), ``notes``,
     ``fault`` (empty if the file is good) and its ``drives``."""
-    return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
+    # Data sets of earlier versions name a result after the content, with more digits; a later one of the same path counts.
+    paths = sorted(Path(root, "ingested").glob("*.json"), key=lambda path: (-len(path.name), path.name))
+    return list({known["source"]: known for known in (json.loads(path.read_bytes()) for path in paths)}.values())
 
 
 def note(root: Path, known: dict[str, Any]) -> None:
     """Store the result for a log file."""
-    write_json(Path(root, "ingested", f"{known['sha256']}.json"), known)
+    name = hashlib.sha256(known["source"].encode()).hexdigest()[:DIGEST]
+    write_json(Path(root, "ingested", f"{name}.json"), known)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -167,9 +177,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(content, sort_keys=True, indent=1).encode())
 
 
-def forget(root: Path, known: dict[str, Any]) -> None:
-    """Remove the data of an earlier state of a log file."""
-    for entry in known["drives"]:
-        drive = Drive(**entry)
-        Path(root, "drives", drive.partition, f"{drive.digest}.parquet").unlink(missing_ok=True)
-    Path(root, "ingested", f"{known['sha256']}.json").unlink(missing_ok=True)
+def forget(root: Path, drives: Iterable[Drive]) -> None:
+    """Remove samples, estimates and figures of drives that no result names any more."""
+    for drive in drives:
+        for kind, ending in (("drives", "parquet"), ("estimates", "parquet"), ("figures", "json")):
+            Path(root, kind, drive.partition, f"{drive.digest}.{ending}").unlink(missing_ok=True)

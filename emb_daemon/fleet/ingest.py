@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.fleet.dataset import DIGEST, About, Drive, day_of, forget, note, read_results, write_drive
+from emb_daemon.fleet.dataset import DIGEST, About, Drive, day_of, note, read_results, write_drive
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import LOG_ENDINGS, log_ending, read_with_digest
 from emb_daemon.offline import corner_index
@@ -28,14 +28,12 @@ UNIT_OF_PATH = r"(?P<unit>[^/]+)/[^/]+$"
 
 @dataclass(frozen=True)
 class Job:
-    """A log file to ingest. ``mapping``: file that maps another rig's signals to ours, or None; ``earlier``: the result
-    for the same path with other content."""
+    """A log file to ingest. ``mapping``: file that maps another rig's signals to ours, or None."""
 
     path: Path
     unit: str
     day: str
     mapping: Path | None = None
-    earlier: dict[str, Any] | None = None
 
 
 def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping: Path | None = None) -> list[Job]:
@@ -63,7 +61,7 @@ def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping
         earlier = known.get(str(path))
         if earlier and (earlier["size"], earlier["mtime_ns"]) == _stamp(path):
             continue
-        result.append(Job(path, found["unit"], found.groupdict().get("day") or "", mapping, earlier))
+        result.append(Job(path, found["unit"], found.groupdict().get("day") or "", mapping))
     return result
 
 
@@ -118,8 +116,6 @@ def ingest(root: Path, job: Job) -> dict[str, Any]:
         known |= {"sha256": digest, "notes": notes, "drives": [asdict(drive) for drive in found]}
     except (InputError, MemoryError) as error:
         known["fault"] = str(error) or "more than this machine's memory"
-    if job.earlier and job.earlier["sha256"] != known["sha256"]:
-        forget(root, job.earlier)
     note(root, known)
     return known
 

@@ -156,6 +156,7 @@ def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
     scorer, path = Scorer(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
     scores = {score.drive: score for score in known if score.drive in drives}
+    silent = {drive.digest: silent[drive.digest] for drive in drives if drive.digest in silent}
     for drive in drives:
         if drive in scores or drive.digest in silent:
             continue
