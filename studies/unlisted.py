@@ -341,6 +341,32 @@ def current_filtered(rng, moments, size):
 
 
 @_family
+def current_delayed(rng, moments, size):
+    """By another frame or a gateway than when it was calibrated."""
+    delay = float(rng.uniform(0.001, 0.012))
+    return Fault(f"{1e3 * delay:.1f} ms", brake=effect("current_delay", delay_s=delay))
+
+
+@_family
+def resolver_delayed(rng, moments, size):
+    """Angle and speed come with the next frame, or the one after it."""
+    cycles, at = int(rng.integers(1, 3)), pick_sometime(rng, moments)
+
+    def delayed():
+        kept = []
+
+        def change(values, _):
+            shown = [*(kept or [values[0]] * cycles if len(values) else []), *values]
+            kept[:] = shown[-cycles:]
+            return np.array(shown[: len(values)])
+
+        return change
+
+    late = chain(*(alter(wire.RESOLVER, column, delayed()) for column in (wire.MOTOR_ANGLE, wire.MOTOR_SPEED)))
+    return Fault(f"{cycles} cycles", at, bus=during(late, at))
+
+
+@_family
 def angle_filtered(rng, moments, size):
     seconds, at = draw_size(rng, 0.003, 0.03), pick_sometime(rng, moments)
     change = alter(wire.RESOLVER, wire.MOTOR_ANGLE, _low_pass(seconds))

@@ -36,6 +36,7 @@ from emb_daemon.estimator.status import (
     CONTACT_LOST,
     CONTACT_SOUGHT,
     CONTACT_UNKNOWN,
+    CURRENT_APART,
     CURRENT_IMPLAUSIBLE,
     DISC_UNEVEN,
     FORCE_SENSOR_WRONG,
@@ -57,6 +58,7 @@ from emb_daemon.estimator.unknown import (
     torque_offset,
 )
 from emb_daemon.jit import Record, hypot, njit, sq
+from emb_daemon.models.alignment import at_bound, compare, forget_alignment, interrupt
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -114,7 +116,8 @@ _LASTS_S = 10.0
 _STROKE_S = 0.25
 #: Share of what the angle gains over the speed that may be wrong: it may be the speed that is.
 _UNSURE = 0.5
-#: Share of the clearance that the motor must have gone back through before a jump is proven.
+#: Share of the clearance by which pads are certainly apart: the motor must have gone back so far before a jump is proven, and
+#: only there do inertia and friction alone need a torque, whose moment is known whatever the contact angle is.
 _BACK = 0.3
 #: Counts of the resolver that the second difference of its angle must exceed.
 _CLEAR = 4.0
@@ -237,6 +240,13 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     slope = s.gear_slope
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
+    if known or s.unknown or s.plausibility.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN):
+        forget_alignment(s.alignment)
+    elif m.dt <= ONE_CYCLE_S and s.past_contact < -_BACK * s.clearance:
+        wanted = s.motor_torque - torque + leverage * mean_force + s.error[OFFSET]
+        compare(s.alignment, s.motor_torque, wanted, sqrt(moving))
+    else:
+        interrupt(s.alignment)
     fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
     periodic = leverage * uneven.applied(s.uneven)
     unexplained = torque - leverage * mean_force - periodic
@@ -284,7 +294,7 @@ def fuse(
     out.innovation = out.innovation_sigma = np.nan
     out.torque_sigma = turning_sigma = standing_sigma = np.inf
     if np.isfinite(torque):
-        trusted = s.plausibility.verdict == AGREE and not s.unknown
+        trusted = s.plausibility.verdict == AGREE and not s.unknown and s.alignment.late == 0.0
         if trusted != s.trusted:
             # What the alternatives learned around a sensor's fault is not due to the brake.
             open_all(s, p)
@@ -408,6 +418,8 @@ def _facts_of_torque(s, p):
         facts |= DISC_UNEVEN
     if s.late > _TOLD_CYCLES * CYCLE_S:
         facts |= ANGLE_LATE
+    if s.alignment.late != 0.0 or at_bound(s.alignment):
+        facts |= CURRENT_APART
     if s.sensor.wrong:
         facts |= FORCE_SENSOR_WRONG
     return facts

@@ -10,6 +10,7 @@ from emb_daemon.estimator.monitor import MONITOR
 from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
+from emb_daemon.models.alignment import ALIGNMENT
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import CREEPS, STATES
 from emb_daemon.models.gear import GEAR
@@ -121,6 +122,7 @@ STATE = np.dtype(
         # Age of the angle beside the speed, and beyond what the calibration knows, s.
         ("lateness", LATENESS),
         ("late", "f8"),
+        ("alignment", ALIGNMENT),
         ("wander", WANDER),
         # Fusion.
         ("error", "f8", (STATES,)),

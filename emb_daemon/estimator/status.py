@@ -43,6 +43,7 @@ TABLE = {
     "offset_large": Fact("the offset of the motor torque exceeds a healthy current sensor's", PATHS_DISAGREE, FUSED),
     "disc_uneven": Fact("the disc may vary in thickness beyond the calibration", PATHS_DISAGREE, FUSED),
     "angle_late": Fact("the motor angle is over two cycles older than the speed of its sample", PATHS_DISAGREE, FUSED),
+    "current_apart": Fact("current and motor angle are apart in time by more than is taken out", PATHS_DISAGREE, FUSED),
     "force_sensor_wrong": Fact("the force sensor contradicts angle and current, or is stuck", PATHS_DISAGREE, FUSED),
     "resolver_implausible": Fact("the resolver is frozen, or contradicts itself", PATHS_DISAGREE | STUCK, TORQUE_ONLY),
     "contact_unknown": Fact("the brake has not been seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
@@ -63,9 +64,9 @@ TABLE = {
 #: Bit of each fact.
 (
     ZERO_MOVED, ZERO_WANDERS, CURRENT_IMPLAUSIBLE, PATHS_CONTRADICT, TORQUE_OLD, JUMP_SUSPECTED, MODEL_ERROR, OFFSET_LARGE,
-    DISC_UNEVEN, ANGLE_LATE, FORCE_SENSOR_WRONG, RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST, CONTACT_SOUGHT,
-    FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK, WHEEL_CONTRADICTED, BOUNDS_CONTRADICT,
-    BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
+    DISC_UNEVEN, ANGLE_LATE, CURRENT_APART, FORCE_SENSOR_WRONG, RESOLVER_IMPLAUSIBLE, CONTACT_UNKNOWN, CONTACT_LOST,
+    CONTACT_SOUGHT, FORCE_UNCERTAIN, TEMPERATURE_UNKNOWN, TEMPERATURE_VAGUE, THERMOCOUPLE_STUCK, WHEEL_CONTRADICTED,
+    BOUNDS_CONTRADICT, BOUND_REACHED, BEYOND_RANGE, NO_SOURCE, NOT_A_NUMBER,
 ) = (1 << bit for bit in range(len(TABLE)))  # fmt: skip
 
 _REASONS = np.array([fact.reasons for fact in TABLE.values()])

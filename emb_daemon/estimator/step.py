@@ -44,18 +44,21 @@ from emb_daemon.estimator.unknown import (
     set_priors,
     softening_sigma,
 )
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit
+from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import follow, interrupt
 from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
-from emb_daemon.models.stiffness import characteristic_curve
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.models.wander import STANDING_RAD_PER_S, leave_stretch, watch_wander
-from emb_daemon.wire.contract import INIT, INVALID, PREDICTED, RUNNING
+from emb_daemon.wire.contract import CYCLE_S, FUSED, INIT, INVALID, PREDICTED, RUNNING, STIFFNESS_ONLY
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
+#: Share of what the pads gain between the moment of the estimate and the sample that may be wrong: the motor accelerates.
+_LED = 0.2
 #: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
@@ -105,6 +108,34 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
         m: SAMPLE record; ``m.dt`` seconds since the last one, 0 at the first.
         out: ESTIMATE record to fill; the caller owns time, corner, counter and cycle.
     """
+    angle, speed, current = m.angle, m.speed, m.current_q
+    align(s.alignment, m)
+    _advance(s, p, m, out)
+    if s.alignment.delay != 0.0:
+        _lead(s, p, m, angle, speed, out)
+    m.angle, m.speed, m.current_q = angle, speed, current
+
+
+@njit
+def _lead(s, p, m, angle, speed, out):
+    """The estimate is of a moment before this sample, in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads go on to
+    where the motor is now."""
+    if out.source != FUSED and out.source != STIFFNESS_ONLY:
+        return
+    apart = CYCLE_S * abs(s.alignment.delay)
+    way = angle - m.angle if s.alignment.delay > 0.0 else apart * speed
+    here, _ = characteristic_curve(s.past_contact, p.curve)
+    there, _ = characteristic_curve(s.past_contact + s.gear_slope * way, p.curve)
+    drive = s.drive + s.factor * s.scale * (there - here)
+    gained = first_order_lag(s.force, s.drive, drive, apart, p.relaxation_time) - s.force
+    out.force = max(out.force + gained, 0.0)
+    out.stiffness_force = max(out.stiffness_force + gained, 0.0)
+    out.sigma = hypot(out.sigma, _LED * gained)
+    s.fused, s.fused_sigma = out.force, out.sigma
+
+
+@njit
+def _advance(s, p, m, out):
     if not s.started:
         _start(s, p, m)
     moved_zero = follow_zero(s, p, m)
@@ -132,7 +163,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
     if moved_zero:
         torque = np.nan
     # Over a gap the current of its last cycle does not belong to the mean acceleration.
-    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown:
+    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment):
         watch_contact(s, p, m, force_before, torque, leverage)
     turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force

@@ -1,0 +1,201 @@
+"""A current that is late or early beside the motion: found, undone, told; nothing else is taken for it."""
+
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.estimator import fuse, restart
+from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.estimator.status import CURRENT_APART
+from emb_daemon.models import alignment
+from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, forget_alignment, interrupt
+from emb_daemon.offline import estimate
+
+_DT, _NOISE = 0.004, 0.02
+
+
+def _torque(seconds=4.0, seed=1):
+    """Torque that a motor needs, N m: steps up and down of some tenths of a second, with ramps between them."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, _DT)
+    at = np.cumsum(rng.uniform(0.05, 0.4, int(4 * seconds)))
+    steps = rng.uniform(-0.6, 0.6, len(at))
+    return np.sum(steps[:, None] * (time > at[:, None]) * np.exp(-np.maximum(time - at[:, None], 0.0) / 0.2), axis=0)
+
+
+def _late(values, cycles):
+    return np.interp(np.arange(len(values)) - cycles, np.arange(len(values)), values)
+
+
+def _compare(shown, needed, a=None):
+    a = np.zeros(1, ALIGNMENT)[0] if a is None else a
+    noise = _NOISE * np.random.default_rng(2).standard_normal(len(shown))
+    # The motor is turning.
+    a["angle"][0] = 1.0
+    for one, other in zip(shown + noise, needed, strict=True):
+        compare(a, one, other, _NOISE)
+    return float(a["late"])
+
+
+@pytest.mark.parametrize("cycles", [-2.0, -1.0, 1.0, 1.5, 2.0, 3.0])
+def test_a_shift_is_found(cycles):
+    needed = _torque()
+    pair = (_late(needed, cycles), needed) if cycles > 0.0 else (needed, _late(needed, -cycles))
+    assert _compare(*pair) == pytest.approx(cycles, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda t: t,
+        lambda t: 1.1 * t,
+        lambda t: t + 0.1,
+        lambda t: 0.0 * t,
+        lambda t: t + 0.1 * np.sign(t),
+    ],
+    ids=["nothing", "gain", "offset", "dead", "friction"],
+)
+@pytest.mark.parametrize("seed", range(5))
+def test_what_no_shift_explains_is_none(wrong, seed):
+    needed = _torque(seed=seed)
+    assert _compare(wrong(needed), needed) == 0.0
+
+
+def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
+    a = np.zeros(1, ALIGNMENT)[0]
+    _compare(np.zeros(500), np.zeros(500), a)
+    assert a["told"] == 0.0
+    a["angle"] = 0.0
+    for torque in _torque():
+        compare(a, 0.0, torque, _NOISE)
+    assert a["told"] == 0.0
+    forget_alignment(a)
+    stroke = np.concatenate((np.zeros(20), np.full(10, 0.6), np.full(10, -0.3), np.full(20, 0.3)))
+    assert _compare(_late(stroke, 2.0), stroke, a) == pytest.approx(2.0, abs=0.1)
+
+
+def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits():
+    """For a contact angle that is not known yet: a late current would pass for a clamp force."""
+    a = np.zeros(1, ALIGNMENT)[0]
+    a["quiet"] = 17.0
+    assert aligned(a)
+    _compare(np.repeat([0.0, 0.5], [10, 3]), np.repeat([0.0, 0.5], [10, 3]), a)
+    assert a["quiet"] == 0.0 and not aligned(a)
+    a["told"], a["quiet"] = 5.0, 0.0
+    assert not aligned(a)
+    a["told"] = 6.0
+    assert aligned(a)
+    a["late"] = 1.0
+    assert not aligned(a)
+
+
+def test_samples_of_before_a_gap_or_of_a_fault_are_not_compared():
+    a, needed = np.zeros(1, ALIGNMENT)[0], _torque()
+    _compare(_late(needed, 2.0), needed, a)
+    interrupt(a)
+    told, squares = float(a["told"]), a["square"].copy()
+    _compare(np.ones(7), np.zeros(7), a)
+    assert a["told"] == told
+    np.testing.assert_array_equal(a["square"], squares)
+    forget_alignment(a)
+    assert a["late"] == a["told"] == 0.0 and not a["square"].any()
+
+
+def _shifted(p, what, count=6):
+    """Samples and forces of stops of which the current, or the motion, comes late or filtered."""
+    rows, force = brake.samples(p, brake.stops(p, count))
+    rows = brake.noisy(rows, p)
+    kind, amount = what
+    for name in ("current_q",) if "current" in kind else ("angle", "speed"):
+        rows[name] = _late(rows[name], amount)
+    return rows, force
+
+
+CASES = {
+    "current late": ("current late", 2.0),
+    "current late by part of a cycle": ("current late", 1.4),
+    "motion late": ("motion late", 1.0),
+}
+
+
+@pytest.mark.parametrize("what", CASES.values(), ids=CASES)
+def test_it_is_undone_within_a_stop(parameters, what):
+    """The force is that of the sample, not of the time to which the earlier of both was moved back."""
+    p = brake.ideal(parameters)
+    rows, force = _shifted(p, what)
+    estimates = estimate(rows, p.reshape(1))
+    second = slice(1000, None)
+    error = (estimates["force"] - force)[second]
+    assert np.sqrt(np.mean(error**2)) < 60.0
+    assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
+    if "current" in what[0]:
+        # Of a motion that comes late the first force does, too.
+        first = (estimates["force"] - force)[:1000]
+        assert np.mean(np.abs(first) > 3.0 * np.hypot(estimates["sigma"][:1000], 25.0)) < 0.01
+
+
+def test_what_is_in_step_is_used_as_it_came(parameters):
+    """And samples are the caller's: they stay as they were."""
+    p = brake.ideal(parameters)
+    rows, _ = _shifted(p, ("current late", 2.0))
+    before = rows.copy()
+    estimate(rows, p.reshape(1))
+    assert str(rows.tolist()) == str(before.tolist())
+    a = np.zeros(1, ALIGNMENT)[0]
+    for row in rows[:200]:
+        align(a, row)
+    assert str(rows.tolist()) == str(before.tolist())
+
+
+def test_it_is_moved_only_while_the_motor_stands(parameters):
+    p = brake.ideal(parameters)
+    rows = brake.samples(p, brake.stops(p, 2))[0]
+    a, turning = np.zeros(1, ALIGNMENT)[0], int(np.argmax(rows["speed"]))
+    for row in rows[: turning + 1]:
+        align(a, row)
+    a["late"] = 1.0
+    align(a, rows[turning + 1])
+    assert a["delay"] == 0.0
+    for row in rows[turning + 2 :]:
+        align(a, row)
+    assert (a["delay"], a["late"]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(("found", "limit"), [(9.0, alignment.LATEST), (-9.0, -alignment.EARLIEST)])
+def test_no_shift_is_beyond_what_frames_and_gateways_make(found, limit):
+    a, m = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0]
+    m["dt"] = _DT
+    for _ in range(8):
+        align(a, m)
+    a["late"] = found
+    align(a, m)
+    assert a["delay"] == limit
+
+
+def test_it_survives_a_restart(parameters):
+    p = brake.ideal(parameters)
+    rows, _ = _shifted(p, ("current late", 2.0))
+    state, resumed = new_state(), new_state()
+    estimate(rows, p.reshape(1), state)
+    snapshot = np.zeros(1, restart.SNAPSHOT)[0]
+    assert restart.take_snapshot(state[0], p, snapshot) and not restart.why_implausible(snapshot, p)
+    assert snapshot["delay"] == pytest.approx(2.0, abs=0.15)
+    restart.resume(resumed[0], p, snapshot, 60.0)
+    assert resumed[0]["alignment"]["delay"] == snapshot["delay"]
+    snapshot["delay"] = 5.0
+    assert restart.why_implausible(snapshot, p) == "delay"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("late", 1.0, True),
+        ("delay", 3.9, False),
+        ("delay", 4.0, True),
+        ("delay", -3.0, True),
+    ],
+)
+def test_the_fact(parameters, field, value, told):
+    s = new_state()[0]
+    s["alignment"][field] = value
+    assert bool(fuse._facts_of_torque(s, parameters[0]) & CURRENT_APART) == told
