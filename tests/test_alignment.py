@@ -1,6 +1,7 @@
 """A current that is late or early beside the motion: found, undone, told; nothing else is taken for it."""
 
 import brake
+import city
 import numpy as np
 import pytest
 
@@ -8,7 +9,7 @@ from emb_daemon.estimator import fuse, restart
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import CURRENT_APART
 from emb_daemon.models import alignment
-from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, forget_alignment, interrupt
+from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, interrupt
 from emb_daemon.offline import estimate
 
 _DT, _NOISE = 0.004, 0.02
@@ -69,7 +70,6 @@ def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
     for torque in _torque():
         compare(a, 0.0, torque, _NOISE)
     assert a["told"] == 0.0
-    forget_alignment(a)
     stroke = np.concatenate((np.zeros(20), np.full(10, 0.6), np.full(10, -0.3), np.full(20, 0.3)))
     assert _compare(_late(stroke, 2.0), stroke, a) == pytest.approx(2.0, abs=0.1)
 
@@ -89,7 +89,7 @@ def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits(
     assert not aligned(a)
 
 
-def test_samples_of_before_a_gap_or_of_a_fault_are_not_compared():
+def test_samples_of_before_a_gap_are_not_compared():
     a, needed = np.zeros(1, ALIGNMENT)[0], _torque()
     _compare(_late(needed, 2.0), needed, a)
     interrupt(a)
@@ -97,8 +97,6 @@ def test_samples_of_before_a_gap_or_of_a_fault_are_not_compared():
     _compare(np.ones(7), np.zeros(7), a)
     assert a["told"] == told
     np.testing.assert_array_equal(a["square"], squares)
-    forget_alignment(a)
-    assert a["late"] == a["told"] == 0.0 and not a["square"].any()
 
 
 def _shifted(p, what, count=6):
@@ -132,6 +130,28 @@ def test_it_is_undone_within_a_stop(parameters, what):
         # Of a motion that comes late the first force does, too.
         first = (estimates["force"] - force)[:1000]
         assert np.mean(np.abs(first) > 3.0 * np.hypot(estimates["sigma"][:1000], 25.0)) < 0.01
+
+
+@pytest.mark.parametrize("cycles", [2.4, 3.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_a_late_current_makes_of_the_first_stroke_is_not_learned(cycles, seed):
+    """Of a unit within tolerances. Neither a clamp force of kilonewtons at the start, nor other pads."""
+
+    def change(rows):
+        rows["current_q"] = _late(rows["current_q"], cycles)
+
+    estimates, force = city.changed(change, seed, 25.0)
+    error = np.abs(estimates["force"] - force)[25:]
+    assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][25:], 25.0)) < 0.005
+    assert np.sqrt(np.mean(error**2)) < 120.0
+
+
+def test_a_brake_that_is_held_as_exactly_known_is_not_moved(parameters):
+    """As in diagnose, which names a delay instead."""
+    p, state = brake.ideal(parameters), new_state()
+    p["clearance_sigma"] = 0.0
+    estimate(_shifted(p, ("current late", 2.0))[0], p.reshape(1), state)
+    assert state[0]["alignment"]["delay"] == 0.0
 
 
 def test_what_is_in_step_is_used_as_it_came(parameters):

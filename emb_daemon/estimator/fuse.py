@@ -58,7 +58,7 @@ from emb_daemon.estimator.unknown import (
     torque_offset,
 )
 from emb_daemon.jit import Record, hypot, njit, sq
-from emb_daemon.models.alignment import at_bound, compare, forget_alignment, interrupt
+from emb_daemon.models.alignment import at_bound, compare, interrupt
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -240,9 +240,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     slope = s.gear_slope
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
-    if known or s.unknown or s.plausibility.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN):
-        forget_alignment(s.alignment)
-    elif m.dt <= ONE_CYCLE_S and s.past_contact < -_BACK * s.clearance:
+    if not known and m.dt <= ONE_CYCLE_S and s.past_contact < -_BACK * s.clearance:
         wanted = s.motor_torque - torque + leverage * mean_force + s.error[OFFSET]
         compare(s.alignment, s.motor_torque, wanted, sqrt(moving))
     else:

@@ -30,9 +30,9 @@ _WORTH = 0.6
 _EXPLAINS = 0.4
 #: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
 _SETTLED = 16.0
-#: Samples that are kept, one more than the largest shift, and gap after which they are of no use, s. A motor stands that moved
-#: by less than three counts of a resolver of 12 bit meanwhile, rad.
-_KEPT_SAMPLES, _GAP_S, _STANDS_RAD = LATEST + 2, 0.1, 0.005
+#: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
+#: 12 bit meanwhile, rad.
+_KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
 #: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares of their difference by
 #: shift, and of what the shown one ``changed`` by. ``heard`` cycles without a gap, ``told`` of them that tell, ``quiet`` since
@@ -55,7 +55,7 @@ def align(a: Record, m: Record) -> None:
     a.quiet += 1.0
     if a.late != 0.0 and _range(a.angle) < _STANDS_RAD:
         a.delay = min(max(a.delay + a.late, -EARLIEST), LATEST)
-        forget_alignment(a)
+        _forget(a)
     if a.delay > 0.0:
         m.angle, m.speed = _at(a.age, a.angle, a.delay * CYCLE_S), _at(a.age, a.speed, a.delay * CYCLE_S)
     elif a.delay < 0.0:
@@ -64,7 +64,7 @@ def align(a: Record, m: Record) -> None:
 
 @njit
 def _keep(a, m):
-    if a.age[1] == 0.0 or m.dt > _GAP_S:
+    if a.age[1] == 0.0:
         for i in range(_KEPT_SAMPLES):
             a.age[i], a.angle[i], a.speed[i], a.current[i] = i * CYCLE_S, m.angle, m.speed, m.current_q
         return
@@ -140,8 +140,8 @@ def interrupt(a: Record) -> None:
 
 
 @njit
-def forget_alignment(a: Record) -> None:
-    """Compare anew: what was seen so far was of other signals, or of a sensor's fault."""
+def _forget(a):
+    """Compare anew: what was seen so far was of other signals."""
     a.late = a.told = a.heard = a.changed = 0.0
     for i in range(_SHIFTS):
         a.square[i] = 0.0
