@@ -19,28 +19,31 @@ from emb_daemon.wire.contract import CYCLE_S
 EARLIEST, LATEST = 3, 4
 _SHIFTS = EARLIEST + LATEST + 1
 #: Change of the needed torque that tells shifts apart, in standard deviations of a torque; way within the samples that are
-#: kept which noise of angle or speed does not make, rad. Without a fault one cycle then makes some ninety times the sum of
+#: kept which noise of angle or speed does not make, rad. Without a fault one cycle then makes some twenty times the sum of
 #: squares.
 _CLEAR, _MOVED_RAD = 6.0, 0.05
-#: Samples that tell, over which the sums forget: some stops. Fewest of them that are enough: one stroke has as many.
-_KEPT, _ENOUGH = 100.0, 6.0
+#: Samples that tell, over which the sums forget: some stops. Fewest of them that are enough: one stroke has as many, three
+#: strokes the second number.
+_KEPT, _ENOUGH, _MANY = 100.0, 6.0, 20.0
 #: Least shift that is taken out, cycles. Half of one is within what the estimate allows for, and interpolation costs as much.
 _WORTH = 0.6
-#: Least part of the sum of squares that a shift must explain.
-_EXPLAINS = 0.4
+#: Least part of the sum of squares that a shift must explain after one stroke, which cold grease has made explain half, and
+#: after many: a shift by half a cycle more than a whole one explains no more than half.
+_EXPLAINS, _EXPLAINS_OF_MANY = 0.6, 0.4
 #: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
 _SETTLED = 16.0
 #: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
 #: 12 bit meanwhile, rad.
 _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
-#: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares of their difference by
-#: shift, and of what the shown one ``changed`` by. ``heard`` cycles without a gap, ``told`` of them that tell, ``quiet`` since
-#: the last. ``late`` cycles: by which the current is behind, beyond the ``delay`` cycles that are taken out; negative where
-#: the motion is. The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
+#: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2, by shift, of
+#: what they change by beside each other, and of what the shown one ``changed`` by. ``heard`` cycles without a gap, ``told`` of
+#: them that tell, ``quiet`` since the last. ``late`` cycles: by which the current is behind, beyond the ``delay`` cycles that
+#: are taken out; negative where the motion is. The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
 ALIGNMENT = np.dtype(
     [
-        *((name, "f8", (_SHIFTS,)) for name in ("shown", "needed", "square")),
+        *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed")),
+        ("square", "f8", (_SHIFTS,)),
         *fields("f8", "changed heard told quiet late delay"),
         *((name, "f8", (_KEPT_SAMPLES,)) for name in ("age", "angle", "speed", "current")),
     ],
@@ -95,17 +98,19 @@ def _at(ages, values, age):
 def compare(a: Record, shown: float, needed: float, noise: float) -> None:
     """Take one cycle's torque by the current and by the motion while the pads are apart, N m; ``noise`` N m: standard
     deviation of their difference."""
-    for i in range(_SHIFTS - 1, 0, -1):
+    for i in range(_SHIFTS, 0, -1):
         a.shown[i], a.needed[i] = a.shown[i - 1], a.needed[i - 1]
     a.shown[0], a.needed[0] = shown, needed
     a.heard += 1.0
-    if a.heard < _SHIFTS or _range(a.needed) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
+    if a.heard <= _SHIFTS or _range(a.needed) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
         return
     a.quiet = 0.0
     a.told += 1.0 - a.told / _KEPT
-    a.changed = _add(a.changed, a.shown[EARLIEST] - a.shown[_SHIFTS - 1])
+    # By what they change in a cycle: friction that the calibration does not know changes slowly.
+    changed = a.shown[EARLIEST] - a.shown[EARLIEST + 1]
+    a.changed = _add(a.changed, changed)
     for i in range(_SHIFTS):
-        a.square[i] = _add(a.square[i], a.shown[EARLIEST] - a.needed[i])
+        a.square[i] = _add(a.square[i], changed - (a.needed[i] - a.needed[i + 1]))
     a.late = _least(a)
 
 
@@ -129,7 +134,8 @@ def _least(a):
             shift += 0.5 * (before - after) / curvature
             least -= 0.125 * (before - after) * (before - after) / curvature
     # A current that shows nothing is explained by no shift.
-    tells = a.told >= _ENOUGH and least < (1.0 - _EXPLAINS) * min(a.square[EARLIEST], a.changed)
+    explains = _EXPLAINS_OF_MANY if a.told >= _MANY else _EXPLAINS
+    tells = a.told >= _ENOUGH and least < (1.0 - explains) * min(a.square[EARLIEST], a.changed)
     return shift if tells and abs(shift) > _WORTH else 0.0
 
 
