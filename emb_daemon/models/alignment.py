@@ -2,11 +2,11 @@
 
 Angle and current travel in two messages. A gateway, or another sampling instant, moves one against the other by some cycles;
 where the torque changes, the balance of torques then fails by kilonewtons, which pass for another contact, stiffness or
-friction. While the pads are apart, inertia and friction alone need a torque. It is compared with that of the current at
+friction. While the pads are apart, inertia and friction alone need a torque. Its changes are compared with the current's at
 several shifts in whole cycles; the least sum of squares and its two neighbours give the shift (Knapp and Carter, The
 generalized correlation method for estimation of time delay, IEEE Trans. Acoustics, Speech and Signal Processing 24(4), 1976).
 Then the earlier of both is delayed as the other is. Of 24 phases with a current that is up to 12 ms late 14 fail without this
-and 1 with it, of 29 with a resolver that is one or two cycles late 13 and 1 (`studies.silent grid --faults
+and none with it, of 29 with a resolver that is one or two cycles late 13 and none (`studies.silent grid --faults
 current_delayed,resolver_delayed --count 8 --seed 5`).
 """
 
