@@ -210,7 +210,7 @@ def test_what_the_kernel_says_beside_a_frame_is_read(order):
     stamp = struct.pack("=QiiQQ", 32, socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, *divmod(stamp_ns, 1_000_000_000))
     drops = struct.pack("=QiiI4x", 20, socket.SOL_SOCKET, rawcan._SO_RXQ_OVFL, 0x01020304)
     content = b"".join((stamp, drops)[::order])
-    near._received.control[0, : len(content)] = np.frombuffer(content, np.uint8)
+    near._received.control.view(np.uint8)[0, : len(content)] = np.frombuffer(content, np.uint8)
     near._received.headers["length"][0], near._received.headers["control_length"][0] = 16, len(content)
     assert near._take(1, time.monotonic_ns()) == (1, 0x01020304)
     assert abs(near._frames["time_ns"][0] - arrived_ns) < _CLOCKS_NS

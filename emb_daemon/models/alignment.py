@@ -22,14 +22,14 @@ _SHIFTS = EARLIEST + LATEST + 1
 #: kept which noise of angle or speed does not make, rad. Without a fault one cycle then makes some twenty times the sum of
 #: squares.
 _CLEAR, _MOVED_RAD = 6.0, 0.05
-#: Samples that tell, over which the sums forget: some stops. Fewest of them that are enough: one stroke has as many, three
-#: strokes the second number.
-_KEPT, _ENOUGH, _MANY = 100.0, 6.0, 20.0
+#: Samples that tell, over which the sums forget: some stops. Fewest of them that are enough: one stroke has as many.
+_KEPT, _ENOUGH = 100.0, 6.0
 #: Least shift that is taken out, cycles. Half of one is within what the estimate allows for, and interpolation costs as much.
 _WORTH = 0.6
-#: Least part of the sum of squares that a shift must explain after one stroke, which cold grease has made explain half, and
-#: after many: a shift by half a cycle more than a whole one explains no more than half.
-_EXPLAINS, _EXPLAINS_OF_MANY = 0.6, 0.4
+#: Standard deviations of a torque that its changes must be off by on the average: three of a difference's.
+_BEYOND = 4.2
+#: Least part of the sum of squares that a shift must explain: cold grease has made one of a cycle explain half.
+_EXPLAINS = 0.6
 #: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
 _SETTLED = 16.0
 #: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
@@ -37,14 +37,15 @@ _SETTLED = 16.0
 _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
 #: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2, by shift, of
-#: what they change by beside each other, and of what the shown one ``changed`` by. ``heard`` cycles without a gap, ``told`` of
-#: them that tell, ``quiet`` since the last. ``late`` cycles: by which the current is behind, beyond the ``delay`` cycles that
-#: are taken out; negative where the motion is. The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
+#: what they change by beside each other, of what the shown one ``changed`` by, and of noise (``noisy``). ``heard`` cycles
+#: without a gap, ``told`` of them that tell, ``quiet`` since the last. ``late`` cycles: by which the current is behind, beyond
+#: the ``delay`` cycles that are taken out; negative where the motion is. The last samples: ``age`` s, ``angle``, ``speed``,
+#: ``current``.
 ALIGNMENT = np.dtype(
     [
         *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed")),
         ("square", "f8", (_SHIFTS,)),
-        *fields("f8", "changed heard told quiet late delay"),
+        *fields("f8", "changed noisy heard told quiet late delay"),
         *((name, "f8", (_KEPT_SAMPLES,)) for name in ("age", "angle", "speed", "current")),
     ],
     align=True,
@@ -108,7 +109,7 @@ def compare(a: Record, shown: float, needed: float, noise: float) -> None:
     a.told += 1.0 - a.told / _KEPT
     # By what they change in a cycle: friction that the calibration does not know changes slowly.
     changed = a.shown[EARLIEST] - a.shown[EARLIEST + 1]
-    a.changed = _add(a.changed, changed)
+    a.changed, a.noisy = _add(a.changed, changed), _add(a.noisy, _BEYOND * noise)
     for i in range(_SHIFTS):
         a.square[i] = _add(a.square[i], changed - (a.needed[i] - a.needed[i + 1]))
     a.late = _least(a)
@@ -134,8 +135,9 @@ def _least(a):
             shift += 0.5 * (before - after) / curvature
             least -= 0.125 * (before - after) * (before - after) / curvature
     # A current that shows nothing is explained by no shift.
-    explains = _EXPLAINS_OF_MANY if a.told >= _MANY else _EXPLAINS
-    tells = a.told >= _ENOUGH and least < (1.0 - explains) * min(a.square[EARLIEST], a.changed)
+    tells = (
+        a.told >= _ENOUGH and a.square[EARLIEST] > a.noisy and least < (1.0 - _EXPLAINS) * min(a.square[EARLIEST], a.changed)
+    )
     return shift if tells and abs(shift) > _WORTH else 0.0
 
 
@@ -148,7 +150,7 @@ def interrupt(a: Record) -> None:
 @njit
 def _forget(a):
     """Compare anew: what was seen so far was of other signals."""
-    a.late = a.told = a.heard = a.changed = 0.0
+    a.late = a.told = a.heard = a.changed = a.noisy = 0.0
     for i in range(_SHIFTS):
         a.square[i] = 0.0
 
