@@ -77,11 +77,10 @@ def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
 def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits():
     """For a contact angle that is not known yet: a late current would pass for a clamp force."""
     a = np.zeros(1, ALIGNMENT)[0]
-    a["quiet"] = 17.0
     assert aligned(a)
     _compare(np.repeat([0.0, 0.5], [10, 3]), np.repeat([0.0, 0.5], [10, 3]), a)
-    assert a["quiet"] == 0.0 and not aligned(a)
-    a["told"], a["quiet"] = 5.0, 0.0
+    assert a["restless"] > 0.0 and not aligned(a)
+    a["told"], a["restless"] = 5.0, 1.0
     assert not aligned(a)
     a["told"] = 6.0
     assert aligned(a)

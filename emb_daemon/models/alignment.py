@@ -6,7 +6,7 @@ friction. While the pads are apart, inertia and friction alone need a torque. It
 several shifts in whole cycles; the least sum of squares and its two neighbours give the shift (Knapp and Carter, The
 generalized correlation method for estimation of time delay, IEEE Trans. Acoustics, Speech and Signal Processing 24(4), 1976).
 Then the earlier of both is delayed as the other is. Of 24 phases with a current that is up to 12 ms late 14 fail without this
-and none with it, of 29 with a resolver that is one or two cycles late 13 and none (`studies.silent grid --faults
+and none with it, of 29 with a resolver that is one or two cycles late 13 and 2 (`studies.silent grid --faults
 current_delayed,resolver_delayed --count 8 --seed 5`).
 """
 
@@ -38,14 +38,14 @@ _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
 #: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2, by shift, of
 #: what they change by beside each other, of what the shown one ``changed`` by, and of noise (``noisy``). ``heard`` cycles
-#: without a gap, ``told`` of them that tell, ``quiet`` since the last. ``late`` cycles: by which the current is behind, beyond
-#: the ``delay`` cycles that are taken out; negative where the motion is. The last samples: ``age`` s, ``angle``, ``speed``,
-#: ``current``.
+#: without a gap, ``told`` of them that tell, ``restless``: those left until the last is settled. ``late`` cycles: by which the
+#: current is behind, beyond the ``delay`` cycles that are taken out; negative where the motion is. The last samples: ``age``
+#: s, ``angle``, ``speed``, ``current``.
 ALIGNMENT = np.dtype(
     [
         *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed")),
         ("square", "f8", (_SHIFTS,)),
-        *fields("f8", "changed noisy heard told quiet late delay"),
+        *fields("f8", "changed noisy heard told restless late delay"),
         *((name, "f8", (_KEPT_SAMPLES,)) for name in ("age", "angle", "speed", "current")),
     ],
     align=True,
@@ -56,7 +56,7 @@ ALIGNMENT = np.dtype(
 def align(a: Record, m: Record) -> None:
     """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other."""
     _keep(a, m)
-    a.quiet += 1.0
+    a.restless = max(a.restless - 1.0, 0.0)
     if a.late != 0.0 and _range(a.angle) < _STANDS_RAD:
         a.delay = min(max(a.delay + a.late, -EARLIEST), LATEST)
         _forget(a)
@@ -105,7 +105,7 @@ def compare(a: Record, shown: float, needed: float, noise: float) -> None:
     a.heard += 1.0
     if a.heard <= _SHIFTS or _range(a.needed) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
         return
-    a.quiet = 0.0
+    a.restless = _SETTLED
     a.told += 1.0 - a.told / _KEPT
     # By what they change in a cycle: friction that the calibration does not know changes slowly.
     changed = a.shown[EARLIEST] - a.shown[EARLIEST + 1]
@@ -165,4 +165,4 @@ def at_bound(a: Record) -> bool:
 def aligned(a: Record) -> bool:
     """Whether a torque of now may be used before the contact angle is known: nothing has changed of late, or the changes were
     seen to belong together."""
-    return a.late == 0.0 and (a.told >= _ENOUGH or a.quiet > _SETTLED)
+    return a.late == 0.0 and (a.told >= _ENOUGH or a.restless == 0.0)
