@@ -356,9 +356,10 @@ def resolver_delayed(rng, moments, size):
         kept = []
 
         def change(values, _):
-            shown = [*(kept or [values[0]] * cycles if len(values) else []), *values]
-            kept[:] = shown[-cycles:]
-            return np.array(shown[: len(values)])
+            kept.extend(values if kept else [*values[:1]] * cycles + [*values])
+            shown = np.array(kept[: len(values)])
+            del kept[: len(values)]
+            return shown
 
         return change
 

@@ -11,6 +11,7 @@ from emb_daemon.estimator.status import CURRENT_APART
 from emb_daemon.models import alignment
 from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, interrupt
 from emb_daemon.offline import estimate
+from emb_daemon.wire.contract import OUTSIDE_RANGE
 
 _DT, _NOISE = 0.004, 0.02
 
@@ -189,6 +190,15 @@ def test_no_shift_is_beyond_what_frames_and_gateways_make(found, limit):
     a["late"] = found
     align(a, m)
     assert a["delay"] == limit
+
+
+def test_a_force_beyond_the_range_is_told_at_its_own_sample(parameters, late):
+    parameters["maximum_force"] = 5000.0
+    state = new_state()
+    estimates = estimate(late, parameters, state)[city.SECOND_CLEARANCE :]
+    beyond = estimates["force"] > 5000.0
+    assert state[0]["alignment"]["delay"] > 1.8 and beyond.any()
+    assert np.all(estimates["reasons"][beyond] & OUTSIDE_RANGE) and np.all(estimates["sigma"] <= 5000.0)
 
 
 def test_it_survives_a_restart(parameters, late):

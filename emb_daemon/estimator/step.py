@@ -53,7 +53,7 @@ from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver,
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.models.wander import STANDING_RAD_PER_S, leave_stretch, watch_wander
-from emb_daemon.wire.contract import CYCLE_S, FUSED, INIT, INVALID, PREDICTED, RUNNING, STIFFNESS_ONLY
+from emb_daemon.wire.contract import CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
@@ -110,18 +110,14 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
     """
     angle, speed, current = m.angle, m.speed, m.current_q
     align(s.alignment, m)
-    _advance(s, p, m, out)
-    if s.alignment.delay != 0.0:
-        _lead(s, p, m, angle, speed, out)
+    _advance(s, p, m, angle, speed, out)
     m.angle, m.speed, m.current_q = angle, speed, current
 
 
 @njit
 def _lead(s, p, m, angle, speed, out):
-    """The estimate is of a moment before this sample, in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads go on to
-    where the motor is now."""
-    if out.source != FUSED and out.source != STIFFNESS_ONLY:
-        return
+    """From the moment to which the sample was moved back to that in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads
+    go on to where the motor is now."""
     apart = CYCLE_S * abs(s.alignment.delay)
     way = angle - m.angle if s.alignment.delay > 0.0 else apart * speed
     here, _ = characteristic_curve(s.past_contact, p.curve)
@@ -131,11 +127,11 @@ def _lead(s, p, m, angle, speed, out):
     out.force = max(out.force + gained, 0.0)
     out.stiffness_force = max(out.stiffness_force + gained, 0.0)
     out.sigma = hypot(out.sigma, _LED * gained)
-    s.fused, s.fused_sigma = out.force, out.sigma
 
 
 @njit
-def _advance(s, p, m, out):
+def _advance(s, p, m, angle, speed, out):
+    """`step` with current and motion of one moment; ``angle`` and ``speed`` as they came."""
     if not s.started:
         _start(s, p, m)
     moved_zero = follow_zero(s, p, m)
@@ -175,7 +171,10 @@ def _advance(s, p, m, out):
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
     facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
-    if p.sensor.limit > 0.0 and facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT):
+    by_torque = facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT) != 0
+    if s.alignment.delay != 0.0 and not by_torque:
+        _lead(s, p, m, angle, speed, out)
+    if p.sensor.limit > 0.0 and by_torque:
         out.force, out.sigma = with_sensor(s.sensor, out.force, out.sigma)
     bound(s.monitor, p, m, s.gear_friction)
     s.angle_before, s.dt_before = s.angle, m.dt

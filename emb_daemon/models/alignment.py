@@ -98,7 +98,7 @@ def _at(ages, values, age):
 @njit
 def compare(a: Record, shown: float, needed: float, noise: float) -> None:
     """Take one cycle's torque by the current and by the motion while the pads are apart, N m; ``noise`` N m: standard
-    deviation of their difference."""
+    deviation by which they may differ from noise of the speed and the part of a cycle that is allowed for."""
     for i in range(_SHIFTS, 0, -1):
         a.shown[i], a.needed[i] = a.shown[i - 1], a.needed[i - 1]
     a.shown[0], a.needed[0] = shown, needed
