@@ -125,6 +125,12 @@ def test_it_is_undone_within_a_stop(names, cycles, seed):
     assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_unit_within_tolerances_is_in_step(parameters, seed):
+    a = _after(city.drive(seed, 40.0)[0], parameters)["alignment"]
+    assert (a["delay"], a["late"]) == (0.0, 0.0) and a["told"] > 20.0
+
+
 @pytest.mark.parametrize("cycles", [2.0, 3.0])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_what_a_late_current_makes_of_the_first_stroke_is_not_learned(cycles, seed):

@@ -28,7 +28,8 @@ _KEPT, _ENOUGH = 100.0, 6.0
 _WORTH = 0.6
 #: Standard deviations of a torque that its changes must be off by on the average: three of a difference's.
 _BEYOND = 4.2
-#: Least part of the sum of squares that a shift must explain: cold grease has made one of a cycle explain half.
+#: Least part of the sum of squares that a shift must explain: a right one leaves a twentieth, and friction that the
+#: calibration does not know, as of grease at -20 degC, has made a wrong one explain half.
 _EXPLAINS = 0.6
 #: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
 _SETTLED = 16.0
