@@ -111,3 +111,48 @@ def test_without_drift_nothing_is_told(p):
     estimates, force = _estimated(p, lambda rows: None, 1)
     assert not np.any(estimates["reasons"] & r.OUT_OF_RANGE)
     assert np.mean(_beyond(estimates, force)) < 0.01
+
+
+def _rmse(estimates, force):
+    return np.sqrt(np.mean((estimates["force"] - force) ** 2))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
+def test_after_some_stops_the_contact_angle_drifts_with_the_angle(p, rad_per_s, seed):
+    """Without that the filter follows with 380 to 530 N."""
+
+    def drift(rows):
+        rows["angle"] += rad_per_s * _DT * np.arange(len(rows))
+
+    estimates, force = _estimated(p, drift, seed)
+    learned = slice(len(force) // 2, None)
+    assert _rmse(estimates[learned], force[learned]) < 300.0
+    assert np.mean(_beyond(estimates, force)[learned]) < 0.01
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
+def test_an_offset_of_the_speed_leaves_the_contact_angle_where_it_is(p, rad_per_s, seed):
+    """Its drift would be 400 um in the whole."""
+
+    def offset(rows):
+        rows["speed"] += rad_per_s
+
+    estimates, force = _estimated(p, offset, seed)
+    assert _rmse(estimates, force) < 150.0
+    assert np.mean(_beyond(estimates, force)) < 0.01
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_angle_that_creeps_in_a_hold_does_not_slide_the_gear(p, seed):
+    """Its torque lies within friction's band, which the torque's sigma covers: it is not that of a closing motor."""
+    angle = np.concatenate((brake.stops(p, _STOPS // 2, seed), np.linspace(0.0, 14.0, 250), np.full(7500, 14.0)))
+    rows, force = brake.samples(p, angle)
+    rows = brake.noisy(rows, p, seed)
+    rows["angle"] += 0.06 * _DT * np.arange(len(rows))
+    rows["current_q"][-7250:] *= 0.6
+    estimates = estimate(rows, p)
+    held = slice(-5000, None)
+    missed = np.abs(estimates["torque_force"] - force)[held] / estimates["torque_sigma"][held]
+    assert np.nanmedian(missed) < 1.3

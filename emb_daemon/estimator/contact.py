@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
-from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, turned
+from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, shift_zero, turned
 from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.contact import (
     NOTHING,
@@ -44,6 +44,11 @@ _STOOD_S = 1.0
 #: T²/8, and four of them on a travel a t², sped up for t and slowed down for as long, by T²/(2 t²) of it, t being 40 ms. On
 #: the simulated rig's logs no travel is off by more than 0.35 of the limit.
 _SPEED_SCALE = 0.005
+#: Gain error of a resolver's speed, share: tolerance of its scale, and what the trapezoid misses of a few samples.
+_SPEED_GAIN = 0.02
+#: Samples in a row in which angle and speed repeat to the bit, from which both are stale: by chance, at one repetition in five
+#: of a motor that stands, one in a hundred.
+_REPEATED = 3
 #: Standard deviations of the contact angle, rad, below which it is known again, and of an unknown one.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Largest torque of a released brake, as a share of what the largest force needs: the offset of an ordinary current sensor;
@@ -63,18 +68,26 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
 
     The shift follows from the speed. If the resolver had been frozen the motor may have turned meanwhile, and an impossible
     motion may have any cause; then the contact angle becomes uncertain by as much. A resolver that loses counts loses a few in
-    each sample, which shows when the motor stands again; it will lose more, and is not used.
+    each sample, which shows when the motor stands again; it will lose more, and is not used. An angle that repeats while the
+    speed goes on has lost nothing unless it goes on from there.
     """
     jump = m.angle - s.angle
     frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
     stuck = s.plausibility.still > 1 or frozen_s > 0.0
-    reach = p.maximum_speed * (m.dt + frozen_s)
+    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     turned = 0.5 * (m.speed + s.speed) * m.dt
     slip = jump - turned
     unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
-    if abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
+    behind = s.behind
+    _stay_behind(s, m, jump, turned)
+    if s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind)):
+        # A loose contact repeats an angle, which is right again when it has made up for the way.
+        pass
+    elif abs(behind) > unsure and s.plausibility.still == 0:
+        moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
+    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
         moved, sigma = jump, reach
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
         moved, sigma = slip, _ZERO_RAD
@@ -90,6 +103,16 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     if moved != 0.0:
         _move_zero(s, p, moved, sigma)
     return moved != 0.0
+
+
+@njit
+def _stay_behind(s, m, jump, turned):
+    """Keep the way (rad) by which an angle that repeats is behind; ``jump`` and ``turned`` rad are what this sample adds to
+    the angle and by the speed."""
+    if jump != 0.0 or s.plausibility.still >= _REPEATED or m.dt > ONE_CYCLE_S:
+        s.behind = 0.0
+    elif abs(turned) > STANDING_RAD_PER_S * m.dt:
+        s.behind += turned
 
 
 @njit
@@ -121,13 +144,7 @@ def _drift(s, m, slip, turned):
 def _move_zero(s, p, moved, sigma):
     """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
     s.drifted = s.stood_s = 0.0
-    s.angle += moved
-    s.angle_before += moved
-    s.slid_angle += moved
-    s.contact_angle += moved
-    s.contact_anchor += moved
-    s.start_angle += moved
-    s.gear_zero += moved
+    shift_zero(s, moved)
     sigma *= s.gear_slope
     s.covariance[CONTACT, CONTACT] += sigma * sigma
     open_again(s, p)
@@ -207,7 +224,7 @@ def place_contact(s: Record, p: Record, released: float) -> None:
     else:
         rest(s, p, x, s.factor * s.scale)
     s.contact_angle, s.contact_anchor = angle, released + p.clearance
-    s.contact_age_s = 0.0
+    s.contact_age_s = s.straying.known = 0.0
     for i in range(STATES):
         s.covariance[CONTACT, i] = s.covariance[i, CONTACT] = 0.0
     s.covariance[CONTACT, CONTACT] = sigma * sigma
@@ -306,6 +323,6 @@ def _start_contact(s, p, m, force, sigma, leverage):
     own = sq(sigma / slope) + lag * lag + _KNOWN_RAD * _KNOWN_RAD
     s.covariance[CONTACT, CONTACT] = own + misread * misread * s.covariance[OFFSET, OFFSET]
     s.contact_anchor = s.contact_angle
-    s.contact_age_s = 0.0
+    s.contact_age_s = s.straying.known = 0.0
     start_anew(s.contact)
     open_again(s, p)

@@ -48,6 +48,7 @@ from emb_daemon.estimator.status import (
     RESOLVER_IMPLAUSIBLE,
     TORQUE_OLD,
 )
+from emb_daemon.estimator.straying import attribute_straying
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
     SLOW_RAD_PER_S,
@@ -114,8 +115,6 @@ _TOLD_CYCLES = 2.0
 _LASTS_S = 10.0
 #: Way of a whole stroke, over which counts are lost in the same direction, as time at the motor's maximum speed, s.
 _STROKE_S = 0.25
-#: Share of what the angle gains over the speed that may be wrong: it may be the speed that is.
-_UNSURE = 0.5
 #: Share of the clearance by which pads are certainly apart: the motor must have gone back so far before a jump is proven, and
 #: only there do inertia and friction alone need a torque, whose moment is known whatever the contact angle is.
 _BACK = 0.3
@@ -157,17 +156,6 @@ def _spread(s, p, m):
 
 
 @njit
-def _wandered(s, p, m):
-    """Variance (rad²) that the contact angle gains with this sample from a resolver whose zero wanders."""
-    w = s.wander
-    drifted = sq(_UNSURE * w.rate) * _LASTS_S * m.dt
-    lost = sq(_UNSURE * w.loss) * _STROKE_S * p.maximum_speed * abs(m.angle - s.angle)
-    variance = s.gear_slope * s.gear_slope * (drifted + lost + w.unseen * w.unseen)
-    w.unseen = 0.0
-    return variance
-
-
-@njit
 def _predict(s, p, m, spread, warmth, known):
     """Time update of all hypotheses, then of the motor's heat."""
     current_torque = p.torque_constant * p.current_sigma
@@ -177,7 +165,9 @@ def _predict(s, p, m, spread, warmth, known):
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
     walked[OFFSET] += s.offset_walk * m.dt
-    walked[CONTACT] += _wandered(s, p, m) + s.contact_walk * m.dt
+    walked[CONTACT] += s.contact_walk * m.dt
+    s.straying.gained += walked[CONTACT]
+    walked[CONTACT] += s.straying.walked
     if s.offset_age_s > 0.0:
         s.offset_age_s += m.dt
     if s.contact_age_s > 0.0:
@@ -314,6 +304,7 @@ def fuse(
             forget_level(s.contact)
         if s.stops > stops:
             weigh_common(s, p)
+            attribute_straying(s)
     else:
         s.torque_age += m.dt
     s.current_before, s.had_current = m.current_q, m.has_current

@@ -112,6 +112,18 @@ def _stand(s, m):
 
 
 @njit
+def shift_zero(s: Record, moved: float) -> None:
+    """Refer all stored angles to a zero that has moved by ``moved`` rad."""
+    s.angle += moved
+    s.angle_before += moved
+    s.slid_angle += moved
+    s.contact_angle += moved
+    s.contact_anchor += moved
+    s.start_angle += moved
+    s.gear_zero += moved
+
+
+@njit
 def settle_paths(s: Record, p: Record, m: Record, factor: float) -> None:
     """Bring both paths of a STATE to rest at a first sample, the motor standing: forces settled, friction unknown."""
     _stand(s, m)
@@ -140,6 +152,9 @@ def _slid(s, p, angle, travel, dt):
     s.turned_back = turned_back(s.turned_back, s.direction, travel, dt)
     if travel != 0.0:
         s.direction = travel
+    if s.straying.creeps:
+        s.slid_angle += travel
+        return 0.0
     noise = p.presliding_angle if s.turned_back > NOISE_TURNS_BACK else 0.0
     before = s.slid_angle
     s.slid_angle = slid_angle(before, angle, max(noise, FLICKER_RAD))

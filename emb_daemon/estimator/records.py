@@ -7,6 +7,7 @@ from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.straying import STRAYING
 from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
 from emb_daemon.jit import fields
@@ -99,7 +100,7 @@ STATE = np.dtype(
         *fields("f8", "drifted stood_s drifting_s"),
         # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
         # turned, s; the first is no number where part of the way was not seen.
-        *fields("f8", "strayed turned turned_s"),
+        *fields("f8", "strayed turned turned_s behind"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
         # Of a gear that is not constant: resolver's angle at its released position, rad, and its slope (`models.gear`). The
         # contact angle and what is past it are equivalent angles.
@@ -153,6 +154,7 @@ STATE = np.dtype(
         ("winding", "f8"),
         ("housing", "f8"),
         ("consistency", CONSISTENCY),
+        ("straying", STRAYING),
         ("uneven", UNEVEN),
         ("sensor", FORCE_SENSOR),
         # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.

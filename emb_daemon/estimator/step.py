@@ -35,6 +35,7 @@ from emb_daemon.estimator.status import (
     ZERO_WANDERS,
     tell_status,
 )
+from emb_daemon.estimator.straying import follow_straying
 from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
     MOST_CREEP,
@@ -197,6 +198,8 @@ def _follow_age(s, p, m, moved_zero):
         watch_wander(s.wander, travel, turned, m.speed, gained, s.speed_sigma, m.dt)
     else:
         leave_stretch(s.wander)
+    if p.clearance_sigma > 0.0:
+        follow_straying(s, travel, m.speed, m.dt)
     if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
         return

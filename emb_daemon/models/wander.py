@@ -30,7 +30,7 @@ WANDER = np.dtype(
         ("right", "f8", (_CAUSES,)),
         ("lower", "f8", (_CAUSES, _CAUSES)),
         ("half", "f8", (_CAUSES,)),
-        *fields("f8", "offset_weight offset_sum strayed rate loss unseen"),
+        *fields("f8", "offset_weight offset_sum strayed drift rate loss unseen"),
         ("found", "?"),
     ],
     align=True,
@@ -98,6 +98,7 @@ def _take_stretch(a, noise):
     a.strayed = keep * a.strayed + a.slip - offset * a.seconds
     apart = rate - offset
     apart_sigma = sqrt(rate_sigma * rate_sigma + offset_sigma * offset_sigma)
+    a.drift = rate if abs(rate) > _LIKELY * rate_sigma else 0.0
     a.rate = apart if abs(apart) > _LIKELY * apart_sigma else 0.0
     a.loss = loss if abs(loss) > _LIKELY * loss_sigma else 0.0
     was, a.found = a.found, abs(apart) > _SURELY * apart_sigma or abs(loss) > _SURELY * loss_sigma

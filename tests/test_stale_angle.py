@@ -1,0 +1,60 @@
+"""A motor angle that repeats while its speed goes on, as a loose contact or a busy sender makes it."""
+
+import brake
+import numpy as np
+import pytest
+
+from emb_daemon.offline import estimate
+
+_STOPS = 12
+
+
+@pytest.fixture
+def p(parameters):
+    return brake.ideal(parameters)
+
+
+@pytest.fixture
+def driven(p):
+    rows, force = brake.samples(p, brake.stops(p, _STOPS))
+    rows = brake.noisy(rows, p)
+    return rows, force, np.flatnonzero(np.abs(rows["speed"]) > 50.0)
+
+
+def _repeat(rows, names, samples, moments):
+    """Let the signals repeat for so many ``samples`` from each of the ``moments`` on."""
+    for at in moments:
+        for name in names:
+            rows[name][at : at + samples] = rows[name][at]
+
+
+def _beyond(estimates, force):
+    return np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0)
+
+
+@pytest.mark.parametrize("names", [("angle",), ("angle", "speed")])
+@pytest.mark.parametrize("samples", [2, 3, 5, 12, 30])
+def test_an_angle_that_catches_up_has_lost_nothing(p, driven, names, samples):
+    rows, force, turning = driven
+    healthy = estimate(rows.copy(), p)
+    moments = turning[:: len(turning) // 15]
+    _repeat(rows, names, samples, moments)
+    estimates = estimate(rows, p)
+    assert abs(estimates["contact_angle"][-1] - healthy["contact_angle"][-1]) < 0.1
+    again = np.ones(len(rows), bool)
+    for at in moments:
+        again[at : at + samples + 25] = False
+    assert np.mean(_beyond(estimates, force)[again]) < 0.001
+
+
+@pytest.mark.parametrize("samples", [5, 12, 30])
+def test_an_angle_that_goes_on_from_where_it_stopped_takes_the_contact_angle_with_it(p, driven, samples):
+    rows, force, turning = driven
+    healthy = estimate(rows.copy(), p)
+    at = turning[len(turning) // 2]
+    lost = rows["angle"][at + samples] - rows["angle"][at]
+    rows["angle"][at : at + samples] = rows["angle"][at]
+    rows["angle"][at + samples :] -= lost
+    estimates = estimate(rows, p)
+    assert abs(estimates["contact_angle"][-1] - healthy["contact_angle"][-1] + lost) < 0.5
+    assert np.mean(_beyond(estimates, force)[at + samples + 25 :]) < 0.01
