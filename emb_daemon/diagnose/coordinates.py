@@ -95,7 +95,7 @@ _BASE = (
 #: what they are, datasheets grant 15 %. Friction: greased screws have a coefficient of 0.05 to 0.2, about 0.1, and grease in
 #: the frost drags several times as much. Pads: 0.2 faded, 0.5 new, about 0.35. Disc: it may lose a tenth of its mass, and iron
 #: takes up a tenth more per 100 K.
-TOLERATED = {
+TOLERATED: dict[str, float] = {
     TORQUE_CONSTANT: 1.1,
     INERTIA: 1.15,
     LOAD_FRICTION: 2.0,

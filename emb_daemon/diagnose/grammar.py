@@ -458,10 +458,12 @@ def _lengths_fitted(
     selection: Selection, channel: str, fitted: Sequence[tuple[Prospect, Selection]], weights: np.ndarray
 ) -> np.ndarray:
     """Description length of what is left of left-out episodes, ``weights`` (k, episodes), once each is fitted, (fitted, k);
-    ``selection``: without any of them. What is too little to matter is nothing."""
+    ``selection``: without any of them. What is too little to matter is nothing; not of heat, where what leaves least is taken.
+    """
     model, samples = selection.model, LASTING[channel]
-    noise = noise_left(model, channel, samples)
-    matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
+    noise, matters = noise_left(model, channel, samples), NOTHING
+    if channel != CHANNEL_OF_HEAT:
+        matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     alone, *left = (m.left_out(channel, samples=samples) for m in (model, *(found.model for _, found in fitted)))
     share = np.maximum(np.array(left) @ weights.T - noise, matters) / np.maximum(weights @ alone - noise, matters)
     return _lengths([prospect for prospect, _ in fitted], share, len(alone))
