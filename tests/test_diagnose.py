@@ -1018,23 +1018,29 @@ def test_resampled_episodes_choose_the_shorter_description(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("left", "numbers", "first"), [((30.0, 10.0), (2, 3), 1), ((1.5, 0.5), (2, 3), 0), ((30.0, 30.0), (3, 2), 1)]
+    ("channel", "left", "numbers", "first"),
+    [
+        ("torque", (30.0, 10.0), (2, 3), 1),
+        ("torque", (1.5, 0.5), (2, 3), 0),
+        ("torque", (30.0, 30.0), (3, 2), 1),
+        ("temperature", (1.5, 0.5), (2, 3), 1),
+    ],
 )
-def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_is_nothing(left, numbers, first):
-    """By left-out episodes: a rest of 4 (N², of each of 40) does not matter here."""
+def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_is_nothing(channel, left, numbers, first):
+    """By left-out episodes: a rest of 4 (N², of each of 40) does not matter here; of heat the least is taken."""
 
     def fitted(each):
         return SimpleNamespace(
-            left_out=lambda *_, **__: np.full(40, each), counted=lambda _: 40, residual={"torque": np.ones(40)},
+            left_out=lambda *_, **__: np.full(40, each), counted=lambda _: 40, residual={channel: np.ones(40)},
             bench=SimpleNamespace(episodes=40),
         )  # fmt: skip
 
     bare = SimpleNamespace(model=fitted(100.0), screening=SimpleNamespace(floor=lambda *_, **__: 2.0))
     pairs = [
-        (_prospect("torque", ("motor_speed",), count, 1.0), SimpleNamespace(model=fitted(each)))
+        (_prospect("port", ("motor_speed",), count, 1.0), SimpleNamespace(model=fitted(each)))
         for each, count in zip(left, numbers, strict=True)
     ]
-    assert np.argmin(grammar._lengths_fitted(bare, "torque", pairs, np.ones((1, 40)))) == first
+    assert np.argmin(grammar._lengths_fitted(bare, channel, pairs, np.ones((1, 40)))) == first
 
 
 def test_a_gate_and_a_second_signal_lengthen_every_description(coupled):
