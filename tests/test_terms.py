@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import runpy
 import subprocess
 import sys
 
@@ -17,6 +18,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.cli.main import main
+from emb_daemon.diagnose import export
 from emb_daemon.effects import terms
 from emb_daemon.errors import InputErrors, InvalidValue
 from emb_daemon.estimator.records import SAMPLE, new_state
@@ -419,6 +421,17 @@ def test_an_exported_effect_is_the_term(term, calibration, tmp_path):
     without, expected = (np.stack([trace[name] for name in ("force", "torque", "leverage")]) for trace in traces)
     assert any(np.nanmax(np.abs(rows)) > 1e-9 for rows in found - without)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_what_a_calibration_says_of_a_term_is_text_in_its_effect_file(calibration, tmp_path):
+    """A calibration is data, whoever wrote it: what it says of a term's origin must not become code."""
+    said = 'in a"b.log\\", signal=print("executed"),\n#'
+    term = msgspec.structs.replace(constant("torque", 0.01), name='term:x", hook="no', provenance=said)
+    text = export.source(term, calibration.stiffness.maximum_force_N, "")
+    (tmp_path / "found.py").write_text(text)
+    effect = runpy.run_path(str(tmp_path / "found.py"))["EFFECT"]
+    assert effect.source == f"found by diagnose, {said}" and effect.name == 'x", hook="no'
+    assert effect.hook == "torque"
 
 
 def test_a_term_that_is_not_there_is_told_by_those_that_are(calibration, tmp_path, capsys):

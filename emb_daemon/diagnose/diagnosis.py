@@ -17,7 +17,7 @@ from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, harm, validation_gains
-from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key
+from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
@@ -45,7 +45,9 @@ _MOVED = 2.0
 
 @dataclass(frozen=True)
 class Recalibrated:
-    """A base parameter that was estimated anew; ``gain`` is the RMS that it takes away on left-out episodes."""
+    """A base parameter that was estimated anew; ``gain`` is the RMS that it takes away on left-out episodes.
+
+    ``tolerated``: the factor by which units, wear and temperature change it at most, if that is known."""
 
     before: float
     value: float
@@ -53,6 +55,15 @@ class Recalibrated:
     unit: str
     gain: float
     channel: str
+    tolerated: float = np.inf
+
+    @property
+    def is_tolerance(self) -> bool:
+        """Whether it may have changed by so much, or by what its standard deviation leaves possible."""
+        if not np.isfinite(self.tolerated):
+            return True
+        low, high = sorted((self.before / self.tolerated, self.before * self.tolerated))
+        return low - _MOVED * self.sigma <= self.value <= high + _MOVED * self.sigma
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,7 @@ class Diagnosis:
         validated: RMS by which each finding lowers its channel's residual on the validation logs.
         judged_residual: (before, after) RMS of each channel's residual on the validation logs.
         left: what is left, by channel; ``left_before``: dependences before anything was accepted.
+        withdrawn: names of what the fit logs prove and confirmation took out again.
     """
 
     original: Calibration
@@ -88,6 +100,7 @@ class Diagnosis:
     judged_residual: Mapping[str, tuple[float, float]]
     left: Mapping[str, Left]
     left_before: Mapping[str, list[Dependence]]
+    withdrawn: tuple[str, ...]
     seconds: float
 
     @property
@@ -153,9 +166,9 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     """The same of logs that are cut into episodes already; ``judges``: the validation logs."""
     begin, calibration = time.monotonic(), bench.calibration
     judged_on = "validate" if judges else "left_out_episodes"
-    selection = select(bench, progress)
+    chosen = select(bench, progress)
     progress("confirming with the running estimator", 0.8)
-    selection, left_out = confirm(selection, judges)
+    selection, left_out = confirm(chosen, judges)
     applied = selection.applied()
     found = with_terms(selection.model.bench.calibrated(applied), selection) if applied else calibration
     augmented = _with_lasting(_with_noise(found, selection) if applied else found, selection)
@@ -185,8 +198,9 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
         judged_residual={c: (rms_known(judged_before[c]), rms_known(final[c])) for c in judging.channels} if judges else {},
-        left=_left(selection, judged_before, final, judging, augmented),
+        left=_left(selection, chosen, judged_before, final, judging, augmented),
         left_before=selection.at_first,
+        withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
         seconds=time.monotonic() - begin,
     )
     progress("done", 1.0)
@@ -313,7 +327,9 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             if abs(value - before) < _MOVED * sigma and gain < selection.screening.floor(model, c.channel):
                 continue
             key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
-            result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel)
+            # What a supplier or nobody has stated may be off by anything.
+            tolerated = TOLERATED.get(c.name, np.inf) if before and calibration.provenance else np.inf
+            result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel, tolerated)
     return result
 
 
@@ -322,12 +338,15 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
 
 def _left(
     selection: Selection,
+    chosen: Selection,
     before: Mapping[str, np.ndarray],
     after: Mapping[str, np.ndarray],
     judging: Bench,
     augmented: Calibration,
 ) -> dict[str, Left]:
-    """What is left in each channel: its size where the error is judged, its dependences where effects were looked for."""
+    """What is left in each channel: its size where the error is judged, its dependences where effects were looked for.
+
+    ``chosen``: the selection before confirmation, which may have taken out what these logs prove."""
     model, screening, result = selection.model, selection.screening, {}
     force = np.concatenate([np.nan_to_num(trial.force_N) for trial in judging.trials])
     if not judging.has_reference:
@@ -353,9 +372,27 @@ def _left(
             first, last = (rms_known(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
             known = screening.achieved(model, channel, force, np.zeros(0), samples)
             found = _heat_dependences(selection, augmented) if is_beyond(last, known) else []
+        withdrawn = _withdrawn(selection, chosen, channel)
+        found = [*withdrawn, *(d for d in found if d.signal not in {w.signal for w in withdrawn})]
+        found.sort(key=lambda dependence: -dependence.share)
         share = (last / first) ** 2 if first > 0.0 else 0.0
         result[channel] = Left(channel, last, known, share, tuple(found))
     return result
+
+
+def _withdrawn(selection: Selection, chosen: Selection, channel: str) -> list[Dependence]:
+    """What lasts of a channel's residual and effects or terms explained that confirmation took out again, by their signals, if
+    that matters and nothing else explains it now.
+
+    What these logs prove, and is not true of others, or harms the estimator, is no such effect; but something is there."""
+    gone = [chosen.candidates[name] for name in chosen.accepted if name not in selection.accepted]
+    signals = list(dict.fromkeys(c.effect.signal for c in gone if c.channel == channel))
+    if not signals:
+        return []
+    without, with_ = (s.model.left_out(channel, samples=LASTING[channel]) for s in (selection, chosen))
+    floor = selection.screening.floor(selection.model, channel, made=True)
+    found = dependences(channel, dict.fromkeys(signals, (without, with_)), selection.model.counted(channel), floor)
+    return [replace(d, matters=True) for d in found if d.rms >= floor]
 
 
 def _heat_dependences(selection: Selection, augmented: Calibration) -> list[Dependence]:

@@ -1,5 +1,7 @@
 """A found term as an effect file, in the form that a person would have written (docs: adding an effect)."""
 
+import json
+
 import numpy as np
 
 from emb_daemon.calibration.terms import Term
@@ -154,18 +156,23 @@ def _declaration(term: Term, equation: str) -> list[str]:
     """The kernel's `Effect`."""
     return [
         "EFFECT = Effect(",
-        f'    name="{effect_name(term)}",',
+        f"    name={_literal(effect_name(term))},",
         f'    hook="{term.port}",',
         "    term=term,",
         "    parameters=(",
         *(f"        {line}" for line in _parameters(term)),
         "    ),",
         f'    equation="{equation}",',
-        f'    source="found by diagnose, {term.provenance or "no log named"}",',
+        f"    source={_literal('found by diagnose, ' + (term.provenance or 'no log named'))},",
         *([] if term.memory == "none" else ["    state=STATE,"]),
         f'    signal="{term.signal}",',
         ")",
     ]
+
+
+def _literal(text: str) -> str:
+    """Text of a calibration as a literal of the effect file: whatever it says, it remains text."""
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _sizes(term: Term) -> list[str]:

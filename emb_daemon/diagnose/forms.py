@@ -121,11 +121,8 @@ class Form:
 
     @property
     def numbers(self) -> int:
-        """How many numbers it takes to state it: coefficients, sizes, one for a gate, two for a second signal, which is one of
-        many, and where a count began: no brake's physics starts at zero with the power."""
-        counted = self.signal in ("energy", "time_since_last_clamp")
-        gated = (self.gate != "always") + 2 * (self.other is not None)
-        return 1 + (self.shape == "harmonic") + len(self.fitted) + gated + counted
+        """How many numbers it takes to state it: coefficients, sizes, and those beside them."""
+        return 1 + (self.shape == "harmonic") + len(self.fitted) + further_numbers(self)
 
     @property
     def step(self) -> float:
@@ -159,6 +156,13 @@ class Form:
         if self.shape == "harmonic" and size == "scale":
             return 0.8 * tried, 1.25 * tried, 0.02 * tried
         return tried / _WIDER, tried * _WIDER, _SHAPE * tried
+
+
+def further_numbers(of: Form | Term) -> int:
+    """How many numbers it takes to state a form or a term beside coefficients and sizes: one for a gate, two for a second
+    signal, which is one of many, and where a count began: no brake's physics starts at zero with the power."""
+    counted = of.signal in ("energy", "time_since_last_clamp")
+    return (of.gate != "always") + 2 * (of.other is not None) + counted
 
 
 def enumerate_forms(covered: Mapping[str, tuple[float, float]], ports: tuple[str, ...]) -> list[Form]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
-from emb_daemon.diagnose.forms import Form, made_effect, places
+from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import LITTLE, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
@@ -207,6 +207,7 @@ def _description(selection: Selection, channel: str) -> float:
     left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
     matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
+    numbers += sum(further_numbers(term) for term in model.bench.calibration.terms if term.name in _made(selection, channel))
     named = len(_causes(selection, channel)) * np.log(places(port for port in PORTS if _acts_on(model, port, channel)))
     return description_length(max(left, matters), numbers, model.bench.episodes) + named
 
@@ -263,9 +264,14 @@ def _one_more(selection: Selection, channel: str) -> Selection:
             break
     if not fitted:
         return refused
-    prospect, found = min(fitted, key=lambda one: _description(one[1], channel) if straight else one[1].model.noise(channel))
+    if straight:
+        # By what the bootstraps go by as well: they must not be asked for the port of what they never choose.
+        first = int(np.argmin(_lengths_fitted(selection, channel, fitted, np.ones((1, model.bench.episodes)))))
+    else:
+        first = int(np.argmin([one.model.noise(channel) for _, one in fitted]))
+    prospect, found = fitted[first]
     if len(fitted) > 1:
-        shares = _shares_fitted(model, channel, fitted)
+        shares = _shares_fitted(selection, channel, fitted)
     at_port = sum(share for (port, _), share in shares.items() if port == prospect.form.port)
     sure = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[prospect.means]:.0f} %"
     candidate = found.candidates[_name(prospect.form, selection)]
@@ -437,17 +443,30 @@ def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, st
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
     alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, weights.shape[1])
     alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
-    return _chosen(prospects, 1.0 - gains / np.maximum(alone, NOTHING), weights.shape[1])
+    return _chosen(prospects, _lengths(prospects, 1.0 - gains / np.maximum(alone, NOTHING), weights.shape[1]))
 
 
-def _shares_fitted(model: Model, channel: str, fitted: Sequence[tuple[Prospect, Selection]]) -> dict[tuple[str, str], float]:
-    """The same by what is left of left-out episodes once each is fitted; ``model``: without any of them."""
-    samples = LASTING[channel]
-    noise = noise_left(model, channel, samples)
+def _shares_fitted(
+    selection: Selection, channel: str, fitted: Sequence[tuple[Prospect, Selection]]
+) -> dict[tuple[str, str], float]:
+    """The same by what is left of left-out episodes once each is fitted; ``selection``: without any of them."""
+    lengths = _lengths_fitted(selection, channel, fitted, _resampled(selection.model.bench.episodes))
+    return _chosen([prospect for prospect, _ in fitted], lengths)
+
+
+def _lengths_fitted(
+    selection: Selection, channel: str, fitted: Sequence[tuple[Prospect, Selection]], weights: np.ndarray
+) -> np.ndarray:
+    """Description length of what is left of left-out episodes, ``weights`` (k, episodes), once each is fitted, (fitted, k);
+    ``selection``: without any of them. What is too little to matter is nothing; not of heat, where what leaves least is taken.
+    """
+    model, samples = selection.model, LASTING[channel]
+    noise, matters = noise_left(model, channel, samples), NOTHING
+    if channel != CHANNEL_OF_HEAT:
+        matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     alone, *left = (m.left_out(channel, samples=samples) for m in (model, *(found.model for _, found in fitted)))
-    weights = _resampled(len(alone))
-    share = (np.array(left) @ weights.T - noise) / np.maximum(weights @ alone - noise, NOTHING)
-    return _chosen([prospect for prospect, _ in fitted], share, len(alone))
+    share = np.maximum(np.array(left) @ weights.T - noise, matters) / np.maximum(weights @ alone - noise, matters)
+    return _lengths([prospect for prospect, _ in fitted], share, len(alone))
 
 
 def _resampled(episodes: int) -> np.ndarray:
@@ -455,11 +474,15 @@ def _resampled(episodes: int) -> np.ndarray:
     return np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1.0 / episodes), _BOOTSTRAPS)
 
 
-def _chosen(prospects: Sequence[Prospect], left: np.ndarray, episodes: int) -> dict[tuple[str, str], float]:
-    """Share of bootstraps in which each port and signal has the shortest description; ``left``: share of the squared error, of
-    each prospect in each bootstrap."""
+def _lengths(prospects: Sequence[Prospect], left: np.ndarray, episodes: int) -> np.ndarray:
+    """Description length with each prospect; ``left``: share of the squared error, of each in each bootstrap."""
     numbers = np.array([prospect.form.numbers for prospect in prospects])
-    chosen = np.argmin(description_length(np.maximum(left, 1e-3), numbers[:, None], episodes), axis=0)
+    return description_length(np.maximum(left, 1e-3), numbers[:, None], episodes)
+
+
+def _chosen(prospects: Sequence[Prospect], lengths: np.ndarray) -> dict[tuple[str, str], float]:
+    """Share of bootstraps in which each port and signal has the shortest description."""
+    chosen = np.argmin(lengths, axis=0)
     shares = dict.fromkeys((prospect.means for prospect in prospects), 0.0)
     for index, count in zip(*np.unique(chosen, return_counts=True), strict=True):
         shares[prospects[index].means] += count / _BOOTSTRAPS

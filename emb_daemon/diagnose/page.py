@@ -142,18 +142,19 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
         "Residual with the contact angle held. No effect of the catalogue explains what is marked; none was invented.",
     )
     for channel, left in diagnosis.left.items():
-        keep = diagnosis.residual[channel] != 0.0
-        if not left.dependences or keep.sum() < _FEWEST:
+        if not left.dependences:
             continue
-        strongest = left.dependences[0].signal
-        signal = diagnosis.signals[strongest]
-        before = _bin(signal[keep], diagnosis.initial[channel][keep])
-        after = _bin(signal[keep], diagnosis.residual[channel][keep])
-        traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
-        section.figure(
-            xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),
-            f"Strongest dependence of the {NAMES[channel]} residual after the diagnosis.",
-        )
+        # Temperatures have times of their own, and signals that only the estimator has no column here.
+        strongest, keep = left.dependences[0].signal, diagnosis.residual[channel] != 0.0
+        signal = diagnosis.signals.get(strongest)
+        if channel in FORCE_CHANNELS and signal is not None and keep.sum() >= _FEWEST:
+            before = _bin(signal[keep], diagnosis.initial[channel][keep])
+            after = _bin(signal[keep], diagnosis.residual[channel][keep])
+            traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
+            section.figure(
+                xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),
+                f"Strongest dependence of the {NAMES[channel]} residual after the diagnosis.",
+            )
         earlier = {d.signal: f"{d.share:.3f}" for d in diagnosis.left_before.get(channel, [])}
         section.table(
             ["signal", "share before", "share after", "mean gain / its error"],
@@ -180,12 +181,15 @@ def _candidates(report: Page, diagnosis: Diagnosis) -> None:
 
 def _recalibration(report: Page, diagnosis: Diagnosis) -> None:
     rows = [
-        [key, f"{r.before:.4g}", number(r.value, r.sigma), r.unit, f"{r.gain:.3g} {UNITS[r.channel]}"]
+        [
+            key, f"{r.before:.4g}", number(r.value, r.sigma), r.unit, f"{r.gain:.3g} {UNITS[r.channel]}",
+            "" if r.is_tolerance else f"no tolerance: more than a factor of {r.tolerated:.3g}",
+        ]
         for key, r in diagnosis.recalibrated.items()
-    ]
+    ]  # fmt: skip
     if rows:
         report.section(
             "Recalibrated",
             "Base parameters that were estimated anew together with the effects: a calibration that is off is no effect. The "
             "curve's coefficients stand for those of all pad thicknesses, which follow in proportion, and gain together.",
-        ).table(["parameter", "before", "after", "unit", "gain"], rows)
+        ).table(["parameter", "before", "after", "unit", "gain", ""], rows)

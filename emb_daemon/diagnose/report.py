@@ -75,7 +75,7 @@ def _left(left: Left) -> dict:
 
 def _recalibrated(found: Recalibrated) -> dict:
     entry = {"before": found.before, "value": found.value, "sigma": found.sigma, "unit": found.unit}
-    return entry | _gain(found.gain, found.channel)
+    return entry | {"tolerance": found.is_tolerance} | _gain(found.gain, found.channel)
 
 
 def _gain(gain: float, channel: str | None) -> dict:

@@ -95,7 +95,9 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    return " ".join([text, *_recalibration(diagnosis), *_unexplained(diagnosis), *_stated(diagnosis)])
+    return " ".join(
+        [text, *_recalibration(diagnosis), *_no_tolerance(diagnosis), *_unexplained(diagnosis), *_stated(diagnosis)]
+    )
 
 
 def _recalibration(diagnosis: Diagnosis) -> list[str]:
@@ -119,6 +121,17 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
     return [f"Recalibrated: {', '.join(told)}.", *(turned if none else [])]
 
 
+def _no_tolerance(diagnosis: Diagnosis) -> list[str]:
+    """Base parameters that moved by more than such parameters change."""
+    found = []
+    for key, r in diagnosis.recalibrated.items():
+        if not r.is_tolerance:
+            change = f"{in_words(key)} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}".strip()
+            found.append(f"{change}, where units, wear and temperature make a factor of {r.tolerated:.3g} at most")
+    like = "another part, a signal in a wrong scale, or an effect that these logs cannot tell from it looks like that"
+    return [f"No tolerance: {'; '.join(found)}: {like}."] if found else []
+
+
 def _unexplained(diagnosis: Diagnosis) -> list[str]:
     left = diagnosis.unexplained
     if left is None:
@@ -131,9 +144,15 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     if strongest is None:
-        return [f"{text}, which depend on no signal that was recorded."]
+        return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
-    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}."]
+    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *_withdrawn(diagnosis, left.channel)]
+
+
+def _withdrawn(diagnosis: Diagnosis, channel: str) -> list[str]:
+    """What these logs prove on a channel of which something is left, and why it is not applied."""
+    gone = [f for f in diagnosis.findings if f.effect.name in diagnosis.withdrawn and f.channel == channel]
+    return [f"Proven on these logs but not applied: {title(f)} ({f.reason})." for f in gone]
 
 
 def _stated(diagnosis: Diagnosis) -> list[str]:
