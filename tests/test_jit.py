@@ -52,14 +52,45 @@ def _twice_if(asked, value):
 
 def test_constants_share_one_compiled_version():
     """A second of compiling for each of them would be wasted."""
+    called = _twice_if._numba_type_.dispatcher
     for constant in (True, False):
-        _twice_if.get_call_template([types.literal(constant), types.float64], {})
-    assert _twice_if.signatures == [(types.boolean, types.float64)]
+        called.get_call_template([types.literal(constant), types.float64], {})
+    assert called.signatures == [(types.boolean, types.float64)]
 
 
-def _call(**variables) -> subprocess.CompletedProcess:
+@njit
+def _half(value):
+    return value / 2.0
+
+
+@njit
+def _quarter(value):
+    return _half(_half(value))
+
+
+def test_what_only_kernels_call_is_not_made_callable_from_python():
+    """A fifth of a cold start would be spent on it."""
+    assert _quarter(4.0) == 1.0
+    assert _quarter.signatures == [(types.float64,)] and not _half.signatures
+    assert _half(4.0) == 2.0
+
+
+def _call(code: str = _CALL, **variables) -> subprocess.CompletedProcess:
     environment = os.environ | {"PYTHONPATH": str(_PACKAGE.parent)} | variables
-    return subprocess.run([sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+
+
+def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
+    """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
+    code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"
+    for call, result in (
+        ("hypot(3.0, 4.0)", "5.0 True"),
+        ("sq(3.0)", "9.0 True"),
+        ("sq(3.0)", "9.0 False"),
+        ("hypot(3.0, 4.0)", "5.0 False"),
+    ):
+        done = _call(code.format(call), NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        assert done.stdout == result + "\n", done.stderr
 
 
 def test_compiled_code_goes_where_it_is_told(tmp_path):
