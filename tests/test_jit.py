@@ -1,11 +1,9 @@
 """Where compiled code is kept: apart for each state of the sources, and never a reason not to start."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
+import processkit
 import pytest
 from numba import types
 
@@ -75,11 +73,6 @@ def test_what_only_kernels_call_is_not_made_callable_from_python():
     assert _half(4.0) == 2.0
 
 
-def _call(code: str = _CALL, **variables) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(_PACKAGE.parent)} | variables
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-
-
 def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
     """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
     code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"
@@ -89,12 +82,12 @@ def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
         ("sq(3.0)", "9.0 False"),
         ("hypot(3.0, 4.0)", "5.0 False"),
     ):
-        done = _call(code.format(call), NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        done = processkit.python("-c", code.format(call), NUMBA_CACHE_DIR=str(tmp_path / "cache"))
         assert done.stdout == result + "\n", done.stderr
 
 
 def test_compiled_code_goes_where_it_is_told(tmp_path):
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0 and not done.stderr
     assert Path(done.stdout.strip()).parent == tmp_path / "cache"
     assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was kept"
@@ -103,19 +96,19 @@ def test_compiled_code_goes_where_it_is_told(tmp_path):
 @pytest.mark.parametrize("below", [True, False])
 def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, below):
     """What is found there is executed."""
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     folder = Path(done.stdout.strip())
     (folder if below else folder.parent).chmod(0o777)
     for file in folder.rglob("*.nb?"):
         file.write_bytes(b"not what was compiled")
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0 and "is writable by anybody" in done.stderr
     assert Path(done.stdout.strip()) != folder
 
 
 def test_an_unwritable_folder_is_told_of_once_and_does_without(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "file"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "file"))
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert str(tmp_path / "file") in done.stderr and "NUMBA_CACHE_DIR" in done.stderr
