@@ -4,10 +4,9 @@ import collections
 import contextlib
 import fcntl
 import os
-import subprocess
-import sys
 from pathlib import Path
 
+import processkit
 import pytest
 from hypothesis import settings
 
@@ -55,9 +54,7 @@ def compiled() -> Path:
     with open(folder / "lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not other.exists():
-            command = [sys.executable, "-c", _COMPILE, library, other]
-            environment = os.environ | {"PYTHONPATH": str(_ROOT)}
-            done = subprocess.run(command, capture_output=True, text=True, env=environment)
+            done = processkit.python("-c", _COMPILE, library, other)
             assert done.returncode == 0, done.stderr
     return folder
 

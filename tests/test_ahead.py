@@ -6,13 +6,13 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import adaptkit
 import aheadkit
 import numpy as np
+import processkit
 import pytest
 
 from emb_daemon.ahead import library
@@ -28,10 +28,6 @@ from emb_daemon.runtime import bus, daemon
 
 _LIBM = {"exp", "log", "pow", "sin", "sincos"}
 _LIBC = {"memcpy", "memmove", "memset"}
-
-
-def _environment(**variables) -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(aheadkit.ROOT), str(aheadkit.ROOT / "tests")])} | variables
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +48,8 @@ def frames(tmp_path_factory):
 def test_every_byte_is_as_from_numba(compiled, frames, tmp_path):
     log = tmp_path / "drive.log"
     write_frames(log, frames)
-    command = [sys.executable, aheadkit.__file__, log, tmp_path / "ahead", tmp_path / "ahead.npz"]
-    environment = _environment(EMB_DAEMON_KERNELS=str(compiled / "kernels.so"))
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    arguments = [aheadkit.__file__, log, tmp_path / "ahead", tmp_path / "ahead.npz"]
+    done = processkit.python(*arguments, EMB_DAEMON_KERNELS=str(compiled / "kernels.so"))
     assert done.returncode == 0, done.stderr
     print(done.stdout)
     expected, found = aheadkit.answered(read_frames(log), tmp_path / "numba"), np.load(tmp_path / "ahead.npz")
@@ -82,10 +77,9 @@ def test_nothing_is_needed_beyond_libc_and_libm(compiled):
 
 def test_the_daemon_says_which_code_it_runs(compiled, tmp_path):
     """Up to the point at which it finds no such interface."""
-    config = aheadkit.ROOT / "config" / "emb.yaml"
-    command = [sys.executable, "-m", "emb_daemon.cli.main", "run", "--config", config, "-i", "socketcan", "-c", "none0"]
-    path = compiled / "kernels.so"
-    done = subprocess.run(command, capture_output=True, text=True, env=_environment(EMB_DAEMON_KERNELS=str(path)))
+    config, path = aheadkit.ROOT / "config" / "emb.yaml", compiled / "kernels.so"
+    arguments = ["run", "--config", config, "-i", "socketcan", "-c", "none0"]
+    done = processkit.command(*arguments, EMB_DAEMON_KERNELS=str(path))
     assert done.returncode == 1 and f"kernels of {path}, compiled ahead" in done.stderr + done.stdout
 
 
@@ -158,7 +152,7 @@ def test_one_of_somebody_else_is_refused(tmp_path, monkeypatch):
 def _load(code: str = "", **variables) -> subprocess.CompletedProcess:
     """`library.load` in a process of its own."""
     code = f"import sys\n{code}\nfrom emb_daemon.ahead import library\nprint(library.load(), library.in_use())"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=_environment(**variables))
+    return processkit.python("-c", code, **variables)
 
 
 def test_what_is_refused_is_told_and_numba_is_used(tmp_path):
@@ -189,9 +183,7 @@ def test_without_library_and_numba_nothing_starts(tmp_path):
 
 def _without_numba(*arguments) -> subprocess.CompletedProcess:
     code = f"import sys; sys.modules['numba'] = None; from emb_daemon.cli.main import main; sys.exit(main({list(arguments)}))"
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=_environment(EMB_DAEMON_KERNELS="")
-    )
+    return processkit.python("-c", code, EMB_DAEMON_KERNELS="")
 
 
 def test_on_a_box_without_numba_files_are_checked_and_what_needs_it_says_so():
@@ -226,8 +218,7 @@ def test_without_a_linker_it_says_what_has_one(monkeypatch):
 
 
 def test_an_unknown_machine_is_wrong_usage():
-    command = [sys.executable, "-m", "emb_daemon.cli.main", "compile", "--target", "riscv64"]
-    done = subprocess.run(command, capture_output=True, text=True, env=_environment())
+    done = processkit.command("compile", "--target", "riscv64")
     assert (done.returncode, done.stderr) == (2, "--target riscv64: expected x86_64 or aarch64\n")
 
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import processkit
 import pytest
 
 from emb_daemon.atomic import write_atomically
@@ -26,10 +27,10 @@ def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new(tmp_path):
     """Fifty writers, each killed at a random moment of its writing."""
     path = tmp_path / "state.json"
     rng = np.random.default_rng(11)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
     seen = set()
     for _ in range(50):
-        writer = subprocess.Popen([sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE, env=environment)
+        command = [sys.executable, "-c", _WRITER, path]
+        writer = subprocess.Popen(command, stdout=subprocess.PIPE, env=processkit.environment())
         writer.stdout.readline()
         try:
             writer.wait(rng.uniform(0.0, 0.02))

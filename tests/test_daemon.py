@@ -4,13 +4,12 @@ import itertools
 import os
 import shutil
 import socket
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
 import numpy as np
+import processkit
 import pytest
 
 from emb_daemon.adapt import files
@@ -291,5 +290,5 @@ def test_nothing_is_compiled_once_the_loop_runs(setup: Setup, drive, tmp_path: P
     np.save(tmp_path / "frames.npy", np.concatenate(drive))
     arguments = [setup.path, tmp_path / "frames.npy", tmp_path / "state"]
     (tmp_path / "state").mkdir()
-    done = subprocess.run([sys.executable, "-c", _COMPILES_NOTHING, *arguments], capture_output=True, text=True)
+    done = processkit.python("-c", _COMPILES_NOTHING, *arguments)
     assert done.returncode == 0, done.stderr

@@ -1,10 +1,9 @@
 """The documentation is current, its links lead somewhere, and it builds."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import processkit
 import pytest
 from browserkit import said_at
 
@@ -43,15 +42,8 @@ def _prose(path: Path) -> str:
 @pytest.mark.parametrize("script", ["generate.py", "completion.py"])
 def test_what_is_generated_is_current(script):
     """Otherwise: python docs/generate.py; python docs/completion.py."""
-    command = [sys.executable, str(_ROOT / "docs" / script), "--check"]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=_ROOT, env=_environment())
+    result = processkit.python(_ROOT / "docs" / script, "--check")
     assert result.returncode == 0, result.stderr or f"docs/{script} has to be run again"
-
-
-def _environment():
-    import os
-
-    return os.environ | {"PYTHONPATH": str(_ROOT)}
 
 
 @pytest.mark.parametrize("page", _PAGES, ids=lambda page: page.name)
@@ -106,8 +98,8 @@ def test_commands_in_the_documentation_exist():
 
 def test_the_site_builds(tmp_path):
     pytest.importorskip("mkdocs", reason="NOT RUN: the docs extra is not installed")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=_ROOT)
+    arguments = ["build", "--strict", "--quiet", "--config-file", _ROOT / "mkdocs.yml", "--site-dir", tmp_path / "site"]
+    result = processkit.python("-m", "mkdocs", *arguments)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "site" / "calibration.html").is_file()
     found = said_at(tmp_path / "site" / "page.html", (tmp_path / "site" / "index.html").read_text(encoding="utf-8"), _SEARCH)

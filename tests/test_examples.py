@@ -1,12 +1,10 @@
 """The Python interface gives the daemon's numbers, and the examples run as they are printed in the documentation."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+import processkit
 import pyarrow.parquet
 import pytest
 import wirekit
@@ -22,16 +20,10 @@ _EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def _run(name: str, *arguments, **environment: str) -> str:
-    command = [sys.executable, str(_EXAMPLES / name), *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=_EXAMPLES.parent,
-                            env=_environment() | environment)  # fmt: skip
+    result = processkit.python(_EXAMPLES / name, *map(str, arguments), MPLBACKEND="agg", **environment)
     assert result.returncode == 0, result.stderr
     assert "Warning" not in result.stderr
     return result.stdout
-
-
-def _environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(_EXAMPLES.parent), "MPLBACKEND": "agg"}
 
 
 def test_running_a_log_is_replaying_it(rig):
@@ -127,7 +119,7 @@ def test_reset_forgets_everything():
 
 def test_importing_the_package_imports_nothing_heavy():
     code = "import sys, emb_daemon; print('numba' in sys.modules, 'numpy' in sys.modules, emb_daemon.__version__)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=_environment())
+    result = processkit.python("-c", code)
     assert result.stdout.split()[:2] == ["False", "False"]
 
 

@@ -1,14 +1,13 @@
 """The estimator for C and for simulators: every byte is replay's, and what does not fit is refused."""
 
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import adaptkit
 import msgspec
 import numpy as np
+import processkit
 import pytest
 
 from emb_daemon.ahead import library
@@ -369,9 +368,7 @@ def test_its_functions_are_those_that_fmi_declares(exported, fmpy, tmp_path):
 
 
 def test_the_example_closes_a_loop_around_the_fmu(exported, fmpy):
-    command = [sys.executable, adaptkit.ROOT / "examples" / "fmu_control_loop.py", exported / "brake.fmu"]
-    environment = os.environ | {"PYTHONPATH": str(adaptkit.ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = processkit.python(adaptkit.ROOT / "examples" / "fmu_control_loop.py", exported / "brake.fmu")
     assert done.returncode == 0, done.stderr
     own_N = float(done.stdout.rpartition("own force")[2].split()[0])
     assert abs(own_N - 8000.0) < 100.0

@@ -1,11 +1,9 @@
 """Where compiled code is kept: apart for each state of the sources, and never a reason not to start."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
+import processkit
 import pytest
 from numba import types
 
@@ -52,18 +50,44 @@ def _twice_if(asked, value):
 
 def test_constants_share_one_compiled_version():
     """A second of compiling for each of them would be wasted."""
+    called = _twice_if._numba_type_.dispatcher
     for constant in (True, False):
-        _twice_if.get_call_template([types.literal(constant), types.float64], {})
-    assert _twice_if.signatures == [(types.boolean, types.float64)]
+        called.get_call_template([types.literal(constant), types.float64], {})
+    assert called.signatures == [(types.boolean, types.float64)]
 
 
-def _call(**variables) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(_PACKAGE.parent)} | variables
-    return subprocess.run([sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True)
+@njit
+def _half(value):
+    return value / 2.0
+
+
+@njit
+def _quarter(value):
+    return _half(_half(value))
+
+
+def test_what_only_kernels_call_is_not_made_callable_from_python():
+    """A fifth of a cold start would be spent on it."""
+    assert _quarter(4.0) == 1.0
+    assert _quarter.signatures == [(types.float64,)] and not _half.signatures
+    assert _half(4.0) == 2.0
+
+
+def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
+    """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
+    code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"
+    for call, result in (
+        ("hypot(3.0, 4.0)", "5.0 True"),
+        ("sq(3.0)", "9.0 True"),
+        ("sq(3.0)", "9.0 False"),
+        ("hypot(3.0, 4.0)", "5.0 False"),
+    ):
+        done = processkit.python("-c", code.format(call), NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        assert done.stdout == result + "\n", done.stderr
 
 
 def test_compiled_code_goes_where_it_is_told(tmp_path):
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0 and not done.stderr
     assert Path(done.stdout.strip()).parent == tmp_path / "cache"
     assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was kept"
@@ -72,19 +96,19 @@ def test_compiled_code_goes_where_it_is_told(tmp_path):
 @pytest.mark.parametrize("below", [True, False])
 def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, below):
     """What is found there is executed."""
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     folder = Path(done.stdout.strip())
     (folder if below else folder.parent).chmod(0o777)
     for file in folder.rglob("*.nb?"):
         file.write_bytes(b"not what was compiled")
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0 and "is writable by anybody" in done.stderr
     assert Path(done.stdout.strip()) != folder
 
 
 def test_an_unwritable_folder_is_told_of_once_and_does_without(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
-    done = _call(NUMBA_CACHE_DIR=str(tmp_path / "file"))
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "file"))
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert str(tmp_path / "file") in done.stderr and "NUMBA_CACHE_DIR" in done.stderr

@@ -2,10 +2,8 @@
 
 import errno
 import importlib.util
-import os
-import subprocess
-import sys
 
+import processkit
 import pytest
 
 from emb_daemon.cli import check
@@ -72,8 +70,7 @@ def test_a_reader_that_has_gone_is_no_error(monkeypatch):
 def test_a_terminal_without_our_characters_is_no_reason_to_end():
     code = "from emb_daemon.cli import check, main; check.run = lambda _: print('3 ± 1 kN') or 0; "
     code += "raise SystemExit(main.main(['check', '--config', 'x']))"
-    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    done = processkit.python("-c", code, PYTHONIOENCODING="ascii:strict")
     assert (done.returncode, done.stdout, done.stderr) == (0, "3 ? 1 kN\n", "")
 
 

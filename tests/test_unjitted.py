@@ -1,11 +1,9 @@
 """The kernels as plain Python give the same: what numba compiles is what is written."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+import processkit
 import wirekit
 
 _ESTIMATES = """
@@ -16,13 +14,9 @@ np.save(sys.argv[3], estimate(samples, parameters[:1]))
 """
 
 
-def _run(*arguments: str) -> subprocess.CompletedProcess:
-    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(Path(__file__).parent.parent)}
-    return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True)
-
-
 def test_kernels_pass_without_compilation():
-    done = _run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(Path(__file__).parent / "test_kernels.py"))
+    arguments = ["-m", "pytest", "-q", "-p", "no:cacheprovider", Path(__file__).parent / "test_kernels.py"]
+    done = processkit.python(*arguments, NUMBA_DISABLE_JIT="1")
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout and "skipped" not in done.stdout
 
@@ -46,7 +40,8 @@ def test_estimates_are_equal_without_compilation(parameters, tmp_path):
     _, count = pipeline.consume(frames)
     for name, array in (("samples", pipeline.samples[:count]), ("parameters", parameters)):
         np.save(tmp_path / name, array)
-    done = _run("-c", _ESTIMATES, *(str(tmp_path / f"{name}.npy") for name in ("samples", "parameters", "estimates")))
+    files = [tmp_path / f"{name}.npy" for name in ("samples", "parameters", "estimates")]
+    done = processkit.python("-c", _ESTIMATES, *files, NUMBA_DISABLE_JIT="1")
     assert done.returncode == 0, done.stderr
     compiled, plain = estimate(pipeline.samples[:count], parameters[:1]), np.load(tmp_path / "estimates.npy")
     assert plain["force"][-1] > 5000.0

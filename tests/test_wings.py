@@ -1,11 +1,10 @@
 """Two wings: the box, which runs in the car, and the bench, which identifies, judges and reports; `cli` alone knows both."""
 
 import ast
-import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 
+import processkit
 import pytest
 
 import emb_daemon
@@ -79,7 +78,8 @@ def test_what_the_box_loads(modules):
     names = ", ".join(f"emb_daemon.{name.strip()}" for name in modules.split(","))
     # python-can imports asammdf where it finds it, and with it half of the others; the daemon forbids it likewise.
     code = f"import sys; sys.modules['asammdf'] = None; import {names}; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = processkit.python("-c", code)
+    assert done.returncode == 0, done.stderr
     loaded = set(done.stdout.split())
     parts = {name.split(".")[1] for name in loaded if name.startswith("emb_daemon.")}
     assert parts <= {*_BOX, "cli"}

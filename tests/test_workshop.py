@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import processkit
 import pytest
 import wirekit
 from hypothesis import given, settings
@@ -323,9 +324,8 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path):
     except Unavailable as error:
         pytest.skip(f"NOT RUN: no multicast here ({error})")
     command = [sys.executable, "-m", "emb_daemon.cli.main", "uds", "--config", _CONFIGURATION, "--state", tmp_path]
-    environment = os.environ | {"PYTHONPATH": str(_ROOT), "NUMBA_DISABLE_JIT": "1"}
     process = subprocess.Popen([*command, "-i", "udp_multicast", "-c", _GROUP], stdout=subprocess.PIPE, text=True,
-                               env=environment)  # fmt: skip
+                               env=processkit.environment(NUMBA_DISABLE_JIT="1"))  # fmt: skip
     try:
         assert "requests 0x710, responses 0x718" in process.stdout.readline()
         request = np.zeros(1, FRAME)

@@ -72,7 +72,8 @@ def _lower(entry: Entry) -> str:
     """LLVM assembly of an entry point with all that it calls, and of the wrapper that calls it with words in memory, under its
     name in C. It is the same for all targets."""
     wrapper, kinds = _wrapper(entry)
-    compiled = numba.njit(types.void(*kinds), nogil=True, error_model="numpy", no_cfunc_wrapper=True)(wrapper)
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    compiled = numba.njit(types.void(*kinds), **options)(wrapper)
     [overload] = compiled.overloads.values()
     kind_in_c = {types.int64: "i64", types.float64: "double"}
     loads, arguments = [], ["ptr %words"]
