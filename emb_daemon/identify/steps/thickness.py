@@ -77,7 +77,7 @@ def load_pads(campaign: Campaign) -> list[Pads]:
         )
     if not any(own.random for own in pads):
         campaign.fault(
-            "random: no usable log, so that relaxation keeps what is usual of brakes, and sigma holds what that may do in a "
+            "random: no usable log, so that the fast relaxation keeps what is usual of brakes, and sigma holds what that may do in a "
             f"hard clamp; needed: {NEED_RANDOM}"
         )
     return pads
