@@ -205,6 +205,20 @@ def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said
     assert said in capsys.readouterr().err
 
 
+def test_gaps_are_told_with_their_place_and_length(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    time_s = columns["time_s"]
+    for name in ("angle_rad", "current_A"):
+        columns[name] = np.where((time_s > 1.0) & (time_s < 1.5), np.nan, columns[name])
+    columns["current_A"][10:50] = np.nan
+    columns["force_N"][300:310] = np.nan
+    _read(tmp_path, columns)
+    said = capsys.readouterr().err
+    assert "MotorAngle: a gap of 0.5 s, 0.996 s after the first value" in said
+    assert "CurrentQ: 2 gaps, together 0.664 s, the longest of 0.5 s" in said
+    assert "ClampForceRef" not in said
+
+
 @pytest.mark.parametrize(
     ("late_s", "said"),
     [

@@ -14,6 +14,9 @@ from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
 #: Least mean of the current at one end of the travel, as a share of the largest, and as a multiple of that at the other end.
 _HOLDS, _MORE = 0.2, 2.0
+#: Least time without a value that is a gap, s: half a clamp; and in periods of the signal, since recorders of few values
+#: wait for the next.
+_GAP_S, _GAP_PERIODS = 0.1, 10.0
 #: Travel below which a motor stands, rad, and everything that correlates with its angle is noise.
 _TRAVEL_RAD = 1.0
 #: Correlation of angle and acceleration up to which their parts of the current can be separated.
@@ -76,9 +79,11 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
     lines = [*_find_other_wheel(corner, messages), *_find_impossible_temperatures(corner, messages)]
-    for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
-        if found is not None and not np.ptp(found.values):
+    own = {name: s for name, s in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)) if s is not None}
+    for name, found in own.items():
+        if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
+    lines += _find_gaps(own)
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
@@ -140,6 +145,20 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
         f"a gear's output, or in another unit (`scale: {ratio:.3g}` of angle and speed would agree), the current in another "
         "unit, or is this another motor?"
     ]
+
+
+def _find_gaps(signals: dict[str, Series]) -> list[str]:
+    """A line on how often and how long nothing was recorded, for all signals of which that is the same."""
+    names: dict[str, list[str]] = {}
+    for name, found in signals.items():
+        steps = 1e-9 * np.diff(found.time_ns)
+        gaps = np.flatnonzero(steps > max(_GAP_S, _GAP_PERIODS * 1e-9 * found.period_ns))
+        if len(gaps):
+            longest = gaps[np.argmax(steps[gaps])]
+            at = 1e-9 * (found.time_ns[longest] - found.time_ns[0])
+            many = f"{len(gaps)} gaps, together {np.sum(steps[gaps]):.3g} s, the longest of" if len(gaps) > 1 else "a gap of"
+            names.setdefault(f"{many} {steps[longest]:.3g} s, {at:.4g} s after the first value", []).append(name)
+    return [f"{', '.join(own)}: {text}; nothing is known of it meanwhile" for text, own in names.items()]
 
 
 def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
