@@ -6,6 +6,7 @@ reported.
 
 import numpy as np
 
+from emb_daemon.calibration.types import Motor
 from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
 from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
@@ -56,6 +57,9 @@ _LEAST_CURRENT_MS, _LONGEST_CURRENT_MS, _CURRENT_BETTER = 2, 30, 1.5
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
 _TOLD_INERTIA, _OTHER_INERTIA = 0.8, 3.0
+#: By how much what load and acceleration need of a current may differ to be the same share, and how far from one that is
+#: another scale: eleven logs of changed brakes are within 4 % and, where magnets have faded, 1.16; an effective value is 0.71.
+_SAME_SHARE, _OTHER_CURRENT = 0.1, 1.25
 #: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
 #: that acceleration would then need.
 _NO_INERTIA, _MUCH = 0.5, 0.5
@@ -110,6 +114,15 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     return lines
 
 
+def has_dead_current(corner: str, messages: dict[str, Signals]) -> bool:
+    """Whether a corner's current is nothing but zero while its motor turns: friction alone would need some."""
+    angle, current = (messages.get(f"EMB_{corner}_{name}", {}) for name in ("Resolver", "Current"))
+    angle, current = angle.get("MotorAngle"), current.get("CurrentQ")
+    if not isinstance(angle, Series) or current is None or len(angle.values) < _LEAST or np.ptp(angle.values) < _TRAVEL_RAD:
+        return False
+    return not np.any(current.values if isinstance(current, Series) else current)
+
+
 def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2: float) -> list[str]:
     """A line if the current accelerates the motor of SAMPLE rows as if its inertia were far from the one stated: then angle or
     current is in another unit, of another place, or of another motor."""
@@ -144,6 +157,44 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
         f"the current accelerates the motor as if its inertia were {ratio:.3g} times what is stated: is the angle that of "
         f"a gear's output, or in another unit (`scale: {ratio:.3g}` of angle and speed would agree), the current in another "
         "unit, or is this another motor?"
+    ]
+
+
+def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[str]:
+    """A line if the current of SAMPLE rows is the same share of what the load and of what the acceleration need, and not one.
+
+    Other pads or friction change what a load needs, another inertia what acceleration needs; the scale of the current, as an
+    effective value's, changes both, and a torque constant within its tolerances neither by as much.
+
+    Args:
+        force_N: clamp force, (n,); NaN where it is not known.
+    """
+    speed, current = (samples[name].astype(float) for name in ("speed", "current_q"))
+    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
+    known = samples["has_current"] & np.isfinite(current) & np.isfinite(force_N) & np.isfinite(acceleration)
+    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
+        return []
+    rows = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
+    sign, force = np.sign(speed[rows]), force_N[rows]
+    rest = np.column_stack([np.ones(len(rows)), sign, speed[rows], sign * force])
+    torques = {"load": motor.gear_gain_m_per_rad * force, "acceleration": motor.inertia_kg_m2 * acceleration[rows]}
+    explained = motor.torque_constant_Nm_per_A * current[rows]
+    shares = []
+    for name, torque in torques.items():
+        others = np.column_stack([rest, *(column for other, column in torques.items() if other != name)])
+        if len(rows) < _LEAST:
+            return []
+        columns = np.column_stack([torque, explained])
+        left = columns - others @ np.linalg.lstsq(others, columns)[0]
+        if not np.all(np.ptp(left, axis=0) > 0.0) or np.corrcoef(left.T)[0, 1] < _TOLD_INERTIA:
+            return []
+        shares.append(float(left[:, 0] @ left[:, 1] / (left[:, 0] @ left[:, 0])))
+    share = float(np.sqrt(np.prod(shares)))
+    if abs(shares[0] / shares[1] - 1.0) > _SAME_SHARE or 1.0 / _OTHER_CURRENT < share < _OTHER_CURRENT:
+        return []
+    return [
+        f"the current is {share:.3g} times what load and acceleration need with the stated torque constant: is it an "
+        f"effective value, in another unit, or of another motor? `scale: {1.0 / share:.3g}` of CurrentQ would agree"
     ]
 
 
