@@ -302,7 +302,7 @@ def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, cap
     """The stamps of a busy computer, beside which a drive's own speed would lose the angle's zero again and again."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     time_s = 0.004 * np.arange(2000)
-    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": 0.0 * time_s}
+    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": np.sin(3.0 * time_s)}
     columns |= {"plate_C": 22.0 + 0.0 * time_s, "force_N": 0.0 * time_s}
     true = 90.0 * np.sin(3.0 * time_s)
     for speed, share in ((true, 0.0), (-true, 0.9)):
