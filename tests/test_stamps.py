@@ -216,6 +216,18 @@ def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     assert _read(tmp_path, columns).samples["has_current"].any()
 
 
+@pytest.mark.parametrize("standing_s", [0.0, 7.9])
+def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, recwarn, standing_s):
+    """A shaft that turns on, braked by another motor in steps; and a force where the motor has hardly begun to move."""
+    time_s = 0.004 * np.arange(2000)
+    turning = np.maximum(time_s - standing_s, 0.0)
+    load = 5000.0 * np.repeat(np.random.default_rng(3).uniform(0.1, 1.0, 40), 50)
+    columns = {"time_s": time_s, "angle_rad": 20.0 * turning, "speed_rad_per_s": 20.0 * (turning > 0.0)}
+    _read(tmp_path, columns | {"current_A": 1e-3 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
+    assert "belongs to" not in capsys.readouterr().err
+    assert not [one for one in recwarn if one.category is RuntimeWarning]
+
+
 def test_gaps_are_told_with_their_place_and_length(truth, tmp_path, capsys):
     columns = foreignkit.sampled(truth, 250.0)
     time_s = columns["time_s"]
