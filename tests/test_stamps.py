@@ -10,7 +10,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import contradictions, other_current, other_motor, starts_anew
+from emb_daemon.logs.contradictions import _find_late_force, contradictions, other_current, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time, strays
@@ -216,15 +216,27 @@ def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     assert _read(tmp_path, columns).samples["has_current"].any()
 
 
-@pytest.mark.parametrize("standing_s", [0.0, 7.9])
-def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, recwarn, standing_s):
-    """A shaft that turns on, braked by another motor in steps; and a force where the motor has hardly begun to move."""
+@pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])
+def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, motion):
+    """A shaft that another motor brakes in steps: it turns on; begins to turn at the end; yields to each step 40 ms later; or
+    turns to and fro."""
     time_s = 0.004 * np.arange(2000)
-    turning = np.maximum(time_s - standing_s, 0.0)
     load = 5000.0 * np.repeat(np.random.default_rng(3).uniform(0.1, 1.0, 40), 50)
-    columns = {"time_s": time_s, "angle_rad": 20.0 * turning, "speed_rad_per_s": 20.0 * (turning > 0.0)}
+    speed = {
+        "on": 20.0 + 0.0 * time_s,
+        "late": 20.0 * (time_s > 7.9),
+        "yields": 4e-3 * np.roll(load, 10),
+        "to and fro": 20.0 * np.cos(9.0 * time_s),
+    }[motion]
+    columns = {"time_s": time_s, "angle_rad": 0.004 * np.cumsum(speed), "speed_rad_per_s": speed}
     _read(tmp_path, columns | {"current_A": 1e-3 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
-    assert "belongs to" not in capsys.readouterr().err
+    assert "ClampForceRef comes" not in capsys.readouterr().err
+
+
+def test_a_force_that_falls_at_every_time_is_of_none(recwarn):
+    times = 4_000_000 * np.arange(2000)
+    angle = Series(times, 20.0 * np.sin(1e-9 * times))
+    assert _find_late_force(angle, Series(times, -100.0 * angle.values)) == []
     assert not [one for one in recwarn if one.category is RuntimeWarning]
 
 

@@ -46,9 +46,8 @@ _ANEW, _LEAST_JUMPS, _ON = 0.5, 3, 0.8
 #: How late a force follows the motor's angle where pads relax, s, and how late it may by no pads in motion that tells it; a
 #: force before its angle is another clock's. Largest delay that is looked for, and step of the search, s.
 _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0.5, 0.01
-#: Share of a force's scatter that a curve over the angle may leave at the best time: pads leave a few per cent, a shaft that
-#: turns on against another motor all of it.
-_BY_ANGLE = 0.5
+#: How often the travel must be passed, and of how many samples that is added up, so that noise adds nothing.
+_PASSES, _PLACES = 1.5, 400
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
@@ -265,6 +264,11 @@ def _find_unsigned(current: Series) -> list[str]:
 def _find_late_force(angle: Series, force: Series) -> list[str]:
     """A line on a force that follows the angle later than pads do, or comes before it."""
     times, values = force.time_ns[:_JUDGED], force.values[:_JUDGED]
+    way = angle.sampled(times)
+    way = way[np.isfinite(way)][:: max(len(times) // _PLACES, 1)]
+    # A curve over an angle that goes one way is one over the time.
+    if np.sum(np.abs(np.diff(way))) < _PASSES * np.ptp(way):
+        return []
 
     def left_N(lag_s: float) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
@@ -277,7 +281,7 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
 
     lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S, _LAG_STEP_S)
     left = np.array([left_N(lag) for lag in lags])
-    if not np.min(left) < _BY_ANGLE * np.std(values):
+    if not np.isfinite(left).any():
         return []
     # Of a motion that repeats itself the least of the lags counts that fit, and none with which the force falls.
     around = np.pad(left, 1, constant_values=np.inf)
