@@ -268,11 +268,41 @@ def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
     assert log.samples["inner_backplate"][50] == 22.0
 
 
+@pytest.mark.parametrize(
+    ("letters", "angle", "force"),
+    [
+        ("gb18030", "位移", "力"),
+        ("cp932", "角度", "荷重"),
+        ("cp949", "각도", "힘"),
+        ("cp1251", "угол", "сила"),
+        ("cp1250", "úhel", "síla"),
+    ],
+)
+def test_names_are_found_in_the_letters_of_their_country(tmp_path, capsys, letters, angle, force):
+    """A testing machine's table: an empty line, names in the letters of its Windows, units, quoted numbers."""
+    (tmp_path / "mapping.yaml").write_text(
+        f"format: 1\ntime: {{signal: t}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: {angle}, unit: rad}}\n"
+        f"  RIG_FL_Force.ClampForceRef: {{signal: {force}, unit: N}}\n",
+        encoding="utf-8",
+    )
+    rows = "".join(f'"{0.02 * n:.4f}","{0.1 * n:.4f}","{2.0 * n:.4f}"\r\n' for n in range(100))
+    content = f"\r\nt,{angle},{force}\r\n(s),(mm),(N)\r\n{rows}"
+    (tmp_path / "a.csv").write_bytes(content.encode(letters))
+    mapping = Mapping(tmp_path / "mapping.yaml")
+    log = load_log(tmp_path / "a.csv", read=mapping.read)
+    assert abs(log.samples["angle"][-1] - 9.9) < 0.05 and np.nanmax(log.force_N) == pytest.approx(198.0, abs=1.0)
+    # A name that is not there is told beside those that are, not beside the empty line's.
+    (tmp_path / "b.csv").write_text("\r\nt,way,load\r\n(s),(mm),(N)\r\n" + rows)
+    with pytest.raises(InputError, match="no such column; the table has t, way, load"):
+        mapping.read(tmp_path / "b.csv")
+    assert "the header names 0" not in capsys.readouterr().err
+
+
 def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, capsys):
     """The stamps of a busy computer, beside which a drive's own speed would lose the angle's zero again and again."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     time_s = 0.004 * np.arange(2000)
-    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": 0.0 * time_s}
+    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": np.sin(3.0 * time_s)}
     columns |= {"plate_C": 22.0 + 0.0 * time_s, "force_N": 0.0 * time_s}
     true = 90.0 * np.sin(3.0 * time_s)
     for speed, share in ((true, 0.0), (-true, 0.9)):

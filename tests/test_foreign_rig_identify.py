@@ -49,7 +49,7 @@ def _long() -> np.ndarray:
     [
         ({"curve": foreignkit.slow, "random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
         ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
-        ({"curve": foreignkit.slow}, "random: no usable log, so that relaxation keeps what is usual", 400.0, 3),
+        ({"curve": foreignkit.slow}, "random: no usable log, so that the fast relaxation keeps what is usual", 400.0, 3),
         ({"curve": _clamp_only}, "random: no usable log", 500.0, 3),
         ({"curve": _long}, "random: no usable log", 400.0, 3),
         ({"curve": _low}, "curves: no log clamps harder than 2.15 of 20 kN", 400.0, 3),

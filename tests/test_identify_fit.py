@@ -1,5 +1,6 @@
 """Identification finds what simulated rigs were given, and says how well it knows it."""
 
+import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,8 +12,9 @@ from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
 import emb_daemon
+from emb_daemon.calibration.curves import Curve, curve_at
 from emb_daemon.calibration.files import load_calibration
-from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, value_of
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, moved, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
@@ -20,12 +22,15 @@ from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
 from emb_daemon.identify.dynamics import (
     DELAY,
     OPTIONAL,
+    RELAXATION,
+    TERMS,
     CurveFit,
     DynamicsFit,
     Pads,
     errors_unseen,
     fit_dynamics,
     regress_free,
+    simulate,
     starting_point,
 )
 from emb_daemon.identify.steps import attribution, noise, stiffness, torque
@@ -203,6 +208,55 @@ def test_errors_of_a_fit_are_of_what_it_has_not_seen():
     assert len(random) == len(force) == pytest.approx(1000 - 95, abs=8) and np.isfinite(random).all()
     [(alone, _)] = errors_unseen(groups, fit, 0.008, slow=False)
     assert np.array_equal(alone, random) and rmse(random) < 0.2 * rmse(errors_unseen(groups, fit)[1][0])
+
+
+def _one_curve():
+    """The brake of `foreignkit` with no more than a curve of its own pads."""
+    known = foreignkit.calibration()
+    thickness_mm = known.pad_thickness_mm
+    coefficients = tuple(curve_at(known.stiffness.curves, thickness_mm)[:TERMS].tolist())
+    curve = Curve(pad_thickness_mm=thickness_mm, coefficients=coefficients)
+    return replace(known, effects={}, stiffness=replace(known.stiffness, curves=(curve,)))
+
+
+def _slow_log(known, *, seconds=20.0, stiffer=1.0, seed=0):
+    """A slow clamp whose force is the stiffness path's, from a sensor with 20 N of noise."""
+    truth = foreignkit.truth(foreignkit.slow(seconds=seconds))
+    time_s, angle, speed = (column[::8] for column in (truth.time_s, truth.angle, truth.speed))
+    log = emb_daemon.log_of_arrays(time_s, angle, speed, force_N=0.0 * angle)
+    force = stiffer * simulate(log, known, known.pad_thickness_mm, known.contact.clearance_rad)
+    return dataclasses.replace(log, force_N=force + np.random.default_rng(seed).normal(0.0, 20.0, len(force)))
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_slow_clamp_alone_shows_what_is_slower_than_it(there):
+    """A loop and a slow relaxation, which a curve alone would have to lie in the middle of; and none that are not there,
+    where a first relaxation of another time than the usual one looks a little like a loop."""
+    own = {
+        "effects.stiffness_hysteresis.share": 0.02,
+        "effects.stiffness_hysteresis.slip_angle_rad": 1.0,
+        "effects.second_relaxation.share": 0.1,
+        "effects.second_relaxation.time_constant_s": 0.8,
+    }
+    known = moved(_one_curve(), own | {RELAXATION: stiffness.USUAL_RELAXATION_S} if there else {RELAXATION: 0.0284})
+    groups = [Pads(known.pad_thickness_mm, (_slow_log(known),))]
+    found = stiffness.identify(groups, replace(known, effects={}))
+    assert sorted(effect.name for effect in found.chosen.effects) == (
+        ["second_relaxation", "stiffness_hysteresis"] if there else []
+    )
+    assert found.sigmas[RELAXATION] == found.values[RELAXATION] == stiffness.USUAL_RELAXATION_S
+    assert found.fit.rms < 25.0
+    if there:
+        assert found.values["effects.second_relaxation.share"] == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
+    """As fitted, half of what tells two clamps apart would be in the error, and in sigma."""
+    known = _one_curve()
+    logs = _slow_log(known), _slow_log(known, stiffer=1.2, seed=1)
+    found = stiffness.identify([Pads(known.pad_thickness_mm, logs)], known)
+    fitted = found.fit.rms
+    assert all(rmse(error) > 1.8 * fitted > 200.0 for error, _ in found.chosen.held_out)
 
 
 def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():

@@ -10,7 +10,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import contradictions, other_motor, starts_anew
+from emb_daemon.logs.contradictions import _find_late_force, contradictions, other_current, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time, strays
@@ -187,8 +187,9 @@ _MOTION = ("angle_rad", "speed_rad_per_s")
         ((*_MOTION, "current_A"), -1.0, "`scale: -1` of MotorAngle and MotorSpeed and CurrentQ?"),
         (("force_N",), -1.0, "`scale: -1` of ClampForceRef?"),
         (("force_N",), 1e-3, "N, which clamps nothing; is its unit right?"),
-        (("current_A",), 1e3, "CurrentQ is beyond"),
-        (("current_A",), 0.0, "CurrentQ is 0 throughout"),
+        (("force_N",), 30.0, "of the samples, which count as not measured; is its unit right? If so, a `scale` "),
+        (("current_A",), 1e3, "of the samples, which make no frames; is its unit right? If so, a `scale` "),
+        (("current_A",), 0.0, "CurrentQ is 0 throughout, while the motor turns: it is taken as not measured"),
         (("speed_rad_per_s",), -1.0, "a direction turned round"),
         (("speed_rad_per_s",), 30.0 / np.pi, "rpm taken for rad/s, or the reverse"),
         (("angle_rad",), 180.0 / np.pi, "degrees taken for radians, or the reverse"),
@@ -202,6 +203,55 @@ def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said
     columns = foreignkit.sampled(truth, 250.0)
     _read(tmp_path, _wrong(columns, *wrong, factor=factor))
     assert said in capsys.readouterr().err
+
+
+def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
+    """As a measured one it would tell the torque path that nothing clamps: 9 kN of error."""
+    columns = foreignkit.sampled(truth, 250.0)
+    columns["current_A"] = 0.0 * columns["current_A"]
+    for mapping in (foreignkit.COLUMNS, re.sub(r"(EMB_FL_Current.CurrentQ): .*", r"\1: {value: 0}", foreignkit.COLUMNS)):
+        assert not _read(tmp_path, columns, mapping).samples["has_current"].any()
+    # A motor that stands needs none.
+    columns |= {name: 0.0 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
+    assert _read(tmp_path, columns).samples["has_current"].any()
+
+
+@pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])
+def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, motion):
+    """A shaft that another motor brakes in steps: it turns on; begins to turn at the end; yields to each step 40 ms later; or
+    turns to and fro."""
+    time_s = 0.004 * np.arange(2000)
+    load = 5000.0 * np.repeat(np.random.default_rng(3).uniform(0.1, 1.0, 40), 50)
+    speed = {
+        "on": 20.0 + 0.0 * time_s,
+        "late": 20.0 * (time_s > 7.9),
+        "yields": 4e-3 * np.roll(load, 10),
+        "to and fro": 20.0 * np.cos(9.0 * time_s),
+    }[motion]
+    columns = {"time_s": time_s, "angle_rad": 0.004 * np.cumsum(speed), "speed_rad_per_s": speed}
+    _read(tmp_path, columns | {"current_A": 1e-3 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
+    assert "ClampForceRef comes" not in capsys.readouterr().err
+
+
+def test_a_force_that_falls_at_every_time_is_of_none(recwarn):
+    times = 4_000_000 * np.arange(2000)
+    angle = Series(times, 20.0 * np.sin(1e-9 * times))
+    assert _find_late_force(angle, Series(times, -100.0 * angle.values)) == []
+    assert not [one for one in recwarn if one.category is RuntimeWarning]
+
+
+def test_gaps_are_told_with_their_place_and_length(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    time_s = columns["time_s"]
+    for name in ("angle_rad", "current_A"):
+        columns[name] = np.where((time_s > 1.0) & (time_s < 1.5), np.nan, columns[name])
+    columns["current_A"][10:50] = np.nan
+    columns["force_N"][300:310] = np.nan
+    _read(tmp_path, columns)
+    said = capsys.readouterr().err
+    assert "MotorAngle: a gap of 0.5 s, 0.996 s after the first value" in said
+    assert "CurrentQ: 2 gaps, together 0.664 s, the longest of 0.5 s" in said
+    assert "ClampForceRef" not in said
 
 
 @pytest.mark.parametrize(
@@ -301,6 +351,31 @@ def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsy
     told = capsys.readouterr().err
     assert said in told
     assert bool(said) == ("the current accelerates the motor" in told)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1.0, ""),
+        (np.sqrt(0.5), "the current is 0.7"),
+        (np.sqrt(2.0), "the current is 1.4"),
+        (0.9, ""),
+    ],
+    ids=["the motor's", "effective", "amplitude of an effective value", "within tolerances"],
+)
+@pytest.mark.parametrize("stiffer", [1.0, 1.4])
+def test_a_current_of_another_scale_is_told_by_load_and_acceleration(truth, factor, said, stiffer):
+    """Other pads, whose force is another at the same angle, do not pass for it: what the sensor shows is taken."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.random(seconds=10.0)), 250.0)
+    samples = np.zeros(len(columns["time_s"]), SAMPLE)
+    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
+    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
+        samples[field] = columns[column]
+    samples["current_q"] *= factor
+    motor = foreignkit.calibration().motor
+    told = other_current(samples, stiffer * columns["force_N"], motor)
+    assert [line.startswith(said) for line in told] == ([True] if said and stiffer == 1.0 else [])
+    assert not other_current(samples, np.full(len(samples), np.nan), motor)
 
 
 def test_rare_samples_tell_no_inertia():

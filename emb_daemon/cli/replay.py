@@ -105,11 +105,14 @@ def _calibration(arguments: argparse.Namespace):
 
 def _tell_other_motor(results, motor):
     """Print to stderr where current and motion of a log are not those of the calibration's ``motor``."""
-    from emb_daemon.logs.contradictions import other_motor
+    from emb_daemon.logs.contradictions import other_current, other_motor
     from emb_daemon.wire.layout import CORNERS
 
     for result in results:
-        for line in other_motor(result.samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2):
+        samples = result.samples
+        for line in other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2) or other_current(
+            samples, result.force_N, motor
+        ):
             print(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}", file=sys.stderr)
 
 

@@ -1,5 +1,6 @@
 """Characteristic curves and dynamics of the stiffness path by output error: the estimator's own path, sample by sample."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,8 +13,9 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
 from emb_daemon.models.gear import all_through_gear
 from emb_daemon.offline import Log
-from emb_daemon.offline.fit import Block, Fit, Free, fit
+from emb_daemon.offline.fit import Block, Fit, Free, fit, valley
 from emb_daemon.offline.run import stiffness_force
+from emb_daemon.offline.score import rmse
 
 #: Terms of the characteristic curve, the thesis's cubic.
 TERMS = 3
@@ -32,6 +34,8 @@ _MORE = {"s": 10.0, "rad": 0.25}
 #: Further starting values of those that are an angle, over the first, and number of evaluations after which they are compared.
 _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
+#: How far from where a fit to all logs puts it a log's contact is looked for in a fit to the others, over its travel.
+_CONTACT = 0.1
 #: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
@@ -168,6 +172,32 @@ def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, sl
     return found
 
 
+def errors_left_out(groups: list[Pads], every: DynamicsFit, fit: Callable[[list[Pads]], DynamicsFit]) -> list[Errors]:
+    """Errors on every log, of a ``fit`` to all others where its pads have another one, and else of that to ``every`` log.
+
+    The contact of a log is its own, and found in it; how unsure it is has a standard deviation of its own.
+    """
+    found = []
+    for g, (pads, curve) in enumerate(zip(groups, every.curves, strict=True)):
+        for number, (log, clearance) in enumerate(zip(pads.logs, curve.clearances_rad, strict=True)):
+            there = every.calibration
+            if rest := pads.logs[:number] + pads.logs[number + 1 :]:
+                there = fit([*groups[:g], replace(pads, logs=rest), *groups[g + 1 :]]).calibration
+                clearance = _contact(log, there, pads.thickness_mm, clearance)
+            found.append(path_errors(log, there, pads.thickness_mm, clearance))
+    return found
+
+
+def _contact(log: Log, calibration: Calibration, thickness_mm: float, near: float) -> float:
+    """The clearance ``near`` another that leaves least errors on a log, rad."""
+    reach = _CONTACT * float(np.ptp(_travel(log, calibration)))
+    return valley(
+        lambda clearance: rmse(path_errors(log, calibration, thickness_mm, clearance)[0]),
+        near + reach * np.linspace(-1.0, 1.0, 9),
+        xatol=1e-3 * reach,
+    )
+
+
 def _delay(into: np.ndarray, samples: np.ndarray, delay_s: float) -> None:
     """Replace the angles of samples by those ``delay_s`` earlier; the first stays, because the clearance counts from it."""
     into["angle"][1:] = (samples["angle"] - delay_s * samples["speed"])[1:]
@@ -260,9 +290,8 @@ def _free(calibration: Calibration, key: str) -> Free:
 class _Model:
     """What is fitted: the calibration's keys, `DELAY`, and for each log its clearance under (group, log's number)."""
 
-    def __init__(self, groups: list[Pads], start: Calibration, delay_s: float, fraction: float, fixed: bool):
-        self.groups, self.start, self.delay_s, self.fraction = groups, start, delay_s, fraction
-        self.shared = () if fixed else (*dynamics(start), DELAY)
+    def __init__(self, groups: list[Pads], start: Calibration, delay_s: float, fraction: float, shared: tuple[str, ...]):
+        self.groups, self.start, self.delay_s, self.fraction, self.shared = groups, start, delay_s, fraction, shared
         self.curves = [curve_keys(start, pads.thickness_mm) for pads in groups]
 
     def free(self) -> dict:
@@ -334,7 +363,7 @@ def fit_dynamics(
     *,
     fraction: float = 1.0,
     search: bool = False,
-    fixed: bool = False,
+    shared: tuple[str, ...] | None = None,
 ) -> DynamicsFit:
     """One set of dynamics, a curve for each pair of pads, a contact angle for each log.
 
@@ -343,9 +372,10 @@ def fit_dynamics(
         delay_s: of the reference, to start from.
         fraction: share that is fitted of each log that is not slow, from its beginning.
         search: try several starting points for angles that shape an effect.
-        fixed: keep the dynamics and fit curves and contact angles alone.
+        shared: which of the dynamics are fitted beside curves and contact angles; all of them and the reference's delay if
+            left out.
     """
-    model = _Model(groups, start, delay_s, fraction, fixed)
+    model = _Model(groups, start, delay_s, fraction, (*dynamics(start), DELAY) if shared is None else shared)
     blocks, first = model.blocks(), model.free()
     angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]
     if search and angles:

@@ -6,6 +6,7 @@ reported.
 
 import numpy as np
 
+from emb_daemon.calibration.types import Motor
 from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
 from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
@@ -14,6 +15,9 @@ from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
 #: Least mean of the current at one end of the travel, as a share of the largest, and as a multiple of that at the other end.
 _HOLDS, _MORE = 0.2, 2.0
+#: Least time without a value that is a gap, s: half a clamp; and in periods of the signal, since recorders of few values
+#: wait for the next.
+_GAP_S, _GAP_PERIODS = 0.1, 10.0
 #: Travel below which a motor stands, rad, and everything that correlates with its angle is noise.
 _TRAVEL_RAD = 1.0
 #: Correlation of angle and acceleration up to which their parts of the current can be separated.
@@ -42,6 +46,8 @@ _ANEW, _LEAST_JUMPS, _ON = 0.5, 3, 0.8
 #: How late a force follows the motor's angle where pads relax, s, and how late it may by no pads in motion that tells it; a
 #: force before its angle is another clock's. Largest delay that is looked for, and step of the search, s.
 _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0.5, 0.01
+#: How often the travel must be passed, and of how many samples that is added up, so that noise adds nothing.
+_PASSES, _PLACES = 1.5, 400
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
@@ -53,6 +59,9 @@ _LEAST_CURRENT_MS, _LONGEST_CURRENT_MS, _CURRENT_BETTER = 2, 30, 1.5
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
 _TOLD_INERTIA, _OTHER_INERTIA = 0.8, 3.0
+#: By how much what load and acceleration need of a current may differ to be the same share, and how far from one that is
+#: another scale: eleven logs of changed brakes are within 4 % and, where magnets have faded, 1.16; an effective value is 0.71.
+_SAME_SHARE, _OTHER_CURRENT = 0.1, 1.25
 #: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
 #: that acceleration would then need.
 _NO_INERTIA, _MUCH = 0.5, 0.5
@@ -76,9 +85,11 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
     lines = [*_find_other_wheel(corner, messages), *_find_impossible_temperatures(corner, messages)]
-    for name, found in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)):
-        if found is not None and not np.ptp(found.values):
+    own = {name: s for name, s in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)) if s is not None}
+    for name, found in own.items():
+        if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
+    lines += _find_gaps(own)
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
@@ -103,6 +114,15 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force) or _find_late_force(angle, force)
     return lines
+
+
+def has_dead_current(corner: str, messages: dict[str, Signals]) -> bool:
+    """Whether a corner's current is nothing but zero while its motor turns: friction alone would need some."""
+    angle, current = (messages.get(f"EMB_{corner}_{name}", {}) for name in ("Resolver", "Current"))
+    angle, current = angle.get("MotorAngle"), current.get("CurrentQ")
+    if not isinstance(angle, Series) or current is None or len(angle.values) < _LEAST or np.ptp(angle.values) < _TRAVEL_RAD:
+        return False
+    return not np.any(current.values if isinstance(current, Series) else current)
 
 
 def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2: float) -> list[str]:
@@ -140,6 +160,58 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
         f"a gear's output, or in another unit (`scale: {ratio:.3g}` of angle and speed would agree), the current in another "
         "unit, or is this another motor?"
     ]
+
+
+def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[str]:
+    """A line if the current of SAMPLE rows is the same share of what the load and of what the acceleration need, and not one.
+
+    Other pads or friction change what a load needs, another inertia what acceleration needs; the scale of the current, as an
+    effective value's, changes both, and a torque constant within its tolerances neither by as much.
+
+    Args:
+        force_N: clamp force, (n,); NaN where it is not known.
+    """
+    speed, current = (samples[name].astype(float) for name in ("speed", "current_q"))
+    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
+    known = samples["has_current"] & np.isfinite(current) & np.isfinite(force_N) & np.isfinite(acceleration)
+    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
+        return []
+    rows = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
+    sign, force = np.sign(speed[rows]), force_N[rows]
+    rest = np.column_stack([np.ones(len(rows)), sign, speed[rows], sign * force])
+    torques = {"load": motor.gear_gain_m_per_rad * force, "acceleration": motor.inertia_kg_m2 * acceleration[rows]}
+    explained = motor.torque_constant_Nm_per_A * current[rows]
+    shares = []
+    for name, torque in torques.items():
+        others = np.column_stack([rest, *(column for other, column in torques.items() if other != name)])
+        if len(rows) < _LEAST:
+            return []
+        columns = np.column_stack([torque, explained])
+        left = columns - others @ np.linalg.lstsq(others, columns)[0]
+        if not np.all(np.ptp(left, axis=0) > 0.0) or np.corrcoef(left.T)[0, 1] < _TOLD_INERTIA:
+            return []
+        shares.append(float(left[:, 0] @ left[:, 1] / (left[:, 0] @ left[:, 0])))
+    share = float(np.sqrt(np.prod(shares)))
+    if abs(shares[0] / shares[1] - 1.0) > _SAME_SHARE or 1.0 / _OTHER_CURRENT < share < _OTHER_CURRENT:
+        return []
+    return [
+        f"the current is {share:.3g} times what load and acceleration need with the stated torque constant: is it an "
+        f"effective value, in another unit, or of another motor? `scale: {1.0 / share:.3g}` of CurrentQ would agree"
+    ]
+
+
+def _find_gaps(signals: dict[str, Series]) -> list[str]:
+    """A line on how often and how long nothing was recorded, for all signals of which that is the same."""
+    names: dict[str, list[str]] = {}
+    for name, found in signals.items():
+        steps = 1e-9 * np.diff(found.time_ns)
+        gaps = np.flatnonzero(steps > max(_GAP_S, _GAP_PERIODS * 1e-9 * found.period_ns))
+        if len(gaps):
+            longest = gaps[np.argmax(steps[gaps])]
+            at = 1e-9 * (found.time_ns[longest] - found.time_ns[0])
+            many = f"{len(gaps)} gaps, together {np.sum(steps[gaps]):.3g} s, the longest of" if len(gaps) > 1 else "a gap of"
+            names.setdefault(f"{many} {steps[longest]:.3g} s, {at:.4g} s after the first value", []).append(name)
+    return [f"{', '.join(own)}: {text}; nothing is known of it meanwhile" for text, own in names.items()]
 
 
 def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
@@ -192,6 +264,11 @@ def _find_unsigned(current: Series) -> list[str]:
 def _find_late_force(angle: Series, force: Series) -> list[str]:
     """A line on a force that follows the angle later than pads do, or comes before it."""
     times, values = force.time_ns[:_JUDGED], force.values[:_JUDGED]
+    way = angle.sampled(times)
+    way = way[np.isfinite(way)][:: max(len(times) // _PLACES, 1)]
+    # A curve over an angle that goes one way is one over the time.
+    if np.sum(np.abs(np.diff(way))) < _PASSES * np.ptp(way):
+        return []
 
     def left_N(lag_s: float) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
@@ -204,6 +281,8 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
 
     lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S, _LAG_STEP_S)
     left = np.array([left_N(lag) for lag in lags])
+    if not np.isfinite(left).any():
+        return []
     # Of a motion that repeats itself the least of the lags counts that fit, and none with which the force falls.
     around = np.pad(left, 1, constant_values=np.inf)
     near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]

@@ -18,7 +18,7 @@ from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
-from emb_daemon.logs.contradictions import contradictions, starts_anew
+from emb_daemon.logs.contradictions import contradictions, has_dead_current, starts_anew
 from emb_daemon.logs.dbc import load_foreign
 from emb_daemon.logs.read import Recorded, ids_in, read_log
 from emb_daemon.logs.resample import (
@@ -393,6 +393,13 @@ class Mapping:
                 )
                 signals["MotorAngle"] = Series(angle.time_ns[~stray], angle.values[~stray])
         for corner in CORNERS:
+            if has_dead_current(corner, messages):
+                del messages[f"EMB_{corner}_Current"]
+                print(
+                    f"{path}: {corner}: CurrentQ is 0 throughout, while the motor turns: it is taken as not measured, and the "
+                    "force rests on the motor angle alone",
+                    file=sys.stderr,
+                )
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 print(f"{path}: {corner}: {line}", file=sys.stderr)
         self._check_rate(path, messages)

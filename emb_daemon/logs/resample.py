@@ -473,9 +473,12 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
                 column = _within(message.name, column, layout["low"], layout["high"])
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
+                so = "count as not measured" if is_reference else "make no frames"
+                much = np.max(np.abs(column[np.isfinite(column)])) / layout["high"]
                 print(
                     f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
-                    "the samples, which make no frames; is its unit right?",
+                    f"the samples, which {so}; is its unit right? If so, a `scale` {much:.2g} times smaller would fit, with "
+                    "all that it is compared with",
                     file=sys.stderr,
                 )
             if length == 1 and (between := np.mean((column > _FLAG) & (column < 1.0 - _FLAG))) > _MOST_BEYOND:

@@ -56,6 +56,8 @@ _IN_GROUP, _BUS = " group ", "CAN_DataFrame"
 _MARK = 200
 #: Number of column names listed if one was not found.
 _LISTED = 20
+#: Letters of older tools of Western and Central Europe, Russia, China, Japan and Korea.
+_LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949")
 #: A value that its line names, as a serial port's text does: ``Time: 5001 Force=3.2 N``; share of the first lines that must
 #: name the same values.
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
@@ -334,7 +336,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     number of cells (a truncated last one) left out, with a note on stderr."""
     import pyarrow.csv
 
-    content = _as_utf8(content)
+    content = _as_utf8(content, names)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
     content = _unlabelled(_unterminated(content))
@@ -357,6 +359,10 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
         header, delimiter = found
         cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
+    elif not {*names} & {*cells}:
+        # What is then said of the names is of what stands above the numbers.
+        header, delimiter = _above_numbers(lines) or (header, delimiter)
+        cells = _cells(lines[header], delimiter)
     if delimiter == " ":
         content = b"\n".join(b" ".join(line.split()) for line in content.split(b"\n"))
     rows = [_cells(line, delimiter) for line in lines[header + 1 : header + 1 + _UNITS]]
@@ -437,8 +443,9 @@ def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: st
     return [*names, *[""] * more]
 
 
-def _as_utf8(content: bytes) -> bytes:
-    """Text as UTF-8 without a mark of byte order; what is neither UTF-8 nor UTF-16 is Latin-1, as older tools write it."""
+def _as_utf8(content: bytes, names: list[str]) -> bytes:
+    """Text as UTF-8 without a mark of byte order; what is neither UTF-8 nor UTF-16 is as older tools write it, in the letters
+    in which the columns' ``names`` stand in it, and otherwise Latin-1."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", errors="replace").encode()
     if content[1:_MARK:2].count(0) > 0.9 * len(content[1:_MARK:2]) > 0.0:
@@ -446,6 +453,11 @@ def _as_utf8(content: bytes) -> bytes:
     try:
         content.decode()
     except UnicodeDecodeError:
+        foreign = [name for name in names if not name.isascii()]
+        for letters in _LETTERS if foreign else ():
+            with contextlib.suppress(UnicodeError):
+                if all(name.encode(letters) in content for name in foreign):
+                    return content.decode(letters).encode()
         return content.decode("latin-1").encode()
     return content.removeprefix(b"\xef\xbb\xbf")
 
@@ -489,6 +501,17 @@ def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
     for row, line in enumerate(lines):
         if mark := next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ""):
             return row - 1, mark
+    return None
+
+
+def _above_numbers(lines: list[str]) -> tuple[int, str] | None:
+    """Index of the highest line above the first of numbers alone that has as many cells, and their separator."""
+    for row, line in enumerate(lines):
+        mark = next((mark for mark in _DELIMITERS if len(_cells(line, mark)) > 1), "")
+        if mark and all(map(_is_number, filter(None, cells := _cells(line, mark)))):
+            above = [len(_cells(text, mark)) == len(cells) for text in lines[max(row - 1 - _UNITS, 0) : row]]
+            count = next((n for n, alike in enumerate(reversed(above)) if not alike), len(above))
+            return (row - count, mark) if count else None
     return None
 
 

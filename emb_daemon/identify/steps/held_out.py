@@ -54,7 +54,7 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
     pads, joint = stiffness.pads[index], stiffness.fit
     others = [other for i, other in enumerate(stiffness.pads) if i != index]
     shared = fit_dynamics(others, joint.calibration, joint.delay_s)
-    own = fit_dynamics([Pads(pads.thickness_mm, pads.slow)], shared.calibration, shared.delay_s, fixed=True)
+    own = fit_dynamics([Pads(pads.thickness_mm, pads.slow)], shared.calibration, shared.delay_s, shared=())
     clearance = float(np.mean(own.curves[0].clearances_rad))
     torque = fit_torque([log for other in others for log in other.logs], joint.calibration, campaign.datasheet)
     return Fold(

@@ -54,7 +54,7 @@ def identify(
     undecided: Mapping[str, float] = NOTHING,
     fastest_rad_per_s: float = 0.0,
 ) -> Step:
-    """Noise levels from the folds, or from the second halves of the random logs where there are none.
+    """Noise levels from the folds, or where there are none from the second halves of the random logs, or from slow logs.
 
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
@@ -73,11 +73,13 @@ def identify(
         errors = [pair for fold in folds for pair in fold.errors]
         held_out = [left for fold in folds for left in fold.unexplained]
     else:
-        errors = errors_unseen(stiffness.pads, stiffness.chosen.fit)
+        chosen, random = stiffness.chosen, any(pads.random for pads in stiffness.pads)
+        errors = errors_unseen(stiffness.pads, chosen.fit) if random else chosen.held_out
         held_out = [unexplained_current(log, torque.fit, known) for log in torque.logs]
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
-            "levels come from the second halves of the random logs."
+            "levels come from the second halves of the random logs; without these from slow logs, each predicted from the "
+            "others of its pads, a single one as it was fitted."
         )
     gear_gain = known.motor.gear_gain_m_per_rad
     floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))

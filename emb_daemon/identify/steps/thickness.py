@@ -77,8 +77,8 @@ def load_pads(campaign: Campaign) -> list[Pads]:
         )
     if not any(own.random for own in pads):
         campaign.fault(
-            "random: no usable log, so that relaxation keeps what is usual of brakes, and sigma holds what that may do in a "
-            f"hard clamp; needed: {NEED_RANDOM}"
+            "random: no usable log, so that the fast relaxation keeps what is usual of brakes, and sigma holds what that may "
+            f"do in a hard clamp; needed: {NEED_RANDOM}"
         )
     return pads
 
