@@ -3,15 +3,21 @@ PYTHON ?= python3
 VENV ?= .venv
 READY = $(VENV)/.ready
 
-.PHONY: demo test docs wheel wheel-demo lint format lock clean deb image fuzz soak mutation silent sbom audit fleet measurement types
+.PHONY: demo test trials docs wheel wheel-demo lint format lock clean deb image fuzz soak mutation silent sbom audit fleet measurement types
 
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
 
 # As many processes as cores: threads of linear algebra beside them would only wait for each other.
 # Byte code is kept whatever the shell says, or a hundred processes would each translate the sources.
+PYTEST = OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4
 test: $(READY) lint
-	OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) --dist loadfile --no-loadscope-reorder -m "not trial"
+	@echo "Left out: the long trials, which make trials runs."
+
+# Kernels compiled anew, and whole drives identified or diagnosed: minutes of one test each on a busy machine.
+trials: $(READY)
+	$(PYTEST) --dist worksteal -m trial
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -45,6 +45,7 @@ def frames(tmp_path_factory):
     return np.concatenate(heard)
 
 
+@pytest.mark.trial
 def test_every_byte_is_as_from_numba(compiled, frames, tmp_path):
     log = tmp_path / "drive.log"
     write_frames(log, frames)

@@ -1344,6 +1344,7 @@ def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, no
     assert report(result)["unexplained"]["present"] and "Proven on these logs but not applied: a term of" in verdict(result)
 
 
+@pytest.mark.trial
 def test_blind(calibration):
     """The short version of the blind test; `python -m studies.blind` is the whole."""
     trial = run_trial(calibration, 21140, "pair", ("friction_asymmetry", "cogging_torque"), 319.5, stops=5)
@@ -1353,6 +1354,7 @@ def test_blind(calibration):
     assert trial.contribution_error < 0.15
 
 
+@pytest.mark.trial
 def test_a_term_of_the_heat_balance_is_named_and_carries_over(calibration, monkeypatch):
     """A disc that cools faster the hotter it is: conductances alone leave 2.0 K of the temperatures on another log."""
     monkeypatch.setattr(blind, "what_is_left", lambda *_: {})
@@ -1362,6 +1364,7 @@ def test_a_term_of_the_heat_balance_is_named_and_carries_over(calibration, monke
     assert trial.kelvin[0] > 6.0 and trial.kelvin[1] < 0.8
 
 
+@pytest.mark.trial
 def test_a_ripple_of_a_sixth_of_the_current_s_noise_is_named_once_its_order_is_fitted(calibration, monkeypatch):
     """As its order was scanned a dozen effective episodes leave it unsure; it is most of what lasts of the torque residual."""
     monkeypatch.setattr(blind, "what_is_left", lambda *_: {})
@@ -1647,6 +1650,7 @@ def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, cali
     assert result.after.rmse("fused") < 33.0
 
 
+@pytest.mark.trial
 def test_from_the_thesis_s_models_to_all_that_the_simulated_rig_hides(rig, calibration):
     """The rig has hysteresis and a second relaxation of its own; in this case its disc is uneven as well."""
     thesis = msgspec.structs.replace(calibration, effects={})

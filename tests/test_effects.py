@@ -156,6 +156,7 @@ def one_more() -> Path:
     return new
 
 
+@pytest.mark.trial
 def test_one_file_and_one_line_more_and_step_and_diagnose_know_the_effect(one_more, tmp_path):
     (tmp_path / "log").write_bytes(pickle.dumps(_of_a_widening_caliper()))
     environment = os.environ | {"PYTHONPATH": str(one_more), "NUMBA_CACHE_DIR": str(one_more / "cache")}

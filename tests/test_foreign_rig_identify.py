@@ -133,6 +133,7 @@ def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
     assert "expected CAMPAIGN.yaml and --output" in capsys.readouterr().err
 
 
+@pytest.mark.trial
 def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeypatch):
     """In slow clamps alone, a gear with play passes for friction that turns over within a radian: 1.7 kN in a stop."""
     effects = {"stribeck_friction": {"rise": 0.25, "speed_rad_per_s": 14.0}, "backlash": {"play_rad": 0.12}}

@@ -360,6 +360,7 @@ def _hidden(law, rng):
     return found
 
 
+@pytest.mark.trial
 def test_a_term_is_made_for_a_cooling_that_is_no_line_over_the_speed_and_none_for_one_that_is(monkeypatch):
     """In the campaign's own step, with its standard deviation and where it was found."""
     searches, rng = [], np.random.default_rng(5)
