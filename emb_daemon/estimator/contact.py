@@ -23,7 +23,7 @@ from emb_daemon.models.contact import (
 from emb_daemon.models.fusion import CONTACT, GAIN, OFFSET, STATES
 from emb_daemon.models.gear import steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
-from emb_daemon.models.wander import STANDING_RAD_PER_S
+from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
 #: what a contact angle jumps by at once), is no motion.
@@ -32,9 +32,9 @@ _ANGLE_MARGIN = 0.5
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 60 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
-#: Offset that a resolver's speed may have: one count of the wire, rad/s; standard deviations of its noise; and time after
-#: which a zero that drifted counts as healed, s: a car that stands once in a minute shows it.
-_SPEED_OFFSET_RAD_PER_S, _CERTAIN, _DRIFTING_S = 0.02, 6.0, 60.0
+#: Standard deviations of the speed's noise that are certain; and time after which a zero that drifted counts as healed, s: a
+#: car that stands once in a minute shows it.
+_CERTAIN, _DRIFTING_S = 6.0, 60.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
 #: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
@@ -44,7 +44,7 @@ _STOOD_S = 1.0
 #: T²/8, and four of them on a travel a t², sped up for t and slowed down for as long, by T²/(2 t²) of it, t being 40 ms. On
 #: the simulated rig's logs no travel is off by more than 0.35 of the limit.
 _SPEED_SCALE = 0.005
-#: Gain error of a resolver's speed, share: tolerance of its scale, and what the trapezoid misses of a few samples.
+#: Gain error of a resolver's speed, share, as `models.lateness` allows for, which also covers what the trapezoid misses.
 _SPEED_GAIN = 0.02
 #: Samples in a row in which angle and speed repeat to the bit, from which both are stale: by chance, at one repetition in five
 #: of a motor that stands, one in a hundred.
@@ -154,7 +154,7 @@ def _move_zero(s, p, moved, sigma):
 @njit
 def _unaccounted(s, seconds):
     """Least travel (rad) beyond the integrated speed over ``seconds`` that neither its noise nor its offset explain."""
-    return _ZERO_RAD + _SPEED_OFFSET_RAD_PER_S * seconds + _CERTAIN * s.speed_sigma * sqrt(CYCLE_S * seconds)
+    return _ZERO_RAD + OFFSET_RAD_PER_S * seconds + _CERTAIN * s.speed_sigma * sqrt(CYCLE_S * seconds)
 
 
 @njit

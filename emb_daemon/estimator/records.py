@@ -99,7 +99,7 @@ STATE = np.dtype(
         # Angle (rad) gone without speed since the motor stands, and for how long; time for which that still counts.
         *fields("f8", "drifted stood_s drifting_s"),
         # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
-        # turned, s; the first is no number where part of the way was not seen.
+        # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind.
         *fields("f8", "strayed turned turned_s behind"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
         # Of a gear that is not constant: resolver's angle at its released position, rad, and its slope (`models.gear`). The

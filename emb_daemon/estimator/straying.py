@@ -14,24 +14,22 @@ from emb_daemon.estimator.hypotheses import GATE
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.jit import Record, fields, njit, sq
 from emb_daemon.models.fusion import CONTACT
+from emb_daemon.models.wander import OFFSET_RAD_PER_S
 
 #: ``share`` of what strays that is the angle's fault, and ``told``: what stops have told of it, as an inverse variance. The
 #: last release left the contact angle at ``contact`` rad with variance ``known`` rad² (0: placed anew since); since then the
 #: zero may have ``strayed`` by so many rad, and the contact angle ``gained`` that variance beside, rad². ``walked``: the
 #: variance that the contact angle gains with the present sample because of what strays, rad². ``speed`` rad/s, smoothed, and
 #: ``creeps``: whether the motor may stand although its angle creeps.
-STRAYING = np.dtype(
-    [*fields("f8", "share told strayed contact known gained walked speed"), ("creeps", "?")],
-    align=True,
-)
+STRAYING = np.dtype([*fields("f8", "share told strayed contact known gained walked speed"), ("creeps", "?")], align=True)
 
 #: Inverse variance of the share before a stop has told anything: nothing or all of it.
 _OPEN = 1.0 / 0.5**2
 #: What of the evidence is kept from stop to stop: an offset of the speed is joined by a drift of the angle within minutes.
 _KEPT = 0.9
-#: Time over which the speed is smoothed, s; what it then is of a motor that stands: a count of the wire, rad/s, and so many
-#: standard deviations of its noise.
-_SMOOTHED_S, _COUNT_RAD_PER_S, _NOISE = 0.2, 0.02, 3.0
+#: Time over which the speed is smoothed, s; of a motor that stands it then is the speed's offset and so many standard
+#: deviations of its noise.
+_SMOOTHED_S, _NOISE = 0.2, 3.0
 
 
 @njit
@@ -52,7 +50,7 @@ def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
     a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (speed - a.speed)
     noise = s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
     # An angle that strays while the speed shows nothing does not slide the gear: what friction carries at rest stays unknown.
-    a.creeps = w.drift != 0.0 and abs(a.speed) < _COUNT_RAD_PER_S + _NOISE * noise
+    a.creeps = w.drift != 0.0 and abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
 
 
 @njit

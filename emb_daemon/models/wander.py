@@ -20,9 +20,10 @@ _GAIN, _AGE, _RATE, _LOSS, _CAUSES = 0, 1, 2, 3, 4
 #: The present stretch: its duration, angle less integrated speed (``slip``, rad), integrated speed (``net`` rad), the same
 #: without sign while the motor turned (``way`` rad), and gained speed (rad/s). ``normal``, ``right``: weighted normal
 #: equations, which forget; ``lower``, ``half``: scratch. ``offset_weight``, ``offset_sum``: what the speed's offset was so
-#: far. ``strayed`` rad: slip of late. ``rate`` rad/s and ``loss``: drift with time and share of the way, where they are
-#: likely, else 0; ``found``: whether one is certain; ``unseen`` rad: what had strayed when that was found, until it has been
-#: taken into account.
+#: far. ``strayed`` rad: slip of late. ``drift`` rad/s: what the angle gains with time over the integrated speed, ``rate``
+#: rad/s: what of that the speed's offset does not explain, and ``loss``: share of the way, where each is likely, else 0;
+#: ``found``: whether rate or loss is certain; ``unseen`` rad: what had strayed when that was found, until it has been taken
+#: into account.
 WANDER = np.dtype(
     [
         *fields("f8", "seconds slip net way gained"),
@@ -52,7 +53,7 @@ _COUNTS_RAD, _MISSED = 0.003, 0.001
 #: Offset of a healthy resolver's speed when nothing is known of it, rad/s, standard deviation: one count of the wire, which a
 #: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
 #: is learned from what differs from it by less than so many standard deviations. Time in which it becomes another, s.
-_OFFSET_RAD_PER_S, _OFFSET_OF_NOISE, _LIKE_BEFORE, _OFFSET_CHANGES_S = 0.02, 0.1, 2.0, 600.0
+OFFSET_RAD_PER_S, _OFFSET_OF_NOISE, _LIKE_BEFORE, _OFFSET_CHANGES_S = 0.02, 0.1, 2.0, 600.0
 #: Standard deviations from which a drift or a loss counts in the force's sigma, and from which it is told: of evidence that
 #: renews itself in 40 s, one in a few hours of driving has so much by chance, and one in a week.
 _LIKELY, _SURELY = 3.0, 4.0
@@ -117,7 +118,7 @@ def _offset(a, noise):
     keep = exp(-a.seconds / _OFFSET_CHANGES_S)
     a.offset_weight *= keep
     a.offset_sum *= keep
-    weight = a.offset_weight + 1.0 / (sq(_OFFSET_RAD_PER_S) + sq(_OFFSET_OF_NOISE * noise))
+    weight = a.offset_weight + 1.0 / (sq(OFFSET_RAD_PER_S) + sq(_OFFSET_OF_NOISE * noise))
     return a.offset_sum / weight, 1.0 / sqrt(weight)
 
 
