@@ -23,9 +23,11 @@ import numpy as np
 
 from emb_daemon.adapt.pairs import FORCE, FRICTION, WEIGHT, pairs_of_passes
 from emb_daemon.adapt.records import TRAINING
+from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main as emb_daemon
-from emb_daemon.offline.log import log_of
+from emb_daemon.offline.log import load_log, log_of
+from studies.plain import plain_fits
 
 _TOOLS = Path(__file__).parent.parent / "tools"
 STATES = ("normal", "lackLubrication1", "lackLubrication2", "backlash1", "backlash2", *(f"spalling{n}" for n in range(1, 9)))
@@ -130,7 +132,7 @@ def embir(folder: Path, work: Path) -> list[str]:
         )
     slow = work / EMBIR_SLOW
     rows.append(_diagnosed("slow turning, left-out episodes", [slow / "run.log"], slow, [], gamma, work / "found_slow"))
-    plain = ", ".join(f"{name} {error:.3f}" for name, error in _plain_fits(base, gamma).items())
+    plain = ", ".join(f"{name} {error:.3f}" for name, error in _plain_of_halves(base).items())
     return [
         f"Plain fits of the first half on the second, N·m: {plain}.", "",
         "| logs | before, N·m | after, N·m | found |", "|---|---|---|---|", *rows,
@@ -145,10 +147,9 @@ def tmotor(folder: Path, work: Path) -> list[str]:
         base = work / path.parent.name
         if convert.main([str(path), "--output", str(base)]):
             continue
-        halves = ([base / f"{half}_half.log"] for half in ("first", "second"))
-        gamma = convert.GEAR_GAIN_M_PER_RAD
-        row = _diagnosed(path.parent.name, next(halves), base, next(halves), gamma, base / "found")
-        rows.append(" ".join([row, *(f"{error:.3f} |" for error in _plain_fits(base, gamma).values())]))
+        first, second = (base / f"{half}_half.log" for half in ("first", "second"))
+        row = _diagnosed(path.parent.name, [first], base, [second], convert.GEAR_GAIN_M_PER_RAD, base / "found")
+        rows.append(" ".join([row, *(f"{error:.3f} |" for error in _plain_of_halves(base).values())]))
     return rows
 
 
@@ -164,21 +165,10 @@ def _diagnosed(name: str, logs: list[Path], base: Path, validate: list[Path], ga
     return f"| {name} | {gamma * torque['rmse_before_N']:.3f} | {gamma * torque['rmse_after_N']:.3f} | {found} |"
 
 
-def _plain_fits(base: Path, gamma: float) -> dict[str, float]:
-    """Error (N m) on the second half of torque over current with the first half's coefficients: constant and offset, with
-    friction, with saturation."""
-    from emb_daemon.offline import load_log
-
-    tables = []
-    for half in ("first_half", "second_half"):
-        log = load_log(base / f"{half}.log")
-        known, s = np.isfinite(log.force_N), log.samples
-        i, v = s["current_q"], s["speed"]
-        table = np.column_stack([i, np.ones(len(i)), np.tanh(v / 0.5), v, i * np.abs(i)])
-        tables.append((table[known], gamma * log.force_N[known]))
-    (fit, wanted), (judge, measured) = tables
-    widths = {"constant and offset": 2, "friction": 4, "saturation": 5}
-    return {name: _rms(measured - judge[:, :n] @ _line(fit[:, :n], wanted)) for name, n in widths.items()}
+def _plain_of_halves(base: Path) -> dict[str, float]:
+    """Errors (N m) of plain fits to the first half on the second."""
+    first, second = (load_log(base / f"{half}_half.log") for half in ("first", "second"))
+    return plain_fits([first], [second], load_calibration(base / "calibration.yaml"))
 
 
 def main(argv: list[str] | None = None) -> int:
