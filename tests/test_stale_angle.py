@@ -4,6 +4,9 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.contact import follow_zero
+from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.models.plausibility import watch
 from emb_daemon.offline import estimate
 
 _STOPS = 12
@@ -58,3 +61,25 @@ def test_an_angle_that_goes_on_from_where_it_stopped_takes_the_contact_angle_wit
     estimates = estimate(rows, p)
     assert abs(estimates["contact_angle"][-1] - healthy["contact_angle"][-1] + lost) < 0.5
     assert np.mean(_beyond(estimates, force)[at + samples + 25 :]) < 0.01
+
+
+def _zeros_moved(p, angles, speeds):
+    s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
+    moved = []
+    for angle, speed in zip(angles, speeds, strict=True):
+        m["angle"], m["speed"], m["dt"] = angle, speed, 0.004
+        moved.append(bool(follow_zero(s, p, m)))
+        watch(s["plausibility"], m, s["angle"], s["speed"], 0.0, 1.0, True)
+        s["angle"], s["speed"] = angle, speed
+    return moved
+
+
+def test_a_speed_that_repeats_with_the_angle_tells_of_no_way(p):
+    """The motor had stopped, and a frame of its motion was sent again and again."""
+    angles, speeds = np.zeros(30), 0.1 * (-1.0) ** np.arange(30)
+    speeds[1:12] = 100.0
+    angles[-5:] = 0.0015
+    assert not any(_zeros_moved(p, angles, speeds))
+    # As it came, sample by sample, the same way is missing.
+    speeds[1:12] += np.arange(11)
+    assert any(_zeros_moved(p, angles, speeds))

@@ -4,6 +4,10 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.contact import place_contact
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.straying import attribute_straying
+from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.wander import WANDER, leave_stretch, watch_wander
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
@@ -156,3 +160,18 @@ def test_an_angle_that_creeps_in_a_hold_does_not_slide_the_gear(p, seed):
     held = slice(-5000, None)
     missed = np.abs(estimates["torque_force"] - force)[held] / estimates["torque_sigma"][held]
     assert np.nanmedian(missed) < 1.3
+
+
+@pytest.mark.parametrize("placed", [False, True])
+def test_a_contact_angle_that_was_placed_anew_tells_nothing_of_the_zero(p, placed):
+    """It moved because another one was believed, not because the zero strayed."""
+    s = new_state()[0]
+    s["gear_slope"], s["straying"]["known"], s["straying"]["strayed"] = 1.0, 0.01, 0.5
+    s["covariance"][CONTACT, CONTACT], s["clearance"] = 0.01, p["clearance"]
+    if placed:
+        place_contact(s, p, 5.0)
+        s["covariance"][CONTACT, CONTACT] = 0.01
+    s["contact_angle"] += 0.5
+    attribute_straying(s)
+    assert s["straying"]["share"] == (0.0 if placed else pytest.approx(0.86, abs=0.01))
+    assert s["straying"]["strayed"] == 0.0 and s["straying"]["known"] == 0.01

@@ -10,7 +10,6 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.hypotheses import GATE
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.jit import Record, fields, njit, sq
 from emb_daemon.models.fusion import CONTACT
@@ -63,8 +62,7 @@ def attribute_straying(s: Record) -> None:
         # What the stop alone has told of the contact angle, and how well.
         whole = predicted / (predicted - known)
         moved, told = (contact - a.contact) * whole, known * whole
-        if sq(moved) < sq(GATE) * (predicted + told):
-            a.share = min(max(a.share + _variance(a) * strayed * moved / (predicted + told), 0.0), 1.0)
-            a.told += strayed * strayed / (walked + told)
+        a.share = min(max(a.share + _variance(a) * strayed * moved / (predicted + told), 0.0), 1.0)
+        a.told += strayed * strayed / (walked + told)
     a.told *= _KEPT
     a.contact, a.known, a.strayed, a.gained = contact, known, 0.0, 0.0
