@@ -21,6 +21,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import Log, load_log
+from emb_daemon.offline.score import rmse
 
 #: Share of the largest speed within which friction falls; samples over which an acceleration is taken: so many that quantised
 #: speeds leave one.
@@ -46,10 +47,7 @@ def _errors(fitted, judged, table, widths):
     (columns, wanted), (judge, measured) = (
         tuple(np.concatenate(parts) for parts in zip(*map(table, logs), strict=True)) for logs in (fitted, judged)
     )
-    return {
-        name: float(np.sqrt(np.mean((measured - judge[:, :n] @ np.linalg.lstsq(columns[:, :n], wanted)[0]) ** 2)))
-        for name, n in widths.items()
-    }
+    return {name: rmse(measured - judge[:, :n] @ np.linalg.lstsq(columns[:, :n], wanted)[0]) for name, n in widths.items()}
 
 
 def _over_current(log):
