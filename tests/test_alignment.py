@@ -29,14 +29,30 @@ def _late(values, cycles):
     return np.interp(np.arange(len(values)) - cycles, np.arange(len(values)), values)
 
 
-def _compare(shown, needed, a=None):
+def _filtered(values, cycles):
+    """Through a first-order filter of so many cycles."""
+    shown, state = np.empty_like(values), values[0]
+    for row, value in enumerate(values):
+        state += (value - state) / (1.0 + cycles)
+        shown[row] = state
+    return shown
+
+
+def _apart(torque, cycles):
+    """Torque by a current through a filter, and by a motion with its noise; or that through one, if ``cycles`` is negative."""
+    needed = torque + _NOISE * np.random.default_rng(3).standard_normal(len(torque))
+    return (_filtered(torque, cycles), needed) if cycles >= 0.0 else (torque, _filtered(needed, -cycles))
+
+
+def _compare(shown, needed, a=None, noise=_NOISE):
     a = np.zeros(1, ALIGNMENT)[0] if a is None else a
-    noise = _NOISE * np.random.default_rng(2).standard_normal(len(shown))
+    noise = noise * np.random.default_rng(2).standard_normal(len(shown))
     # The motor is turning.
     a["angle"][0] = 1.0
     for one, other in zip(shown + noise, needed, strict=True):
-        compare(a, one, other, _NOISE)
-    return float(a["late"])
+        compare(a, one, other, 0.0, _NOISE)
+    assert 0.0 in (a["late"], a["slow"])
+    return float(a["late"] + a["slow"])
 
 
 @pytest.mark.parametrize("cycles", [-2.0, -1.0, 1.0, 2.0, 2.2, 3.0])
@@ -46,16 +62,34 @@ def test_a_shift_is_found(cycles):
     assert _compare(*pair) == pytest.approx(cycles, abs=0.15)
 
 
+@pytest.mark.parametrize("cycles", [-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_filter_is_found(cycles, seed):
+    a, (shown, needed) = np.zeros(1, ALIGNMENT)[0], _apart(_torque(seed=seed), cycles)
+    assert _compare(shown, needed, a, 0.0) == pytest.approx(cycles, rel=0.25)
+    assert a["late"] == 0.0
+
+
+def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
+    torque, a = _torque(20.0), np.zeros(1, ALIGNMENT)[0]
+    before, after = torque[:3500], torque[3500:4000]
+    assert _compare(*_apart(before, 0.0), a, 0.0) == 0.0
+    _compare(*_apart(after, 2.0), a, 0.0)
+    assert a["slow"] == pytest.approx(2.0, rel=0.25)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
         lambda t: t,
+        lambda t: 0.5 * t,
+        lambda t: 2.0 * t,
         lambda t: 1.1 * t,
         lambda t: t + 0.1,
         lambda t: 0.0 * t,
         lambda t: t + 0.1 * np.sign(t),
     ],
-    ids=["nothing", "gain", "offset", "dead", "friction"],
+    ids=["nothing", "half", "twice", "gain", "offset", "dead", "friction"],
 )
 @pytest.mark.parametrize("seed", range(5))
 def test_what_no_shift_explains_is_none(wrong, seed):
@@ -69,7 +103,7 @@ def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
     assert a["told"] == 0.0
     a["angle"] = 0.0
     for torque in _torque():
-        compare(a, 0.0, torque, _NOISE)
+        compare(a, 0.0, torque, 0.0, _NOISE)
     assert a["told"] == 0.0
     stroke = np.concatenate((np.zeros(20), np.full(10, 0.6), np.full(10, -0.3), np.full(20, 0.3)))
     assert _compare(_late(stroke, 2.0), stroke, a) == pytest.approx(2.0, abs=0.1)
@@ -99,12 +133,12 @@ def test_samples_of_before_a_gap_are_not_compared():
     np.testing.assert_array_equal(a["square"], squares)
 
 
-def _moved(names, cycles):
-    """What makes signals of a drive come some cycles late."""
+def _moved(names, cycles, by=_late):
+    """What makes signals of a drive come some cycles late, or through a filter."""
 
     def change(rows):
         for name in names:
-            rows[name] = _late(rows[name], cycles)
+            rows[name] = by(rows[name], cycles)
 
     return change
 
@@ -113,11 +147,11 @@ _CURRENT, _MOTION = ("current_q",), ("angle", "speed")
 
 
 @pytest.mark.parametrize("names", [_CURRENT, _MOTION])
-@pytest.mark.parametrize("cycles", [1.0, 2.0])
+@pytest.mark.parametrize(("by", "cycles"), [(_late, 1.0), (_late, 2.0), (_filtered, 1.5), (_filtered, 2.0)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_it_is_undone_within_a_stop(names, cycles, seed):
+def test_it_is_undone_within_a_stop(names, by, cycles, seed):
     """The force is that of the sample, not of the time to which the earlier of both was moved back."""
-    estimates, force = city.changed(_moved(names, cycles), seed, 40.0)
+    estimates, force = city.changed(_moved(names, cycles, by), seed, 40.0)
     unmoved, _ = city.changed(seed=seed, seconds=40.0)
     second = slice(city.SECOND_CLEARANCE, None)
     error = (estimates["force"] - force)[second]
@@ -128,7 +162,7 @@ def test_it_is_undone_within_a_stop(names, cycles, seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_unit_within_tolerances_is_in_step(parameters, seed):
     a = _after(city.drive(seed, 40.0)[0], parameters)["alignment"]
-    assert (a["delay"], a["late"]) == (0.0, 0.0) and a["told"] > 20.0
+    assert (a["delay"], a["late"], a["lag"], a["slow"]) == (0.0, 0.0, 0.0, 0.0) and a["told"] > 15.0
 
 
 @pytest.mark.parametrize("cycles", [2.0, 3.0])
@@ -198,6 +232,46 @@ def test_no_shift_is_beyond_what_frames_and_gateways_make(found, limit):
     assert a["delay"] == limit
 
 
+@pytest.mark.parametrize("found", [-20.0, 20.0])
+def test_no_filter_is_slower_than_can_be_undone(found):
+    a, m = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0]
+    m["dt"] = _DT
+    for _ in range(8):
+        align(a, m)
+    a["slow"] = found
+    align(a, m)
+    assert a["lag"] == np.copysign(alignment.SLOWEST, found) and a["slow"] == 0.0
+
+
+@pytest.mark.parametrize("cycles", [-4.0, 2.0, 6.0])
+def test_a_filter_and_its_inverse(cycles):
+    """Over gaps too, where a current has changed steadily."""
+    true = _torque()
+    a, m, undone = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0], []
+    a["lag"] = cycles
+    for value in _filtered(true, cycles) if cycles > 0.0 else true:
+        m["dt"], m["current_q"] = _DT, value
+        align(a, m)
+        undone.append(float(m["current_q"]))
+    np.testing.assert_allclose(undone[2:], (true if cycles > 0.0 else _filtered(true, -cycles))[2:], atol=1e-9)
+    m["dt"], m["current_q"] = 20.0 * abs(cycles) * _DT, 1.0
+    align(a, m)
+    assert m["current_q"] == pytest.approx(1.0, abs=0.06)
+
+
+def test_the_inverse_of_a_filter_adds_noise_to_a_torque(parameters):
+    p, state = brake.ideal(parameters), new_state()
+    rows = brake.samples(p, brake.stops(p, 2))[0]
+    estimate(rows, p, state)
+    plain = fuse._moving_variance(state[0], p, rows[-1])
+    state[0]["alignment"]["lag"] = 3.0
+    # Four times this current less three times the one before, of independent noise, instead of this current alone.
+    expected = (4.0**2 + 3.0**2 - 1.0) * (p["torque_constant"] * p["current_sigma"]) ** 2
+    assert fuse._moving_variance(state[0], p, rows[-1]) - plain == pytest.approx(expected)
+    state[0]["alignment"]["lag"] = -3.0
+    assert fuse._moving_variance(state[0], p, rows[-1]) == plain
+
+
 def test_a_force_beyond_the_range_is_told_at_its_own_sample(parameters, late):
     parameters["maximum_force"] = 5000.0
     state = new_state()
@@ -217,6 +291,18 @@ def test_it_survives_a_restart(parameters, late):
     assert restart.why_implausible(snapshot, p) == "delay"
 
 
+def test_a_filter_survives_a_restart(parameters):
+    p, resumed, snapshot = parameters[0], new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+    samples = city.drive(1, 25.0)[0].copy()
+    _moved(_CURRENT, 3.0, _filtered)(samples)
+    assert restart.take_snapshot(_after(samples, parameters), p, snapshot) and not restart.why_implausible(snapshot, p)
+    assert snapshot["lag"] == pytest.approx(3.0, rel=0.15)
+    restart.resume(resumed, p, snapshot, 60.0)
+    assert resumed["alignment"]["lag"] == snapshot["lag"]
+    snapshot["lag"] = -12.5
+    assert restart.why_implausible(snapshot, p) == "lag"
+
+
 @pytest.mark.parametrize(
     ("field", "value", "told"),
     [
@@ -224,6 +310,11 @@ def test_it_survives_a_restart(parameters, late):
         ("delay", 3.9, False),
         ("delay", 4.0, True),
         ("delay", -3.0, True),
+        ("slow", 1.0, True),
+        ("slow", -1.0, True),
+        ("lag", 11.0, False),
+        ("lag", 12.0, True),
+        ("lag", -12.0, True),
     ],
 )
 def test_the_fact(parameters, field, value, told):

@@ -59,7 +59,7 @@ from emb_daemon.estimator.unknown import (
     torque_offset,
 )
 from emb_daemon.jit import Record, hypot, njit, sq
-from emb_daemon.models.alignment import at_bound, compare, interrupt
+from emb_daemon.models.alignment import at_bound, compare, interrupt, out_of_step
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -199,12 +199,15 @@ def _predict(s, p, m, spread, warmth, known):
 
 @njit
 def _moving_variance(s, p, m):
-    """Variance, (N m)^2, of one torque from noise of the speeds and from the difference in time between current and angle."""
+    """Variance, (N m)^2, of one torque from noise of the speeds, from the difference in time between current and angle, and
+    from what a filter's inverse adds to the noise of a current, whatever part of it is behind the filter."""
     unknown_speed = s.speed_sigma if m.dt <= ONE_CYCLE_S else s.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
     apart = _LATE + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
     late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
-    return 2.0 * speed_torque * speed_torque + late * late
+    lag = max(s.alignment.lag, 0.0)
+    added = 2.0 * lag * (1.0 + lag) * sq(p.torque_constant * p.current_sigma)
+    return 2.0 * speed_torque * speed_torque + late * late + added
 
 
 @njit
@@ -232,7 +235,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
     if not known and m.dt <= ONE_CYCLE_S and s.past_contact < -_BACK * s.clearance:
         wanted = s.motor_torque - torque + leverage * mean_force + s.error[OFFSET]
-        compare(s.alignment, s.motor_torque, wanted, sqrt(moving))
+        compare(s.alignment, s.motor_torque, wanted, wanted - p.inertia * (m.speed - s.speed) / m.dt, sqrt(moving))
     else:
         interrupt(s.alignment)
     fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
@@ -282,7 +285,7 @@ def fuse(
     out.innovation = out.innovation_sigma = np.nan
     out.torque_sigma = turning_sigma = standing_sigma = np.inf
     if np.isfinite(torque):
-        trusted = s.plausibility.verdict == AGREE and not s.unknown and s.alignment.late == 0.0
+        trusted = s.plausibility.verdict == AGREE and not s.unknown and not out_of_step(s.alignment)
         if trusted != s.trusted:
             # What the alternatives learned around a sensor's fault is not due to the brake.
             open_all(s, p)
@@ -407,7 +410,7 @@ def _facts_of_torque(s, p):
         facts |= DISC_UNEVEN
     if s.late > _TOLD_CYCLES * CYCLE_S:
         facts |= ANGLE_LATE
-    if s.alignment.late != 0.0 or at_bound(s.alignment):
+    if out_of_step(s.alignment) or at_bound(s.alignment):
         facts |= CURRENT_APART
     if s.sensor.wrong:
         facts |= FORCE_SENSOR_WRONG

@@ -23,7 +23,7 @@ from emb_daemon.estimator.unknown import (
     set_priors,
 )
 from emb_daemon.jit import Record, entry, njit, sq
-from emb_daemon.models.alignment import EARLIEST, LATEST
+from emb_daemon.models.alignment import EARLIEST, LATEST, SLOWEST
 from emb_daemon.models.fusion import CONTACT, CREEPS, FAST, NOISE, STATES, copy_errors
 from emb_daemon.models.thermal import NODES, UNALTERED, heat_step
 from emb_daemon.wire.contract import CYCLE_S
@@ -51,6 +51,7 @@ SNAPSHOT = np.dtype(
         ("winding", "f8"),
         ("housing", "f8"),
         ("delay", "f8"),
+        ("lag", "f8"),
         ("temperature_known", "?"),
         ("pads", "f8", (2, NODES)),
         ("disc", "f8"),
@@ -83,7 +84,7 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
         snapshot.creep[i] = s.creep[i]
     copy_errors(snapshot.error, snapshot.covariance, s.error, s.covariance)
     snapshot.winding, snapshot.housing = s.winding, s.housing
-    snapshot.delay = s.alignment.delay
+    snapshot.delay, snapshot.lag = s.alignment.delay, s.alignment.lag
     snapshot.temperature_known = s.temperature_known
     _copy_pads(snapshot.pads, s.pads)
     snapshot.disc, snapshot.history = s.disc, s.history
@@ -120,6 +121,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
         "winding": 0.0 <= snapshot["winding"] <= _HEAT,
         "housing": 0.0 <= snapshot["housing"] <= _HEAT,
         "delay": -EARLIEST <= snapshot["delay"] <= LATEST,
+        "lag": abs(snapshot["lag"]) <= SLOWEST,
     }
     for name in ("pads", "disc", "growth_start"):
         if snapshot["temperature_known"]:
@@ -148,7 +150,7 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.covariance[FAST, FAST] = 1.0
     s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
     add_rest(s.covariance, p, elapsed_s)
-    s.alignment.delay = snapshot.delay
+    s.alignment.delay, s.alignment.lag = snapshot.delay, snapshot.lag
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
     if snapshot.temperature_known:

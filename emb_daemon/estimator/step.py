@@ -119,7 +119,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
 def _lead(s, p, m, angle, speed, out):
     """From the moment to which the sample was moved back to that in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads
     go on to where the motor is now."""
-    apart = CYCLE_S * abs(s.alignment.delay)
+    apart = CYCLE_S * (abs(s.alignment.delay) + max(-s.alignment.lag, 0.0))
     way = angle - m.angle if s.alignment.delay > 0.0 else apart * speed
     here, _ = characteristic_curve(s.past_contact, p.curve)
     there, _ = characteristic_curve(s.past_contact + s.gear_slope * way, p.curve)
@@ -173,7 +173,7 @@ def _advance(s, p, m, angle, speed, out):
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
     facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
     by_torque = facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT) != 0
-    if s.alignment.delay != 0.0 and not by_torque:
+    if (s.alignment.delay != 0.0 or s.alignment.lag < 0.0) and not by_torque:
         _lead(s, p, m, angle, speed, out)
     if p.sensor.limit > 0.0 and by_torque:
         out.force, out.sigma = with_sensor(s.sensor, out.force, out.sigma)

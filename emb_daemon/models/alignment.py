@@ -1,14 +1,19 @@
-"""Time by which the current is late, or early, beside the motion that it causes.
+"""Time by which the current is late, or early, beside the motion that it causes, and filters that either went through.
 
 Angle and current travel in two messages. A gateway, or another sampling instant, moves one against the other by some cycles;
-where the torque changes, the balance of torques then fails by kilonewtons, which pass for another contact, stiffness or
-friction. While the pads are apart, inertia and friction alone need a torque. Its changes are compared with the current's at
-several shifts in whole cycles; the least sum of squares and its two neighbours give the shift (Knapp and Carter, The
-generalized correlation method for estimation of time delay, IEEE Trans. Acoustics, Speech and Signal Processing 24(4), 1976).
-Then the earlier of both is delayed as the other is. Of 24 phases with a current that is up to 12 ms late 14 fail without this
-and none with it, of 29 with a resolver that is one or two cycles late 13 and 2 (`studies.silent grid --faults
-current_delayed,resolver_delayed --count 8 --seed 5`).
+another converter or tracking loop filters one of them. Where the torque changes, the balance of torques then fails by
+kilonewtons, which pass for another contact, stiffness or friction. While the pads are apart, inertia and friction alone need a
+torque. Its changes are compared with the current's: at several shifts in whole cycles, where the least sum of squares and its
+two neighbours give a shift (Knapp and Carter, The generalized correlation method for estimation of time delay, IEEE Trans.
+Acoustics, Speech and Signal Processing 24(4), 1976); with what a first-order filter has taken from the current, by linear
+regression; and with the current through several filters, because the motion may have gone through one. What explains most is
+undone: the earlier signal is delayed, or filtered, as the other is, and a filtered current is what went into its filter.
+
+Of 24 phases with a current that is up to 12 ms late 14 fail without this and none with it, of 29 with a resolver that is one
+or two cycles late 13 and 2 (`studies.silent grid --faults current_delayed,resolver_delayed --count 8 --seed 5`).
 """
+
+from math import exp, log
 
 import numpy as np
 
@@ -18,35 +23,48 @@ from emb_daemon.wire.contract import CYCLE_S
 #: Cycles by which a current may be early or late: sample, frame and gateway each a cycle.
 EARLIEST, LATEST = 3, 4
 _SHIFTS = EARLIEST + LATEST + 1
+#: Longest time constant of a filter that is undone, cycles: the noise of a current grows by some times as much. Time constants
+#: of those that the current is compared through with the motion, an octave from each other.
+SLOWEST, _FILTERS = 12.0, (1.0, 2.0, 4.0, 8.0)
 #: Change of the needed torque that tells shifts apart, in standard deviations of a torque; way within the samples that are
 #: kept which noise of angle or speed does not make, rad. Without a fault one cycle then makes some twenty times the sum of
 #: squares.
 _CLEAR, _MOVED_RAD = 6.0, 0.05
-#: Samples that tell, over which the sums forget: some stops. Fewest of them that are enough: one stroke has as many.
-_KEPT, _ENOUGH = 100.0, 6.0
-#: Least shift that is taken out, cycles. Half of one is within what the estimate allows for, and interpolation costs as much.
-_WORTH = 0.6
-#: Standard deviations of a torque that its changes must be off by on the average: three of a difference's.
-_BEYOND = 4.2
-#: Least part of the sum of squares that a shift must explain: a right one leaves a twentieth, and friction that the
-#: calibration does not know, as of grease at -20 degC, has made a wrong one explain half.
-_EXPLAINS = 0.6
+#: Samples that tell, over which the sums forget: a few strokes, because what changes while driving is to be found against what
+#: was seen before. Of 34 phases with a filtered current (`studies.silent grid --faults current_filtered --count 10 --seed 61`)
+#: 11 fail with 100. Fewest of them that are enough: one stroke has as many.
+_KEPT, _ENOUGH = 20.0, 6.0
+#: Least shift that is taken out, and least time constant, cycles. Half of one is within what the estimate allows for, and
+#: interpolation costs as much; a current that is late by a third looks like a filter of as much.
+_WORTH, _WORTH_SLOW = 0.6, 0.5
+#: Standard deviations of a torque that its changes must be off by on the average: a difference's own are 1.4, and the shortest
+#: filter above makes two where changes are as small as may tell.
+_BEYOND = 1.75
+#: Least part of the sum of squares that a shift, or a filter of the current, must explain: a right one leaves a twentieth to
+#: a fifth, and friction that the calibration does not know, as of grease at -20 degC, has made a wrong one explain half. The
+#: same of a filter of the motion: a current that shows twice as much looks like one, and two thirds of it are explained.
+_EXPLAINS, _EXPLAINS_MOTION = 0.6, 0.8
 #: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
 _SETTLED = 16.0
 #: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
 #: 12 bit meanwhile, rad.
 _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
-#: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2, by shift, of
-#: what they change by beside each other, of what the shown one ``changed`` by, and of noise (``noisy``). ``heard`` cycles
-#: without a gap, ``told`` of them that tell, ``restless``: those left until the last is settled. ``late`` cycles: by which the
-#: current is behind, beyond the ``delay`` cycles that are taken out; negative where the motion is. The last samples: ``age``
-#: s, ``angle``, ``speed``, ``current``.
+#: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2: by shift, of
+#: what they change by beside each other, of what the shown one ``changed`` by and the needed one (``moved``), of noise
+#: (``noisy``), and of the shown one's second differences (``curved``), and their product with the difference of both changes
+#: (``against``). ``heard`` cycles without a gap, ``told`` of them that tell, ``restless``: those left until the last is
+#: settled. ``late`` cycles: by which the current is behind, beyond the ``delay`` cycles that are taken out; negative where the
+#: motion is. ``slow`` cycles: time constant of a filter of the current, beyond the ``lag`` that is taken out; negative of the
+#: motion. ``filtered`` A: the last current, as it came or, if the motion is filtered, through that filter. ``rubbed`` N m:
+#: friction in the needed torque. ``slower`` N m: the shown one less friction through each filter, by which it changed in this
+#: cycle (``slower_change``), and ``slower_square``, as above. The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
 ALIGNMENT = np.dtype(
     [
-        *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed")),
+        *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed", "rubbed")),
         ("square", "f8", (_SHIFTS,)),
-        *fields("f8", "changed noisy heard told restless late delay"),
+        *fields("f8", "changed moved noisy curved against heard told restless late delay slow lag filtered"),
+        *((name, "f8", (len(_FILTERS),)) for name in ("slower", "slower_change", "slower_square")),
         *((name, "f8", (_KEPT_SAMPLES,)) for name in ("age", "angle", "speed", "current")),
     ],
     align=True,
@@ -55,16 +73,36 @@ ALIGNMENT = np.dtype(
 
 @njit
 def align(a: Record, m: Record) -> None:
-    """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other."""
+    """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other, and a filtered current by
+    what went into its filter."""
     _keep(a, m)
     a.restless = max(a.restless - 1.0, 0.0)
-    if a.late != 0.0 and _range(a.angle) < _STANDS_RAD:
+    if out_of_step(a) and _range(a.angle) < _STANDS_RAD:
         a.delay = min(max(a.delay + a.late, -EARLIEST), LATEST)
+        a.lag = min(max(a.lag + a.slow, -SLOWEST), SLOWEST)
         _forget(a)
     if a.delay > 0.0:
         m.angle, m.speed = _at(a.age, a.angle, a.delay * CYCLE_S), _at(a.age, a.speed, a.delay * CYCLE_S)
     elif a.delay < 0.0:
         m.current_q = _at(a.age, a.current, -a.delay * CYCLE_S)
+    _filter(a, m)
+
+
+@njit
+def _filter(a, m):
+    current, dt = m.current_q, a.age[1]
+    if a.lag > 0.0 and dt > 0.0:
+        m.current_q += a.lag * CYCLE_S * (current - a.filtered) / dt
+    elif a.lag < 0.0:
+        kept = exp(log(a.lag / (a.lag - 1.0)) * dt / CYCLE_S)
+        current = m.current_q = current + kept * (a.filtered - current)
+    a.filtered = current
+
+
+@njit
+def out_of_step(a: Record) -> bool:
+    """Whether current and motion were seen to be apart, which is not yet undone."""
+    return a.late != 0.0 or a.slow != 0.0
 
 
 @njit
@@ -97,49 +135,90 @@ def _at(ages, values, age):
 
 
 @njit
-def compare(a: Record, shown: float, needed: float, noise: float) -> None:
-    """Take one cycle's torque by the current and by the motion while the pads are apart, N m; ``noise`` N m: standard
-    deviation by which they may differ from noise of the speed and the part of a cycle that is allowed for."""
+def compare(a: Record, shown: float, needed: float, rubbed: float, noise: float) -> None:
+    """Take one cycle's torque by the current and by the motion while the pads are apart, N m, and what ``rubbed`` of it;
+    ``noise`` N m: standard deviation by which they may differ from noise of the speed and the part of a cycle that is allowed
+    for."""
     for i in range(_SHIFTS, 0, -1):
-        a.shown[i], a.needed[i] = a.shown[i - 1], a.needed[i - 1]
-    a.shown[0], a.needed[0] = shown, needed
+        a.shown[i], a.needed[i], a.rubbed[i] = a.shown[i - 1], a.needed[i - 1], a.rubbed[i - 1]
+    a.shown[0], a.needed[0], a.rubbed[0] = shown, needed, rubbed
     a.heard += 1.0
+    _slow_down(a)
     if a.heard <= _SHIFTS or _range(a.needed) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
         return
     a.restless = _SETTLED
     a.told += 1.0 - a.told / _KEPT
     # By what they change in a cycle: friction that the calibration does not know changes slowly.
-    changed = a.shown[EARLIEST] - a.shown[EARLIEST + 1]
-    a.changed, a.noisy = _add(a.changed, changed), _add(a.noisy, _BEYOND * noise)
+    changed, before = a.shown[EARLIEST] - a.shown[EARLIEST + 1], a.shown[EARLIEST + 1] - a.shown[EARLIEST + 2]
+    moved = a.needed[EARLIEST] - a.needed[EARLIEST + 1]
+    curved = changed - before
+    a.changed, a.moved = _add(a.changed, changed * changed), _add(a.moved, moved * moved)
+    a.noisy = _add(a.noisy, _BEYOND * _BEYOND * noise * noise)
+    a.curved, a.against = _add(a.curved, curved * curved), _add(a.against, (moved - changed) * curved)
     for i in range(_SHIFTS):
-        a.square[i] = _add(a.square[i], changed - (a.needed[i] - a.needed[i + 1]))
-    a.late = _least(a)
+        off = changed - (a.needed[i] - a.needed[i + 1])
+        a.square[i] = _add(a.square[i], off * off)
+    for i in range(len(_FILTERS)):
+        off = a.slower_change[i] - (moved - (a.rubbed[EARLIEST] - a.rubbed[EARLIEST + 1]))
+        a.slower_square[i] = _add(a.slower_square[i], off * off)
+    a.late, a.slow = _found(a)
 
 
 @njit
-def _add(total, off):
-    return total + off * off - total / _KEPT
+def _slow_down(a):
+    """What accelerates the motor, through each filter. Friction does not go through that of the motion."""
+    accelerates = a.shown[EARLIEST] - a.rubbed[EARLIEST]
+    for i in range(len(_FILTERS)):
+        if a.heard <= EARLIEST + 1:
+            a.slower[i] = accelerates
+        a.slower_change[i] = (accelerates - a.slower[i]) / (1.0 + _FILTERS[i])
+        a.slower[i] += a.slower_change[i]
 
 
 @njit
-def _least(a):
-    """Shift of the least sum of squares, cycles, between the whole ones by a parabola; 0 where it explains too little."""
+def _add(total, term):
+    return total + term - total / _KEPT
+
+
+@njit
+def _found(a):
+    """Shift and time constant, cycles, of which one at most is not 0: what explains most, if it explains enough."""
+    apart = a.square[EARLIEST]
+    if a.told < _ENOUGH or apart < a.noisy:
+        return 0.0, 0.0
+    # A current, or a motion, that shows nothing is explained by nothing.
+    place, least = _least(a.square)
+    left, shift, slow = least / min(apart, a.changed), place - EARLIEST, 0.0
+    if a.against > 0.0:
+        undone = 1.0 - a.against * a.against / (a.curved * apart)
+        if undone < left:
+            left, slow = undone, a.against / a.curved
+    place, least = _least(a.slower_square)
+    filtered = least / min(apart, a.moved)
+    if filtered < left and filtered < 1.0 - _EXPLAINS_MOTION:
+        left, slow = filtered, -_FILTERS[0] * exp(log(2.0) * place)
+    if left > 1.0 - _EXPLAINS:
+        return 0.0, 0.0
+    if slow != 0.0:
+        return 0.0, slow if abs(slow) > _WORTH_SLOW else 0.0
+    return shift if abs(shift) > _WORTH else 0.0, 0.0
+
+
+@njit
+def _least(squares):
+    """Place of the least of several, and its size, between the whole ones by a parabola."""
     best = 0
-    for i in range(1, _SHIFTS):
-        if a.square[i] < a.square[best]:
+    for i in range(1, len(squares)):
+        if squares[i] < squares[best]:
             best = i
-    shift, least = float(best - EARLIEST), a.square[best]
-    if 0 < best < _SHIFTS - 1:
-        before, after = a.square[best - 1], a.square[best + 1]
+    place, least = float(best), squares[best]
+    if 0 < best < len(squares) - 1:
+        before, after = squares[best - 1], squares[best + 1]
         curvature = before - 2.0 * least + after
         if curvature > 0.0:
-            shift += 0.5 * (before - after) / curvature
+            place += 0.5 * (before - after) / curvature
             least -= 0.125 * (before - after) * (before - after) / curvature
-    # A current that shows nothing is explained by no shift.
-    tells = (
-        a.told >= _ENOUGH and a.square[EARLIEST] > a.noisy and least < (1.0 - _EXPLAINS) * min(a.square[EARLIEST], a.changed)
-    )
-    return shift if tells and abs(shift) > _WORTH else 0.0
+    return place, least
 
 
 @njit
@@ -151,19 +230,21 @@ def interrupt(a: Record) -> None:
 @njit
 def _forget(a):
     """Compare anew: what was seen so far was of other signals."""
-    a.late = a.told = a.heard = a.changed = a.noisy = 0.0
+    a.late = a.slow = a.told = a.heard = a.changed = a.moved = a.noisy = a.curved = a.against = 0.0
     for i in range(_SHIFTS):
         a.square[i] = 0.0
+    for i in range(len(_FILTERS)):
+        a.slower_square[i] = 0.0
 
 
 @njit
 def at_bound(a: Record) -> bool:
     """Whether current and motion may be further apart than is taken out."""
-    return a.delay in (-EARLIEST, LATEST)
+    return a.delay in (-EARLIEST, LATEST) or abs(a.lag) == SLOWEST
 
 
 @njit
 def aligned(a: Record) -> bool:
     """Whether a torque of now may be used before the contact angle is known: nothing has changed of late, or the changes were
     seen to belong together."""
-    return a.late == 0.0 and (a.told >= _ENOUGH or a.restless == 0.0)
+    return not out_of_step(a) and (a.told >= _ENOUGH or a.restless == 0.0)
