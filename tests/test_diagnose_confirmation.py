@@ -178,22 +178,22 @@ def test_validation_has_a_veto(nominal, judged, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("does_N", "true", "lasting_N", "refuted"),
+    ("does_N", "true", "lasting_N", "noise_N", "refuted"),
     [
-        (20.0, 0.0, 10.0, True),
-        (20.0, 1.0, 10.0, False),
-        (20.0, 0.0, 100.0, False),
-        (90.0, 0.0, 100.0, True),
-        (1e-3, 0.0, 100.0, False),
+        (25.0, 0.0, 10.0, 100.0, True),
+        (25.0, 1.0, 10.0, 100.0, False),
+        (25.0, 0.0, 100.0, 10.0, False),
+        (1e-3, 0.0, 100.0, 10.0, False),
+        (90.0, 0.0, 100.0, 10.0, True),
     ],
 )
-def test_a_log_refutes_only_what_it_would_have_shown(does_N, true, lasting_N, refuted):
-    """By how its episodes scatter; an effect that is not there, but does less than that, adds a little by chance. What adds
-    more than a twentieth to what is left is withdrawn however they scatter."""
+def test_a_log_refutes_only_what_it_would_have_shown(does_N, true, lasting_N, noise_N, refuted):
+    """By how its episodes scatter, not its samples: an effect that is not there, but does less than that, adds a little by
+    chance. What adds more than a twentieth to what is left is withdrawn however they scatter."""
     rng = np.random.default_rng(3)
     episode = np.repeat(np.arange(20), 50)
     does = does_N * np.sin(episode)
-    rest = np.repeat(rng.normal(0.0, lasting_N, 20), 50)
+    rest = np.repeat(rng.normal(0.0, lasting_N, 20), 50) + rng.normal(0.0, noise_N, 1000)
     rest -= (rest @ does + 1e-3 * does @ does) / (does @ does) * does
     bare = rest + true * does
     assert (rmse(bare - does) > rmse(bare)) != bool(true)
