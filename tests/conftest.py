@@ -19,9 +19,10 @@ _ROOT = Path(__file__).parent.parent
 #: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache the
 #: first compiles the library, in which nothing of the cache helps, the other the estimator: neither does it twice.
 _FIRST = (
-    "test_ahead", "test_hypotheses", "test_diagnose", "test_effects", "test_adapt", "test_fleet", "test_plant", "test_rig",
-    "test_identify_command", "test_foreign_rig_identify", "test_foreign_rig", "test_identify_fit", "test_formats",
-    "test_browser", "test_reload", "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
+    "test_ahead", "test_hypotheses", "test_diagnose_terms", "test_diagnose", "test_effects", "test_adapt", "test_fleet",
+    "test_diagnose_confirmation", "test_plant", "test_rig", "test_diagnose_model", "test_identify_command",
+    "test_foreign_rig_identify", "test_foreign_rig", "test_identify_fit", "test_formats", "test_browser", "test_reload",
+    "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
 )  # fmt: skip
 
 #: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
@@ -101,6 +102,15 @@ def shipped_setup():
     from emb_daemon.calibration.configuration import Setup
 
     return Setup(_ROOT / "config" / "emb.yaml")
+
+
+@pytest.fixture(scope="session")
+def calibration():
+    """The shipped one, of one brake."""
+    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.resources import resource
+
+    return load_calibration(resource("config/calibration.yaml"))
 
 
 @pytest.fixture

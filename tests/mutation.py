@@ -83,7 +83,7 @@ _SECOC = [
 _HYPOTHESES = "not (attributed or closes or drifts_takes or lubricant or fades or proven_where or first_st or noisy)"
 _TRAINING = ["tests/test_training_rules.py", "tests/test_adaptation.py"]
 _EVIDENCE = [
-    f"tests/test_diagnose.py::{name}"
+    f"tests/test_diagnose_evidence.py::{name}"
     for name in (
         "test_evidence_is_what_its_definition_gives",
         "test_two_episodes_alone_prove_nothing_however_much_they_say",

@@ -21,15 +21,9 @@ from emb_daemon.logs.candump import format_candump
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
-from emb_daemon.resources import resource
 from studies import fleet as study
 
 pytest.importorskip("distributed")
-
-
-@pytest.fixture(scope="module")
-def calibration():
-    return load_calibration(resource("config/calibration.yaml"))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.effects import REGISTRY
@@ -18,7 +17,6 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.heat import cell_count, heat_cycle
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.records import EFFECTS, FORCE, LATCH, PLANT_STATE, SUBSTEP_S
-from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import socket_pair
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PARK_RELEASED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -68,11 +66,6 @@ VISIBLE = {
     "drawn_disc_heat": {"size": 500.0, "signal": 7, "exponent": 1.0, "other": -1},
     "drawn_pad_conductivity": {"size": 0.5, "signal": 3, "exponent": 1.0, "other": -1},
 }
-
-
-@pytest.fixture(scope="module")
-def calibration():
-    return load_calibration(resource("config/calibration.yaml"))
 
 
 @pytest.fixture(scope="module")

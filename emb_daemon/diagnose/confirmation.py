@@ -17,6 +17,7 @@ from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
+from emb_daemon.diagnose.screening import Q_VALUE
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection
 from emb_daemon.diagnose.unexplained import CLEARLY
 from emb_daemon.offline.score import EpisodeErrors, rmse
@@ -243,32 +244,54 @@ def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: floa
 def validation_gains(selection: Selection, judges: Bench) -> dict[str, float]:
     """By suspect, RMS by which it lowers its channel's residual on the validation logs, in quadrature and the channel's unit;
     negative where it does harm there."""
-    bench = selection.model.bench
+    return {suspect: _gain(*pair) for suspect, pair in _with_and_without(selection, judges).items()}
+
+
+def _with_and_without(selection: Selection, judges: Bench) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By suspect, its channel's residual on the validation logs with all that was found, and without it."""
+    bench, result = selection.model.bench, {}
     with_all = judges.under(bench.calibrated(selection.applied())).residuals({})
-    result = {}
     for suspect in selection.suspects:
-        channel = selection.channel_of(suspect)
-        if channel not in with_all:
-            continue
-        rest = judges.under(bench.calibrated(selection.applied(suspect))).residuals({})
-        gain = rmse(rest[channel]) ** 2 - rmse(with_all[channel]) ** 2
-        result[suspect] = float(np.sign(gain) * np.sqrt(abs(gain)))
+        if (channel := selection.channel_of(suspect)) in with_all:
+            rest = judges.under(bench.calibrated(selection.applied(suspect))).residuals({})
+            result[suspect] = with_all[channel], rest[channel]
     return result
+
+
+def _gain(there: np.ndarray, bare: np.ndarray) -> float:
+    """RMS by which a residual is smaller with a suspect ``there``, in quadrature."""
+    gain = rmse(bare) ** 2 - rmse(there) ** 2
+    return float(np.sign(gain) * np.sqrt(abs(gain)))
+
+
+def is_refuted(there: np.ndarray, bare: np.ndarray, episode: np.ndarray) -> bool:
+    """Whether a channel's residual with a suspect ``there``, and without it, speaks as clearly against it as what was fitted
+    had to speak for it: by the likelihood of all that it does against none, episodes (N,) counted from 0 being independent.
+
+    Where it does next to nothing a log is a little better or worse for it by chance, and refutes nothing. What makes its path
+    clearly worse goes in any case."""
+    if _gain(there, bare) >= 0.0 or rmse(there) > _HARM * rmse(bare):
+        return _gain(there, bare) < 0.0
+    moments = Moments.of((bare - there)[:, None], bare, episode, int(episode[-1]) + 1)
+    share = leave_out(moments, np.zeros(1))
+    return bool(share.values[0] - 0.5 < np.log(Q_VALUE) * share.covariance[0, 0])
 
 
 def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
     """The suspect that the validation logs speak against most, and what they say."""
-    gains = validation_gains(selection, judges)
-    worst = min(gains, key=gains.__getitem__, default=None)
-    if worst is not None and gains[worst] < 0.0:
-        channel = selection.channel_of(worst)
-        return worst, f"withdrawn: on the validation logs it adds {-gains[worst]:.3g} {UNITS[channel]} RMS to what it explains"
+    spoken = _with_and_without(selection, judges)
+    channel = {suspect: selection.channel_of(suspect) for suspect in spoken}
+    refuted = {s: _gain(*pair) for s, pair in spoken.items() if is_refuted(*pair, judges.episode[channel[s]])}
+    if refuted:
+        worst = min(refuted, key=refuted.__getitem__)
+        adds = f"{-refuted[worst]:.3g} {UNITS[channel[worst]]} RMS"
+        return worst, f"withdrawn: on the validation logs it adds {adds} to what it explains"
     bench, main = selection.model.bench, whole(judges)
     before = errors(judges, bench.calibration)
     # If nothing is clamped there is only this path, and no other hides the effect of a recalibration.
     tolerated = _HARM if judges.clamps else 1.0
     worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, tolerated)
-    if not worse or not gains:
+    if not worse or not spoken:
         return None
-    rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in gains}
+    rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in spoken}
     return min(rest, key=rest.__getitem__), f"withdrawn: {worse} on the validation logs"
