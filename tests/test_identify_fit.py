@@ -250,6 +250,26 @@ def test_a_slow_clamp_alone_shows_what_is_slower_than_it(there):
         assert found.values["effects.second_relaxation.share"] == pytest.approx(0.1, abs=0.02)
 
 
+@pytest.mark.parametrize("preload_N", [0.0, 2000.0])
+def test_a_log_that_begins_without_a_force_has_its_contact_still_to_come(preload_N):
+    """A force that rises at once and then flattens is no cubic: a contact far before the log fits it, and no other log."""
+    known = _one_curve()
+    log = _slow_log(known)
+    travel = log.samples["angle"] - log.samples["angle"][0]
+    log = dataclasses.replace(log, force_N=preload_N + 2e4 * np.sqrt(travel / travel.max() + 1e-4) - 200.0)
+    found = fit_dynamics([Pads(known.pad_thickness_mm, (log,))], known, shared=()).curves[0].clearances_rad
+    assert found < 0.0 if preload_N else found >= 0.0
+
+
+def test_a_loop_of_a_rubber_is_found():
+    """Half of the force lost between clamping and release over a third of the travel."""
+    own = {"effects.stiffness_hysteresis.share": 0.4, "effects.stiffness_hysteresis.slip_angle_rad": 15.0}
+    known = moved(_one_curve(), own | {RELAXATION: stiffness.USUAL_RELAXATION_S})
+    found = stiffness.identify([Pads(known.pad_thickness_mm, (_slow_log(known),))], replace(known, effects={}))
+    for key, value in own.items():
+        assert found.values[key] == pytest.approx(value, rel=0.05), key
+
+
 def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
     """As fitted, half of what tells two clamps apart would be in the error, and in sigma."""
     known = _one_curve()

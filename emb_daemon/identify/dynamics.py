@@ -36,6 +36,8 @@ _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
 #: How far from where a fit to all logs puts it a log's contact is looked for in a fit to the others, over its travel.
 _CONTACT = 0.1
+#: Share of a log's largest force that is none: the zero of a force sensor is as sure as that.
+_NO_FORCE = 0.01
 #: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
@@ -222,6 +224,12 @@ def _rest_noise(log: Log) -> float:
     return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
 
 
+def _begins_free(log: Log) -> bool:
+    """Whether the first samples' reference force is none."""
+    first = np.median(log.force_N[np.isfinite(log.force_N)][:5])
+    return bool(abs(first) < _NO_FORCE * np.nanmax(log.force_N))
+
+
 def _travel(log: Log, calibration: Calibration) -> np.ndarray:
     """Equivalent angle (`models.gear`) from the start of a log, rad."""
     return all_through_gear(calibration.motor.gear(), log.samples["angle"] - log.samples["angle"][0])[0]
@@ -307,8 +315,9 @@ class _Model:
         for g, pads in enumerate(self.groups):
             span = max(_span(log, self.start) for log in pads.logs)
             for number, log in enumerate(pads.logs):
-                # The force is clear of its noise only somewhat past contact.
-                free[g, number] = Free(clearance_guess(log, _travel(log, self.start)) - 0.02 * span, 5e-6 * span)
+                # The force is clear of its noise only somewhat past contact; what begins without a force has it still to come.
+                guess = clearance_guess(log, _travel(log, self.start)) - 0.02 * span
+                free[g, number] = Free(guess, 5e-6 * span, 0.0 if _begins_free(log) else -np.inf)
         return free
 
     def blocks(self) -> list[Block]:
