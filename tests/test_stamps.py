@@ -670,10 +670,11 @@ def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_
                 "CurrentQ covers 8 steps of our message, and rounding hides what it says: `scale`",
             ],
         ),
+        (4e-6, ["MotorAngle covers 29 steps"]),
     ],
 )
 def test_what_our_messages_would_round_away_is_said(tmp_path, capsys, factor, said):
-    """A robot's joint, at its own shaft, takes minutes for a turn; its motor does not. Nor is a motor that stands too slow."""
+    """A robot's joint, at its own shaft, takes minutes for a turn, and its spring makes none. What stands is not too slow."""
     time_s = 0.004 * np.arange(20000)
     speed = 73.0 * factor * np.sin(0.1 * time_s)
     columns = {"time_s": time_s, "angle_rad": -730.0 * factor * np.cos(0.1 * time_s), "speed_rad_per_s": speed}
