@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
 import emb_daemon
-from emb_daemon.calibration.curves import Curve, curve_at
+from emb_daemon.calibration.curves import Curve, curve_at, rising_force
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, moved, value_of
 from emb_daemon.calibration.terms import Term
@@ -259,6 +259,19 @@ def test_a_log_that_begins_without_a_force_has_its_contact_still_to_come(preload
     log = dataclasses.replace(log, force_N=preload_N + 2e4 * np.sqrt(travel / travel.max() + 1e-4) - 200.0)
     found = fit_dynamics([Pads(known.pad_thickness_mm, (log,))], known, shared=()).curves[0].clearances_rad
     assert found < 0.0 if preload_N else found >= 0.0
+
+
+def test_what_a_jaw_drags_on_its_way_is_no_contact():
+    """From there a curve that rises, falls and rises again fits best, and the calibration ended at a fortieth of the force."""
+    known = _one_curve()
+    time_s = 0.015 * np.arange(500)
+    angle = np.clip(6.0 * (time_s - 0.5), 0.0, 34.5)
+    force_N = 13.0 * np.minimum(angle, 1.0) + 60.0 * np.maximum(angle - 30.0, 0.0) ** 2
+    log = emb_daemon.log_of_arrays(time_s, angle, force_N=0.0 * angle)
+    log = dataclasses.replace(log, force_N=np.interp(log.time_s, time_s, force_N))
+    found = stiffness.identify([Pads(known.pad_thickness_mm, (log,))], replace(known, effects={})).fit.curves[0]
+    assert found.clearances_rad == pytest.approx(30.0, abs=0.5)
+    assert rising_force(found.coefficients) > force_N.max()
 
 
 def test_a_loop_of_a_rubber_is_found():

@@ -38,6 +38,8 @@ _TRIAL = 8
 _CONTACT = 0.1
 #: Share of a log's largest force that is none: the zero of a force sensor is as sure as that.
 _NO_FORCE = 0.01
+#: The same that a clamp may need before it touches: a finger's joints and seals take 1.4 % on a recorded hand.
+_DRAGGED = 0.02
 #: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
@@ -212,8 +214,9 @@ def is_slow(log: Log) -> bool:
 
 
 def clearance_guess(log: Log, travel: np.ndarray) -> float:
-    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise."""
-    clear = np.flatnonzero(log.force_N > 8.0 * max(_rest_noise(log), 1e-9))
+    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise and of what a jaw
+    drags on its way."""
+    clear = np.flatnonzero(log.force_N > max(8.0 * _rest_noise(log), _DRAGGED * np.nanmax(log.force_N), 1e-9))
     return float(travel[clear[0]]) if len(clear) else 0.0
 
 
