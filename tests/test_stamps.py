@@ -148,12 +148,16 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
         (lambda t: 1e3 * t, "one value every 4 s; expected 1e-05 to 1 s; is the unit of time right?"),
         (lambda t: 1e6 * t, "one value every 4e+03 s"),
         (lambda t: 1e-6 * t, "one value every 4e-09 s"),
+        (
+            lambda t: 45000.0 + t / 86400.0,
+            "is the unit of time right? In days (`unit: d`) it is 0.00",
+        ),
         (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right? As us it is 1790000"),
         (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
         (lambda t: 0.0 * t, "749 values, all of them of one time"),
         (lambda t: np.concatenate([t[:400], t[: len(t) - 400]]), "time goes back by 1.596 s after value 400"),
     ],
-    ids=["ms", "us", "s as us", "year", "outlier", "no clock", "two recordings"],
+    ids=["ms", "us", "s as us", "days of a spreadsheet", "year", "outlier", "no clock", "two recordings"],
 )
 def test_times_that_cannot_be_are_refused(truth, tmp_path, time_s, said):
     columns = foreignkit.sampled(truth, 250.0)
@@ -587,6 +591,54 @@ def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
     log = _read(tmp_path, {name: np.concatenate([rest[name], columns[name]]) for name in columns})
     assert "one sample of the motor every 50 ms, too rare" in capsys.readouterr().err
     assert len(log.samples) <= 101 * len(columns["time_s"])
+
+
+@pytest.mark.parametrize("rate_Hz", [20.0, 250.0])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("angle_rad", "speed_rad_per_s", "current_A", "force_N"), "`scale: -1` of ClampForceRef, MotorAngle, MotorSpeed and"),
+        (("force_N",), "`scale: -1` of ClampForceRef"),
+        ((), ""),
+    ],
+)
+def test_a_slow_clamp_that_is_turned_round_is_told_at_any_rate(tmp_path, capsys, rate_Hz, wrong, said):
+    """20 Hz do for a slow clamp, whose way between two samples is known; all that is turned round fits together."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=20.0)), rate_Hz)
+    _read(tmp_path, _wrong(columns, *wrong))
+    told = capsys.readouterr().err
+    assert said in told and ("scale: -1" in told) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("signal", "said"),
+    [
+        ("force (kN), unit: N", "force (kN) says kN and is taken in N: which is right?"),
+        ("force (kN), unit: kN", ""),
+        ("force (kN), unit: N, scale: -1000", ""),
+        ("'force [Newtons]', unit: N", ""),
+        ("force (raw), unit: N", ""),
+    ],
+)
+def test_a_unit_in_a_columns_name_that_is_not_the_mappings_is_said(tmp_path, signal, said):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", signal))
+    notes = "\n".join(Mapping(tmp_path / "mapping.yaml").notes)
+    assert said in notes and ("which is right" in notes) == bool(said)
+
+
+def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):
+    columns = foreignkit.sampled(truth, 250.0)
+    days = columns | {"time_s": 45000.0 + columns["time_s"] / 86400.0}
+    log = _read(tmp_path, days, foreignkit.COLUMNS.replace("signal: time_s}", "signal: time_s, unit: d}"))
+    assert np.ptp(log.time_s) == pytest.approx(np.ptp(columns["time_s"]), abs=0.01)
+
+
+@pytest.mark.parametrize("begins", [b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\x00"])
+def test_a_bag_of_messages_is_refused_with_what_would_do(tmp_path, begins):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    (tmp_path / "a.csv").write_bytes(begins + bytes(200))
+    with pytest.raises(InputError, match="which is not read; expected what it holds as CSV"):
+        Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
 
 
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)

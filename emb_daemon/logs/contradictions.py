@@ -108,8 +108,9 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         # What relaxes in pads looks like a delay.
         lines += _find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
-        # Travel alone does not show directions; current and force do.
-        return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
+        # A travel that is small, or unknown between two samples, does not show directions; current and force do.
+        turned = [] if angle is None or bare or force is None or not np.ptp(force.values) else _find_turned_force(angle, force)
+        return lines + (turned or _find_opposed(speed, current, force) if moves and force is not None else turned)
     if bare:
         return lines
     if current is not None and np.ptp(current.values):
@@ -503,4 +504,9 @@ def _find_turned_force(angle: Series, force: Series) -> list[str]:
     if high < low:
         what = "ClampForceRef" if abs(high) > abs(low) else "MotorAngle and MotorSpeed"
         return [f"ClampForceRef falls from {low:.4g} N to {high:.4g} N while MotorAngle rises: `scale: -1` of {what}?"]
+    if abs(low) > _MORE * abs(high):
+        return [
+            f"ClampForceRef is {low:.4g} N where MotorAngle is least and {high:.4g} N where it is largest; a clamp force is "
+            "positive at large angles: `scale: -1` of ClampForceRef, MotorAngle, MotorSpeed and CurrentQ?"
+        ]
     return []
