@@ -751,3 +751,11 @@ def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, c
     table = foreignkit.write_table(tmp_path / "a.csv", {name: np.tile(values, 2) for name, values in columns.items()})
     assert main(["replay", str(table), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{table}: time goes back by")
+
+
+def test_a_coarse_encoder_hides_no_way():
+    """A finger's thousand counts of a tenth of a radian, one too many or too few: more than 0.01 rad, and no motion."""
+    time_ns = 22_000_000 * np.arange(400)
+    counts = np.floor(0.7 * np.arange(400)) + np.random.default_rng(3).integers(-1, 2, 400)
+    assert not Series(time_ns, 0.1 * counts).way_is_unknown
+    assert Series(time_ns, 0.1 * counts + 1e-5 * np.arange(400)).way_is_unknown
