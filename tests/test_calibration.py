@@ -117,7 +117,7 @@ _HYSTERESIS = "effects.stiffness_hysteresis"
     ("effects", "expected"),
     [
         ("{warp_drive: {share: 1.0}}", "effects.warp_drive: unknown effect; known are"),
-        ("{stiffness_hysteresis: {share: 0.9, slip_angle_rad: 1.0}}", f"{_HYSTERESIS}.share: 0.9 outside [0.0, 0.2]"),
+        ("{stiffness_hysteresis: {share: 0.9, slip_angle_rad: 1.0}}", f"{_HYSTERESIS}.share: 0.9 outside [0.0, 0.5]"),
         ("{stiffness_hysteresis: {share: 0.1, slip: 1.0, slip_angle_rad: 1.0}}", f"{_HYSTERESIS}.slip: unknown parameter"),
         ("{stiffness_hysteresis: {share: 0.1}}", f"{_HYSTERESIS}: missing slip_angle_rad"),
         ("{stiffness_hysteresis: {share: wide, slip_angle_rad: 1.0}}", f"{_HYSTERESIS}.share: Expected `float`, got `str`"),

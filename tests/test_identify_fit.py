@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from synthetic_rig import datasheet, draw, pads
 
 import emb_daemon
-from emb_daemon.calibration.curves import Curve, curve_at
+from emb_daemon.calibration.curves import Curve, curve_at, rising_force
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, moved, value_of
 from emb_daemon.calibration.terms import Term
@@ -248,6 +248,42 @@ def test_a_slow_clamp_alone_shows_what_is_slower_than_it(there):
     assert found.fit.rms < 25.0
     if there:
         assert found.values["effects.second_relaxation.share"] == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.parametrize("preload_N", [0.0, 2000.0])
+def test_a_log_that_begins_without_a_force_has_its_contact_still_to_come(preload_N):
+    """A force that rises at once and then flattens is no cubic: a contact far before the log fits it, and no other log."""
+    known = _one_curve()
+    log = _slow_log(known)
+    travel = log.samples["angle"] - log.samples["angle"][0]
+    log = dataclasses.replace(log, force_N=preload_N + 2e4 * np.sqrt(travel / travel.max() + 1e-4) - 200.0)
+    found = fit_dynamics([Pads(known.pad_thickness_mm, (log,))], known, shared=()).curves[0].clearances_rad
+    assert found < 0.0 if preload_N else found >= 0.0
+
+
+@pytest.mark.parametrize(("zero_N", "drag_N", "apart"), [(0.0, 13.0, 0.5), (30.0, 30.0, 6.0)])
+def test_what_a_jaw_drags_on_its_way_is_no_contact(zero_N, drag_N, apart):
+    """From there a curve that rises, falls and rises again fits best, and the calibration ended at a fortieth of the force. A
+    sensor's zero and a drag that are a tenth of it may place the contact too early, but the curve rises."""
+    known = _one_curve()
+    time_s = 0.015 * np.arange(500)
+    angle = np.clip(6.0 * (time_s - 0.5), 0.0, 34.5)
+    force_N = zero_N + drag_N * np.minimum(angle, 1.0) + (600.0 / 20.25) * np.maximum(angle - 30.0, 0.0) ** 2
+    log = emb_daemon.log_of_arrays(time_s, angle, force_N=0.0 * angle)
+    log = dataclasses.replace(log, force_N=np.interp(log.time_s, time_s, force_N))
+    found = stiffness.identify([Pads(known.pad_thickness_mm, (log,))], replace(known, effects={})).fit
+    assert found.curves[0].clearances_rad == pytest.approx(30.0, abs=apart)
+    assert found.curves[0].rises and rising_force(found.curves[0].coefficients) > 0.9 * force_N.max()
+    assert found.rms < 0.08 * force_N.max()
+
+
+def test_a_loop_of_a_rubber_is_found():
+    """Half of the force lost between clamping and release over a third of the travel."""
+    own = {"effects.stiffness_hysteresis.share": 0.4, "effects.stiffness_hysteresis.slip_angle_rad": 15.0}
+    known = moved(_one_curve(), own | {RELAXATION: stiffness.USUAL_RELAXATION_S})
+    found = stiffness.identify([Pads(known.pad_thickness_mm, (_slow_log(known),))], replace(known, effects={}))
+    for key, value in own.items():
+        assert found.values[key] == pytest.approx(value, rel=0.05), key
 
 
 def test_a_slow_log_is_predicted_from_the_others_of_its_pads():

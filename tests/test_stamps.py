@@ -148,12 +148,16 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
         (lambda t: 1e3 * t, "one value every 4 s; expected 1e-05 to 1 s; is the unit of time right?"),
         (lambda t: 1e6 * t, "one value every 4e+03 s"),
         (lambda t: 1e-6 * t, "one value every 4e-09 s"),
+        (
+            lambda t: 45000.0 + t / 86400.0,
+            "is the unit of time right? In days (`unit: d`) it is 0.00",
+        ),
         (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right? As us it is 1790000"),
         (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
         (lambda t: 0.0 * t, "749 values, all of them of one time"),
         (lambda t: np.concatenate([t[:400], t[: len(t) - 400]]), "time goes back by 1.596 s after value 400"),
     ],
-    ids=["ms", "us", "s as us", "year", "outlier", "no clock", "two recordings"],
+    ids=["ms", "us", "s as us", "days of a spreadsheet", "year", "outlier", "no clock", "two recordings"],
 )
 def test_times_that_cannot_be_are_refused(truth, tmp_path, time_s, said):
     columns = foreignkit.sampled(truth, 250.0)
@@ -589,6 +593,54 @@ def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
     assert len(log.samples) <= 101 * len(columns["time_s"])
 
 
+@pytest.mark.parametrize("rate_Hz", [20.0, 250.0])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("angle_rad", "speed_rad_per_s", "current_A", "force_N"), "`scale: -1` of ClampForceRef, MotorAngle, MotorSpeed and"),
+        (("force_N",), "`scale: -1` of ClampForceRef"),
+        ((), ""),
+    ],
+)
+def test_a_slow_clamp_that_is_turned_round_is_told_at_any_rate(tmp_path, capsys, rate_Hz, wrong, said):
+    """20 Hz do for a slow clamp, whose way between two samples is known; all that is turned round fits together."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=20.0)), rate_Hz)
+    _read(tmp_path, _wrong(columns, *wrong))
+    told = capsys.readouterr().err
+    assert said in told and ("scale: -1" in told) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("signal", "said"),
+    [
+        ("force (kN), unit: N", "force (kN) says kN and is taken in N: which is right?"),
+        ("force (kN), unit: kN", ""),
+        ("force (kN), unit: N, scale: -1000", ""),
+        ("'force [Newtons]', unit: N", ""),
+        ("force (raw), unit: N", ""),
+    ],
+)
+def test_a_unit_in_a_columns_name_that_is_not_the_mappings_is_said(tmp_path, signal, said):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", signal))
+    notes = "\n".join(Mapping(tmp_path / "mapping.yaml").notes)
+    assert said in notes and ("which is right" in notes) == bool(said)
+
+
+def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):
+    columns = foreignkit.sampled(truth, 250.0)
+    days = columns | {"time_s": 45000.0 + columns["time_s"] / 86400.0}
+    log = _read(tmp_path, days, foreignkit.COLUMNS.replace("signal: time_s}", "signal: time_s, unit: d}"))
+    assert np.ptp(log.time_s) == pytest.approx(np.ptp(columns["time_s"]), abs=0.01)
+
+
+@pytest.mark.parametrize("begins", [b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\x00"])
+def test_a_bag_of_messages_is_refused_with_what_would_do(tmp_path, begins):
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    (tmp_path / "a.csv").write_bytes(begins + bytes(200))
+    with pytest.raises(InputError, match="which is not read; expected what it holds as CSV"):
+        Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
+
+
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
 
 
@@ -670,10 +722,11 @@ def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_
                 "CurrentQ covers 8 steps of our message, and rounding hides what it says: `scale`",
             ],
         ),
+        (4e-6, ["MotorAngle covers 29 steps"]),
     ],
 )
 def test_what_our_messages_would_round_away_is_said(tmp_path, capsys, factor, said):
-    """A robot's joint, at its own shaft, takes minutes for a turn; its motor does not. Nor is a motor that stands too slow."""
+    """A robot's joint, at its own shaft, takes minutes for a turn, and its spring makes none. What stands is not too slow."""
     time_s = 0.004 * np.arange(20000)
     speed = 73.0 * factor * np.sin(0.1 * time_s)
     columns = {"time_s": time_s, "angle_rad": -730.0 * factor * np.cos(0.1 * time_s), "speed_rad_per_s": speed}
@@ -698,3 +751,11 @@ def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, c
     table = foreignkit.write_table(tmp_path / "a.csv", {name: np.tile(values, 2) for name, values in columns.items()})
     assert main(["replay", str(table), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{table}: time goes back by")
+
+
+def test_a_coarse_encoder_hides_no_way():
+    """A finger's thousand counts of a tenth of a radian, one too many or too few: more than 0.01 rad, and no motion."""
+    time_ns = 22_000_000 * np.arange(400)
+    counts = np.floor(0.7 * np.arange(400)) + np.random.default_rng(3).integers(-1, 2, 400)
+    assert not Series(time_ns, 0.1 * counts).way_is_unknown
+    assert Series(time_ns, 0.1 * counts + 1e-5 * np.arange(400)).way_is_unknown

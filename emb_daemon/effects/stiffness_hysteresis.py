@@ -22,12 +22,12 @@ EFFECT = Effect(
     hook="stiffness",
     term=term,
     parameters=(
-        Parameter("share", "1", 0.0, 0.2, 0.03, "half width of the loop over the clamp force", drawn=(0.0, 0.2)),
+        Parameter("share", "1", 0.0, 0.5, 0.03, "half width of the loop over the clamp force", drawn=(0.0, 0.2)),
         Parameter(
             "slip_angle_rad",
             "rad",
             0.05,
-            10.0,
+            100.0,
             1.0,
             "motor angle over which the element stretches before it slips",
             (0.3, 1.0, 3.0),

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from msgspec import structs
+from scipy.optimize import nnls
 
-from emb_daemon.calibration.curves import Curve
+from emb_daemon.calibration.curves import Curve, rising_force
 from emb_daemon.calibration.parameters import CLEARANCE, moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.effects import REGISTRY
@@ -36,6 +37,12 @@ _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
 #: How far from where a fit to all logs puts it a log's contact is looked for in a fit to the others, over its travel.
 _CONTACT = 0.1
+#: Share of a log's largest force that is none: the zero of a force sensor is as sure as that.
+_NO_FORCE = 0.01
+#: Samples of a log, and places in its travel, at which its contact is looked for before anything is fitted.
+_PLACES, _CONTACTS = 1000, 60
+#: Number of places in the travel at which a curve's slope is watched, and what it is at least, over the mean one.
+_SLOPES, _LEAST_SLOPE = 200, 0.02
 #: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
@@ -87,6 +94,11 @@ class CurveFit:
     def force(self, x: np.ndarray) -> np.ndarray:
         """Static force in N at ``x`` rad past contact."""
         return powers(x, len(self.coefficients)) @ self.coefficients
+
+    @property
+    def rises(self) -> bool:
+        """Whether the force rises over the travel as far as it gets there."""
+        return bool(rising_force(self.coefficients) >= self.force(np.array([self.travel_rad]))[0])
 
     def force_sigma(self, x: np.ndarray) -> np.ndarray:
         """Its standard deviation from the covariance of the coefficients."""
@@ -210,9 +222,25 @@ def is_slow(log: Log) -> bool:
 
 
 def clearance_guess(log: Log, travel: np.ndarray) -> float:
-    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise."""
+    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise, and from which it
+    rises: until a jaw touches, joints and seals may drag as much as they like, but alike."""
     clear = np.flatnonzero(log.force_N > 8.0 * max(_rest_noise(log), 1e-9))
-    return float(travel[clear[0]]) if len(clear) else 0.0
+    return max(float(travel[clear[0]]) if len(clear) else 0.0, _rises_from(log.force_N, travel))
+
+
+def _rises_from(force_N: np.ndarray, travel: np.ndarray) -> float:
+    """The ``travel`` from which a force that is constant before it, and rises ever more steeply past it, fits best."""
+    known = np.flatnonzero(np.isfinite(force_N))
+    known = known[:: max(len(known) // _PLACES, 1)]
+    x, force = travel[known], force_N[known]
+    half = x[force > 0.5 * np.max(force)]
+    places = np.linspace(np.min(x), np.min(half), _CONTACTS) if len(half) else np.zeros(1)
+
+    def left(place: float) -> float:
+        table = powers((x - place) / max(np.ptp(x), 1e-9))
+        return float(nnls(np.column_stack([np.ones(len(x)), -np.ones(len(x)), table]), force)[1])
+
+    return float(min(places, key=left))
 
 
 def _rest_noise(log: Log) -> float:
@@ -220,6 +248,12 @@ def _rest_noise(log: Log) -> float:
     angle = log.samples["angle"]
     left = np.flatnonzero(np.abs(angle - angle[0]) > 0.01 * max(np.ptp(angle), 1e-9))
     return float(np.nanstd(log.force_N[: max(left[0] if len(left) else 0, 5)]))
+
+
+def _begins_free(log: Log) -> bool:
+    """Whether the first samples' reference force is none."""
+    first = np.median(log.force_N[np.isfinite(log.force_N)][:5])
+    return bool(abs(first) < _NO_FORCE * np.nanmax(log.force_N))
 
 
 def _travel(log: Log, calibration: Calibration) -> np.ndarray:
@@ -307,12 +341,30 @@ class _Model:
         for g, pads in enumerate(self.groups):
             span = max(_span(log, self.start) for log in pads.logs)
             for number, log in enumerate(pads.logs):
-                # The force is clear of its noise only somewhat past contact.
-                free[g, number] = Free(clearance_guess(log, _travel(log, self.start)) - 0.02 * span, 5e-6 * span)
+                # The force is clear of its noise only somewhat past contact; what begins without a force has it still to come.
+                guess = clearance_guess(log, _travel(log, self.start)) - 0.02 * span
+                free[g, number] = Free(guess, 5e-6 * span, 0.0 if _begins_free(log) else -np.inf)
         return free
 
     def blocks(self) -> list[Block]:
         return [self._block(g, number, log) for g, pads in enumerate(self.groups) for number, log in enumerate(pads.logs)]
+
+    def rising(self) -> list[Block]:
+        """What a curve that falls within its travel costs: where its slope, over all the travel, is less than a share of the
+        largest force, what it lacks of that in N."""
+        blocks = []
+        for pads, own in zip(self.groups, self.curves, strict=True):
+            span = max(float(_travel(log, self.start).max()) for log in pads.logs)
+            places = span * np.linspace(0.0, 1.0, _SLOPES)[:, None]
+            weight = np.sqrt(sum(len(log.samples) for log in pads.logs))
+            cost = weight * span * np.arange(1, TERMS + 1) * places ** np.arange(TERMS)
+            least = weight * _LEAST_SLOPE * max(float(np.nanmax(log.force_N)) for log in pads.logs)
+
+            def residual(values, own=own, cost=cost, least=least):
+                return np.minimum(cost @ [values[key] for key in own] - least, 0.0)
+
+            blocks.append(Block(residual, tuple(own), np.zeros(_SLOPES, int)))
+        return blocks
 
     def _block(self, g: int, number: int, log: Log) -> Block:
         rows = len(log.samples) if self.fraction == 1.0 or is_slow(log) else int(self.fraction * len(log.samples))
@@ -351,8 +403,8 @@ class _Model:
             delay_s=found.values.get(DELAY, self.delay_s),
             sigmas={key: found.sigmas[key] for key in self.shared},
             curves=curves,
-            rms=found.rms,
-            residuals={str(log.path): r for log, r in zip(logs, found.residuals, strict=True)},
+            rms=rmse(np.concatenate(found.residuals[: len(logs)])),
+            residuals={str(log.path): r for log, r in zip(logs, found.residuals[: len(logs)], strict=True)},
         )
 
 
@@ -386,4 +438,7 @@ def fit_dynamics(
         tried = [fit(blocks, free, tolerance=1e-5, evaluations=_TRIAL) for free in starts]
         best = min(tried, key=lambda found: found.rms).values
         first = {key: replace(free, start=best[key]) for key, free in first.items()}
-    return model.result(fit(blocks, first, tolerance=1e-6))
+    found = model.result(fit(blocks, first, tolerance=1e-6))
+    if all(curve.rises for curve in found.curves):
+        return found
+    return model.result(fit([*blocks, *model.rising()], model.free(), tolerance=1e-6))

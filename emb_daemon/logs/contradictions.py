@@ -73,6 +73,8 @@ _TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
 _KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
+#: Change from sample to sample, over the whole of it, below which a small motion is no noise, whose is 1.4.
+_SMOOTH = 0.3
 
 
 def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
@@ -85,6 +87,9 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
     lines = [*_find_other_wheel(corner, messages), *_find_impossible_temperatures(corner, messages)]
+    # A motor with constant load clamps nothing.
+    is_free = turns_free(corner, messages)
+    bare = is_free or (force is not None and _is_of_either_sign(force))
     own = {name: s for name, s in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)) if s is not None}
     for name, found in own.items():
         if not np.ptp(found.values):
@@ -95,19 +100,18 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _find_too_fast(angle)
-        lines += _find_rounded(corner, angle, current)
+        lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
-    # A motor with constant load clamps nothing.
-    is_free = turns_free(corner, messages)
     moves = not (speed is None or current is None or is_unresolved(angle or speed.integral(), is_free))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
         # What relaxes in pads looks like a delay.
-        lines += _find_late_current(speed, current, force) if is_free or _is_of_either_sign(force) else []
+        lines += _find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
-        # Travel alone does not show directions; current and force do.
-        return lines + _find_opposed(speed, current, force) if moves and force is not None else lines
-    if is_free or (force is not None and _is_of_either_sign(force)):
+        # A travel that is small, or unknown between two samples, does not show directions; current and force do.
+        turned = [] if angle is None or bare or force is None or not np.ptp(force.values) else _find_turned_force(angle, force)
+        return lines + (turned or _find_opposed(speed, current, force) if moves and force is not None else turned)
+    if bare:
         return lines
     if current is not None and np.ptp(current.values):
         lines += _find_unsigned(current) or _find_turned_current(angle, current)
@@ -345,19 +349,24 @@ def _find_too_fast(angle: Series) -> list[str]:
     return [f"MotorAngle changes by {fastest:.4g} rad/s ({fastest * 30.0 / np.pi:.3g} rpm), which no motor does: {what}"]
 
 
-def _find_rounded(corner: str, angle: Series, current: Series | None) -> list[str]:
-    """A line on a motion, or the current for it, that is too small for the steps of our messages."""
+def _find_rounded(corner: str, angle: Series, current: Series | None, bare: bool) -> list[str]:
+    """A line on a motion, or the current for it, that is too small for the steps of our messages; ``bare`` of what clamps
+    nothing, whose motor does not stand for long."""
 
     def covered(message: str, signal: str, values: np.ndarray) -> float:
         step = shipped_database("dbc/emb.dbc").get_message_by_name(message.format(corner)).get_signal_by_name(signal).scale
         return float(np.ptp(np.quantile(values, (0.01, 0.99))) / step)
 
-    if covered("EMB_{}_Resolver", "MotorAngle", angle.values) < _TURNS:
-        return []
+    way = covered("EMB_{}_Resolver", "MotorAngle", angle.values)
     lines, lost = [], "steps of our message, and rounding hides what it says"
+    how = "of what turns behind a gear state the motor's, angle and speed alike by the gear's ratio as `scale`"
+    if way < _TURNS:
+        # A joint that is locked has noise.
+        goes = way > 0.0 and np.std(np.diff(angle.values)) < _SMOOTH * np.std(angle.values)
+        how = f"{how}, of a deflection any that makes radians of it"
+        return [f"MotorAngle covers {way:.2g} {lost}: {how}"] if bare and goes else []
     speed = covered("EMB_{}_Resolver", "MotorSpeed", angle.derivative().values)
     if speed < _LEAST_COVERED:
-        how = "of what turns behind a gear state the motor's, angle and speed alike by the gear's ratio as `scale`"
         lines.append(f"MotorSpeed covers {speed:.2g} {lost}: {how}")
     if current is not None and 0.0 < (steps := covered("EMB_{}_Current", "CurrentQ", current.values)) < _LEAST_COVERED:
         lines.append(f"CurrentQ covers {steps:.2g} {lost}: `scale` it up, and the torque constant down")
@@ -495,4 +504,9 @@ def _find_turned_force(angle: Series, force: Series) -> list[str]:
     if high < low:
         what = "ClampForceRef" if abs(high) > abs(low) else "MotorAngle and MotorSpeed"
         return [f"ClampForceRef falls from {low:.4g} N to {high:.4g} N while MotorAngle rises: `scale: -1` of {what}?"]
+    if abs(low) > _MORE * abs(high):
+        return [
+            f"ClampForceRef is {low:.4g} N where MotorAngle is least and {high:.4g} N where it is largest; a clamp force is "
+            "positive at large angles: `scale: -1` of ClampForceRef, MotorAngle, MotorSpeed and CurrentQ?"
+        ]
     return []

@@ -4,6 +4,7 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -37,7 +38,7 @@ from emb_daemon.logs.stamps import held_rows, in_time, strays
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
-from emb_daemon.wire.units import TRAVELS, UNITS, conversion
+from emb_daemon.wire.units import TRAVELS, UNITS, conversion, stated_in
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -47,6 +48,8 @@ _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 #: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
+#: A day, in which spreadsheets count, and the shortest period of a table that is one, s.
+_DAY_S, _USUAL_S = 86_400.0, 1e-3
 #: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
 #: What DBCs call a raw value that is none, once words are apart; and a flag that says that all is well.
@@ -98,7 +101,7 @@ class Time(Struct, kw_only=True):
 
     #: Name of the column.
     signal: str | None = None
-    #: s, ms, us or ns.
+    #: s, ms, us, ns, min, h or d: a spreadsheet counts days.
     unit: str = "s"
     #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
     rate_Hz: Positive | None = None
@@ -115,7 +118,7 @@ class Time(Struct, kw_only=True):
         if self.rate_Hz is not None and self.unit != "s":
             raise ValueError("unit: counts have none; expected unit or rate_Hz")
         if UNITS.get(self.unit, ("",))[0] != "s":
-            raise ValueError(f"unit: expected s, ms, us or ns, found {self.unit!r}")
+            raise ValueError(f"unit: expected s, ms, us, ns, min, h or d, found {self.unit!r}")
 
 
 class Bus(Struct, kw_only=True):
@@ -251,6 +254,11 @@ class Mapping:
         except InputError as error:
             hint = "; state `unit:`" if not unit else "" if ours.unit else '; of a number without one state `unit: "1"`'
             return self._fault(name, f"{mapped.signal} {error}{hint}")
+        own = stated_in(mapped.signal)
+        if own and UNITS[own][0] == UNITS[ours.unit or ""][0] and not self.databases:
+            theirs, zero = conversion(own, ours.unit or "")
+            if not math.isclose(abs(mapped.scale) * factor, theirs, rel_tol=1e-3) or (mapped.scale == 1.0 and shift != zero):
+                self.notes.append(f"{self.path}: {name}: {mapped.signal} says {own} and is taken in {unit}: which is right?")
         span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
         span_ns = None if span_ms is None else 1e6 * span_ms
         signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
@@ -419,9 +427,12 @@ class Mapping:
             for name, source in self._sources(f"EMB_{corner}_Resolver").items():
                 series = messages[f"EMB_{corner}_Resolver"][name]
                 if len(series.time_ns) > 2 and not _SHORTEST_S <= 1e-9 * series.period_ns <= _LONGEST_S:
+                    seconds = 1e-9 * series.period_ns
+                    in_days = _DAY_S * seconds
+                    days = f" In days (`unit: d`) it is {in_days:.3g} s" if _USUAL_S < in_days < _LONGEST_S else ""
                     raise InputError(
-                        f"{path}: {source.name}: one value every {1e-9 * series.period_ns:.3g} s; expected {_SHORTEST_S:g} to "
-                        f"{_LONGEST_S:g} s; is the unit of time right?"
+                        f"{path}: {source.name}: one value every {seconds:.3g} s; expected {_SHORTEST_S:g} to "
+                        f"{_LONGEST_S:g} s; is the unit of time right?{days}"
                     )
 
     def _clocks(self) -> str:

@@ -132,12 +132,17 @@ class Series:
     @property
     def way_is_unknown(self) -> bool:
         """Whether an angle's way between two samples is unknown: sparse samples of a motion that they do not resolve."""
-        return self._misses > _UNKNOWN_WAY_RAD
+        return self._misses > max(_UNKNOWN_WAY_RAD, self._step)
 
     @property
     def course_is_unknown(self) -> bool:
         """The same of a machine without a load."""
-        return self._misses > max(_UNKNOWN_WAY_RAD, _UNKNOWN_SHARE * self._goes)
+        return self._misses > max(_UNKNOWN_WAY_RAD, self._step, _UNKNOWN_SHARE * self._goes)
+
+    @cached_property
+    def _step(self) -> float:
+        """Least difference of two values: a coarse encoder's count, of which the angle is not sure either."""
+        return float(np.min(np.diff(found))) if len(found := np.unique(self.values)) > 1 else 0.0
 
     @cached_property
     def _goes(self) -> float:

@@ -28,6 +28,8 @@ _TABLES = (".csv", ".txt", ".tsv", ".dat", ".xlsx", ".xls", ".ods", ".parquet", 
 _FRAMES = (".blf", ".asc", ".trc")
 #: How columnar files and workbooks begin.
 _PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+#: How containers of messages begin that nothing here reads.
+_BAGS = {b"#ROSBAG": "a ROS bag", b"\x89MCAP": "a ROS 2 bag", b"SQLite format 3": "a database, as ROS 2 bags are"}
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
@@ -79,6 +81,8 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
+    if bag := next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), ""):
+        raise InputError(f"{path}: is {bag}, which is not read; expected what it holds as CSV, Parquet or .mat")
     begins = ending_of_content(content)
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
     if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):

@@ -1,6 +1,7 @@
 """Units as DBC files spell them, and how one becomes another of the same quantity."""
 
 import math
+import re
 
 from emb_daemon.errors import InputError
 
@@ -25,6 +26,7 @@ UNITS = {
     "kNm": ("Nm", 1e3, 0.0), "mNm": ("Nm", 1e-3, 0.0), "Nmm": ("Nm", 1e-3, 0.0), "N mm": ("Nm", 1e-3, 0.0),
     "Hz": ("Hz", 1.0, 0.0),
     "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "us": ("s", 1e-6, 0.0), "µs": ("s", 1e-6, 0.0), "ns": ("s", 1e-9, 0.0),
+    "min": ("s", 60.0, 0.0), "h": ("s", 3600.0, 0.0), "d": ("s", 86400.0, 0.0),
     "%": ("%", 1.0, 0.0),
     "1": ("", 1.0, 0.0), "-": ("", 1.0, 0.0), "": ("", 1.0, 0.0),
 }  # fmt: skip
@@ -38,8 +40,17 @@ _SPELLINGS = {
     "deg f": "degF", "km/hr": "km/h", "kmh": "km/h", "kmph": "km/h", "km/h": "km/h", "kph": "km/h", "newton": "N",
     "newtons": "N", "n*m": "Nm", "newton meter": "Nm", "percent": "%",
 }  # fmt: skip
+#: A unit at the end of a column's name.
+_IN_NAME = re.compile(r"\[\s*([^][]+?)\s*\]\s*$|\(\s*([^()]+?)\s*\)\s*$")
 #: For an axis whose travel is measured instead of its motor's angle.
 TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", "m/min", "in/s")
+
+
+def stated_in(name: str) -> str:
+    """The unit that a column's name ends with, in brackets or parentheses, as `UNITS` spells it; empty if it states none."""
+    found = _IN_NAME.search(name)
+    unit = found[1] or found[2] if found else ""
+    return unit if unit in UNITS else _SPELLINGS.get(unit.lower(), "")
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
