@@ -28,11 +28,13 @@ def _cache_root() -> Path:
 
 
 def _cache_folder() -> Path:
-    """A writable folder for compiled code: the chosen one or, where that cannot be written or anybody could write to it, one
+    """A writable folder for compiled code: the chosen one or, where that cannot be written or others could write to it, one
     for this process alone."""
     folder = _cache_root() / installed_digest()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for each in (folder.parent, folder):
+            # Whatever the umask: who else may write to it may have what he likes executed.
+            each.mkdir(0o755, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             trouble = who_else_writes(folder)
     except OSError as error:

@@ -521,9 +521,42 @@ class TestFreshnessFile:
         def full(*_):
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(secured.files, "write", full)
+        monkeypatch.setattr(secured, "write_in_reserve", full)
         with pytest.raises(Unavailable, match="trip counter cannot be stored: No space left on device"):
             FreshnessFile(tmp_path).begin_trip()
+
+    def test_a_disk_that_has_become_full_is_no_obstacle(self, tmp_path, monkeypatch):
+        """Nothing is made and nothing grows once the file was written."""
+        opened(tmp_path).close()
+        taken, plain = {(file.stat().st_ino, file.stat().st_size) for file in tmp_path.iterdir()}, os.open
+
+        def full(path, flags, *mode):
+            if flags & os.O_CREAT and not Path(path).exists():
+                raise OSError(28, "No space left on device")
+            return plain(path, flags, *mode)
+
+        monkeypatch.setattr(os, "open", full)
+        authentication = opened(tmp_path)
+        authentication.verify(signed())
+        authentication.close()
+        assert {(file.stat().st_ino, file.stat().st_size) for file in tmp_path.iterdir()} == taken
+        assert FreshnessFile(tmp_path).load() == Freshness(trip=2, heard=authentication._verifier.last())
+        assert FreshnessFile(tmp_path).begin_trip().trip == 3
+
+    def test_what_could_not_be_stored_is_tried_again_and_told_once(self, tmp_path, monkeypatch, caplog):
+        def broken(*_):
+            raise OSError(5, "Input/output error")
+
+        authentication = opened(tmp_path)
+        authentication.verify(signed())
+        with monkeypatch.context() as patch:
+            patch.setattr(secured, "write_in_reserve", broken)
+            for _ in range(3):
+                authentication.close()
+                assert authentication.stale()
+        assert caplog.text.count("freshness cannot be stored: Input/output error") == 1
+        authentication.close()
+        assert not authentication.stale() and FreshnessFile(tmp_path).load().heard == authentication._verifier.last()
 
     def test_used_up(self, tmp_path):
         file = FreshnessFile(tmp_path)
@@ -534,7 +567,7 @@ class TestFreshnessFile:
     def test_far_behind_is_what_64_resets_are(self, tmp_path):
         authentication = opened(tmp_path)
         authentication.verify(signed())
-        authentication.keep()
+        authentication.close()
         links = authentication._verifier.links
         links["reset"][0] += 63
         assert not authentication.stale()
