@@ -1,10 +1,14 @@
 """Files that are complete at every moment."""
 
 import contextlib
+import ctypes
 import errno
 import os
 import tempfile
 from pathlib import Path
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 @contextlib.contextmanager
@@ -43,7 +47,43 @@ def _write_beside(path: Path, content: bytes | memoryview) -> None:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    _sync_folder(path.parent)
+
+
+def write_in_reserve(path: Path, content: bytes, size: int) -> None:
+    """`write_atomically` for a file that must be replaced on a full disk too: at least ``size`` bytes long, filled up with
+    blanks, it takes turns with a second file, whose room on the disk is taken with the first call.
+
+    Raises:
+        OSError: the folder cannot be written; what was there is untouched.
+    """
+    spare = path.with_name(f".{path.name}.spare")
+    with name_in_errors(path):
+        _fill(spare, content.ljust(size))
+        if not (path.is_file() and _exchange(spare, path)):
+            os.replace(spare, path)
+            # Needed at the next call only.
+            with contextlib.suppress(OSError):
+                _fill(spare, bytes(size))
+        _sync_folder(path.parent)
+
+
+def _fill(path: Path, content: bytes) -> None:
+    """Write over a file, in the room that it has."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644), "wb") as file:
+        file.write(content)
+        file.truncate()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two files change places; False where the file system cannot do that."""
+    return _libc.renameat2(_AT_FDCWD, bytes(one), _AT_FDCWD, bytes(other), _RENAME_EXCHANGE) == 0
+
+
+def _sync_folder(path: Path) -> None:
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(folder)
     finally:

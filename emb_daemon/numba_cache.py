@@ -13,10 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from numba.core import config, event, types
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.compiler import compile_result
 from numba.core.registry import CPUDispatcher
 
 from emb_daemon.ahead.library import installed_digest, who_else_writes
+from emb_daemon.ahead.parts import Part, PartCompiler
 from emb_daemon.ahead.signature import Function
 
 
@@ -28,11 +30,13 @@ def _cache_root() -> Path:
 
 
 def _cache_folder() -> Path:
-    """A writable folder for compiled code: the chosen one or, where that cannot be written or anybody could write to it, one
+    """A writable folder for compiled code: the chosen one or, where that cannot be written or others could write to it, one
     for this process alone."""
     folder = _cache_root() / installed_digest()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for each in (folder.parent, folder):
+            # Whatever the umask: who else may write to it may have what he likes executed.
+            each.mkdir(0o755, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             trouble = who_else_writes(folder)
     except OSError as error:
@@ -95,18 +99,39 @@ config.CACHE_DIR = str(_cache_folder())
 _OPTIONS = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
+class _PartsInCache(CompileResultCacheImpl):
+    """Parts as they are kept on disk: LLVM's bitcode."""
+
+    def rebuild(self, target_context, payload):
+        (name, _, bitcode), description, environment, signature, *_ = payload
+        library = Part.of_bitcode(target_context.codegen(), name, bitcode)
+        return compile_result(
+            target_context=target_context,
+            typing_context=target_context.typing_context,
+            library=library,
+            environment=environment,
+            entry_point=target_context.get_executable(library, description, environment),
+            fndesc=description,
+            signature=signature,
+            objectmode=False,
+            lifted=(),
+        )
+
+
 class _WithinCache(FunctionCache):
     """Keeps code for kernels apart from code for Python, of which numba's index would give one for the other."""
+
+    _impl_class = _PartsInCache
 
     def _index_key(self, sig, codegen):
         return *super()._index_key(sig, codegen), "within"
 
 
 class _Within(CPUDispatcher):
-    """A function as kernels call it: without what unpacks Python's objects, a fifth of all that there is to compile."""
+    """A function as kernels call it: without what unpacks Python's objects, and without machine code of its own."""
 
     def __init__(self, function: Function):
-        super().__init__(function, targetoptions=_OPTIONS | {"no_cpython_wrapper": True})
+        super().__init__(function, targetoptions=_OPTIONS | {"no_cpython_wrapper": True}, pipeline_class=PartCompiler)
         self._cache = _WithinCache(function)
 
     def get_call_template(self, args, kws):

@@ -2,8 +2,10 @@
 
 import argparse
 import ctypes
+import grp
 import os
 import platform
+import pwd
 import re
 import subprocess
 from pathlib import Path
@@ -16,7 +18,7 @@ import processkit
 import pytest
 
 from emb_daemon.ahead import library
-from emb_daemon.ahead.library import Manifest, Refused, check, installed_digest, read_manifest, seal
+from emb_daemon.ahead.library import Manifest, Refused, check, installed_digest, read_manifest, seal, who_else_writes
 from emb_daemon.ahead.signature import Array
 from emb_daemon.errors import Unavailable
 from emb_daemon.estimator.records import SAMPLE
@@ -139,6 +141,24 @@ def test_one_that_anybody_can_write_is_refused(tmp_path):
     tmp_path.chmod(0o777)
     with pytest.raises(Refused, match="is writable by anybody"):
         check(path)
+
+
+@pytest.mark.parametrize("folder", [True, False])
+@pytest.mark.parametrize(
+    ("name", "members", "refused"),
+    [("USER", [], False), ("USER", ["USER"], False), ("USER", ["other"], True), ("users", [], True)],
+)
+def test_one_that_a_group_with_others_can_write_is_refused(tmp_path, monkeypatch, folder, name, members, refused):
+    """A group with the user's own name has, on many systems, nobody else in it."""
+    path, user = _sealed(tmp_path / "kernels.so"), pwd.getpwuid(os.geteuid()).pw_name
+    place = tmp_path if folder else path
+    if os.geteuid() == 0:
+        os.chown(place, -1, 4242)
+    place.chmod(0o775)
+    group = grp.struct_group((name.replace("USER", user), "x", 4242, [member.replace("USER", user) for member in members]))
+    monkeypatch.setattr(library.grp, "getgrgid", lambda _: group)
+    said = who_else_writes(path)
+    assert said.startswith(f"{place} is writable by a group with other users") if refused else said == ""
 
 
 def test_one_of_somebody_else_is_refused(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.fleet import dataset, findings, learning, population, scores
+from emb_daemon.fleet import dataset, findings, learning, population, scores, speed
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
 from emb_daemon.fleet.replaying import replay_drive
@@ -290,6 +291,20 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
 
 
 # -- end to end -------------------------------------------------------------------------------------------------------
+
+
+def test_bench_prints_stages_and_what_a_second_worker_gains(logs, monkeypatch, capsys):
+    """On a machine with one core the second gains nothing, and nothing is promised here."""
+    monkeypatch.setattr(speed, "_SCALED_SAMPLES", 1)
+    assert main(["fleet", "bench", str(logs / "car0" / "drive.0.log.gz"), "--workers", "2"]) == 0
+    title, *rows, last = capsys.readouterr().out.splitlines()
+    assert title.split()[0] == "stage" and [row[:24].strip() for row in rows] == [
+        "unpack", "parse", "check and decode", "estimate", "read columns", "project on all causes", "replay from the file",
+        "replay from columns",
+    ]  # fmt: skip
+    assert all(float(cell) > 0.0 for row in rows for cell in row[24:].split())
+    told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", last)
+    assert told and all(0.1 < float(gain) < 10.0 for gain in told.groups())
 
 
 @pytest.fixture(scope="module")

@@ -73,6 +73,35 @@ def test_what_only_kernels_call_is_not_made_callable_from_python():
     assert _half(4.0) == 2.0
 
 
+def test_what_only_kernels_call_is_translated_with_them_alone():
+    """And not before, with all that it calls in turn, as numba would: a fifth of a cold start."""
+    assert _quarter(4.0) == 1.0
+    [kernel], [part] = (function.overloads.values() for function in (_quarter, _half._numba_type_.dispatcher))
+    is_translated = kernel.codegen._engine.is_symbol_defined
+    assert is_translated(kernel.fndesc.llvm_func_name) and not is_translated(part.fndesc.llvm_func_name)
+
+
+_FAR = """
+from emb_daemon.jit import hypot, njit
+from emb_daemon.numba_cache import _compilations
+
+@njit
+def far(a, b):
+    return {} * hypot(a, b)
+
+print(far(3.0, 4.0), _compilations.count)
+"""
+
+
+def test_another_kernel_takes_from_the_cache_what_it_calls(tmp_path):
+    """The kernel with `hypot` and `sq`; then, changed, the kernel alone; then nothing."""
+    for factor, said in ((1.0, "5.0 3"), (2.0, "10.0 1"), (None, "10.0 0")):
+        if factor:
+            (tmp_path / "far.py").write_text(_FAR.format(factor))
+        done = processkit.python(str(tmp_path / "far.py"), NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        assert done.stdout == said + "\n", done.stderr
+
+
 def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
     """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
     code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"

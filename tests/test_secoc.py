@@ -96,20 +96,11 @@ def code_of(key: bytes, message: bytes) -> bytes:
     return code.tobytes()
 
 
-@given(
-    st.sampled_from([(0, 0x100, 0x110), (1, 0x120), (2, 0x0F0), (FRESHNESS_SET, FRESHNESS)]),
-    st.integers(0, 2**24 - 1),
-    st.integers(0, 2**24 - 2),
-    st.integers(0, 254),
-    st.binary(min_size=16, max_size=16),
-)
-def test_authenticator_and_its_place_are_those_of_cantools(shape, trip, reset, message, content):
-    """cantools puts freshness and authenticator of a secured message behind its payload, most significant bit first."""
-    from cantools.autosar.secoc import apply_authenticator, verify_authenticator
-    from cantools.database.can.formats.arxml.message_specifics import AutosarMessageSpecifics
-    from cantools.database.can.formats.arxml.secoc_properties import AutosarSecOCProperties
-
-    which, *ids = shape
+@st.composite
+def authenticated(draw):
+    """Any set of FL's sender: its number, its payloads' octets, its freshness value of 56 bits, its authentication frame."""
+    which, *ids = draw(st.sampled_from([(0, 0x100, 0x110), (1, 0x120), (2, 0x0F0), (FRESHNESS_SET, FRESHNESS)]))
+    trip, reset, message = draw(st.integers(0, 2**24 - 1)), draw(st.integers(0, 2**24 - 2)), draw(st.integers(0, 254))
     if which == FRESHNESS_SET:
         # It has a content of its own, and is sent where the message counter is at its end, before another set.
         frames, reset_after, message_after = answer_to(trip, reset, 255, [(0x120, 0)]), reset + 1, 0
@@ -117,14 +108,25 @@ def test_authenticator_and_its_place_are_those_of_cantools(shape, trip, reset, m
         assert (can_id, data >> 16 & 2**24 - 1, data >> 40) == (FRESHNESS, trip, reset + 1)
         octets, tag = data.to_bytes(8, "little"), frames[2]
     else:
-        octets = content[: 8 * len(ids)]
         # One sample's messages have the same Counter.
-        octets = b"".join(octets[at : at + 1] + b"\x05" + octets[at + 2 : at + 8] for at in range(0, len(octets), 8))
-        payloads = [int.from_bytes(octets[at : at + 8], "little") for at in range(0, len(octets), 8)]
+        each = [draw(st.binary(min_size=1, max_size=1)) + b"\x05" + draw(st.binary(min_size=6, max_size=6)) for _ in ids]
+        octets, payloads = b"".join(each), [int.from_bytes(one, "little") for one in each]
         frames, reset_after, message_after = (
             answer_to(trip, reset, message, zip(ids, payloads, strict=True)), reset, message + 1,
         )  # fmt: skip
         tag = frames[-1]
+    assert (tag["can_id"], tag["length"], int(tag["data"]) >> 20 & 0xFF) == (AUTH, 8, message_after)
+    return which, octets, trip << 32 | reset_after << 8 | message_after, tag
+
+
+@given(authenticated())
+def test_authenticator_and_its_place_are_those_of_cantools(secured_set):
+    """cantools puts freshness and authenticator of a secured message behind its payload, most significant bit first."""
+    from cantools.autosar.secoc import apply_authenticator, verify_authenticator
+    from cantools.database.can.formats.arxml.message_specifics import AutosarMessageSpecifics
+    from cantools.database.can.formats.arxml.secoc_properties import AutosarSecOCProperties
+
+    which, octets, freshness, tag = secured_set
     properties = AutosarSecOCProperties(
         auth_algorithm_name=None, freshness_algorithm_name=None, data_id=AUTH | which << 11, payload_length=len(octets),
         freshness_bit_length=56, freshness_tx_bit_length=8, auth_tx_bit_length=36,
@@ -133,13 +135,39 @@ def test_authenticator_and_its_place_are_those_of_cantools(shape, trip, reset, m
     specifics._secoc = properties
     theirs = cantools.database.can.Message(AUTH, "Secured", len(octets) + 6, [], autosar_specifics=specifics)
     key = KEYS["EMB_FL_Auth"]
-    freshness = trip << 32 | reset_after << 8 | message_after
     secured_message = apply_authenticator(octets + bytes(6), theirs, lambda _m, data, _f: plain_cmac(key, data), freshness)
     assert verify_authenticator(secured_message, theirs, lambda _m, data, _f: plain_cmac(key, data), freshness)
     tail = int.from_bytes(secured_message[-6:]) >> 4
-    assert (tag["can_id"], tag["length"]) == (AUTH, 8)
-    assert tail >> 36 == int(tag["data"]) >> 20 & 0xFF == message_after
+    assert tail >> 36 == int(tag["data"]) >> 20 & 0xFF
     assert tail & (1 << 36) - 1 == int(tag["data"]) >> 28
+
+
+@given(authenticated())
+def test_scapy_has_the_same_code_of_a_set(secured_set):
+    """With its own AES and CMAC; its messages carry eight bits of freshness and 24 of the code, which it also verifies."""
+    from scapy.contrib.automotive.autosar.secoc_pdu import SecOC_PDU
+    from scapy.packet import Raw
+
+    which, octets, freshness, tag = secured_set
+
+    class Secured(SecOC_PDU):
+        def get_secoc_payload(self):
+            return (AUTH | which << 11).to_bytes(2) + bytes(self.pdu_payload)
+
+        def get_secoc_key(self):
+            return KEYS["EMB_FL_Auth"]
+
+        def get_secoc_freshness_value(self):
+            return freshness.to_bytes(7)
+
+    message = Secured(pdu_id=AUTH, pdu_payload=Raw(octets))
+    assert int.from_bytes(message.get_message_authentication_code()) >> 92 == int(tag["data"]) >> 28
+    message.secoc_authenticate()
+    assert message.tfv == int(tag["data"]) >> 20 & 0xFF and int.from_bytes(message.tmac) == int(tag["data"]) >> 40
+    heard = Secured(bytes(message))
+    assert heard.secoc_verify()
+    heard.pdu_payload = Raw(bytes([octets[0] ^ 1]) + octets[1:])
+    assert not heard.secoc_verify()
 
 
 def answer_to(trip, reset, message, payloads):
@@ -521,9 +549,42 @@ class TestFreshnessFile:
         def full(*_):
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(secured.files, "write", full)
+        monkeypatch.setattr(secured, "write_in_reserve", full)
         with pytest.raises(Unavailable, match="trip counter cannot be stored: No space left on device"):
             FreshnessFile(tmp_path).begin_trip()
+
+    def test_a_disk_that_has_become_full_is_no_obstacle(self, tmp_path, monkeypatch):
+        """Nothing is made and nothing grows once the file was written."""
+        opened(tmp_path).close()
+        taken, plain = {(file.stat().st_ino, file.stat().st_size) for file in tmp_path.iterdir()}, os.open
+
+        def full(path, flags, *mode):
+            if flags & os.O_CREAT and not Path(path).exists():
+                raise OSError(28, "No space left on device")
+            return plain(path, flags, *mode)
+
+        monkeypatch.setattr(os, "open", full)
+        authentication = opened(tmp_path)
+        authentication.verify(signed())
+        authentication.close()
+        assert {(file.stat().st_ino, file.stat().st_size) for file in tmp_path.iterdir()} == taken
+        assert FreshnessFile(tmp_path).load() == Freshness(trip=2, heard=authentication._verifier.last())
+        assert FreshnessFile(tmp_path).begin_trip().trip == 3
+
+    def test_what_could_not_be_stored_is_tried_again_and_told_once(self, tmp_path, monkeypatch, caplog):
+        def broken(*_):
+            raise OSError(5, "Input/output error")
+
+        authentication = opened(tmp_path)
+        authentication.verify(signed())
+        with monkeypatch.context() as patch:
+            patch.setattr(secured, "write_in_reserve", broken)
+            for _ in range(3):
+                authentication.close()
+                assert authentication.stale()
+        assert caplog.text.count("freshness cannot be stored: Input/output error") == 1
+        authentication.close()
+        assert not authentication.stale() and FreshnessFile(tmp_path).load().heard == authentication._verifier.last()
 
     def test_used_up(self, tmp_path):
         file = FreshnessFile(tmp_path)
@@ -534,7 +595,7 @@ class TestFreshnessFile:
     def test_far_behind_is_what_64_resets_are(self, tmp_path):
         authentication = opened(tmp_path)
         authentication.verify(signed())
-        authentication.keep()
+        authentication.close()
         links = authentication._verifier.links
         links["reset"][0] += 63
         assert not authentication.stale()

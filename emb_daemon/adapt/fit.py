@@ -128,24 +128,24 @@ class _Training:
     """
 
     def __init__(self, rows, calibration, state, scale):
-        self._rows, self._calibration, self._state, self._scale = rows, calibration, state, scale
+        self._rows, self.calibration, self._state, self.scale = rows, calibration, state, scale
         self._states = np.zeros(1, STATE)
         self.left_out = np.zeros((len(rows) - 1) // _BLOCK, bool)
 
     def values(self, x) -> dict[str, float]:
         """Values of the calibration's keys for the fitted values ``x``."""
-        return curve_values(self._calibration, x[_CURVE:] * self._scale) | {
-            LOAD_FRICTION: x[_LOAD] * self._calibration.motor.gear_gain_m_per_rad,
+        return curve_values(self.calibration, x[_CURVE:] * self.scale) | {
+            LOAD_FRICTION: x[_LOAD] * self.calibration.motor.gear_gain_m_per_rad,
             OFFSET_FRICTION: x[_OFFSET],
             PRESLIDING_ANGLE: exp(min(max(x[_PRESLIDING], -12.0), 2.0)),
         }
 
     def trial(self, x):
         """The calibration with the fitted values ``x``, motor and inertia included."""
-        motor = self._calibration.motor
+        motor = self.calibration.motor
         torque_constant = motor.torque_constant_Nm_per_A * exp(min(max(x[_GAIN], -1.0), 1.0))
         inertia = motor.inertia_kg_m2 * exp(min(max(x[_INERTIA], -1.0), 1.0))
-        return moved(self._calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
+        return moved(self.calibration, self.values(x) | {TORQUE_CONSTANT: torque_constant, INERTIA: inertia})
 
     def simulate(self, x):
         """Residuals that `_improve` minimises; unexplained motor torque (N m; NaN: unknown) and stiffness force (N) at each
@@ -404,21 +404,7 @@ def fit_training(
     training = _Training(rows, calibration, state, scale)
     fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
     x, sigmas = fit.x, np.sqrt(np.diag(fit.covariance))
-    values = training.values(x)
-    if unchanged:
-        values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
-    curve = to_parameters(moved(calibration, values))["curve"]
-    top = highest - x[_CONTACT]
-    # An error of the torque constant scales the whole curve; the shape is known better than the scale.
-    along = fit.covariance[_GAIN] / max(sigmas[_GAIN], 1e-300)
-    constant, relative, force_sigma = _force_sigma(curve, scale, fit.covariance - np.outer(along, along), top)
-    # Errors that the fit cannot see but the curve inherits: of the dynamics, the gear gain and the pad temperature.
-    scale_sigma = hypot(sigmas[_GAIN], limits.torque_constant_relative, factor_sigma)
-    if unchanged:
-        values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
-    else:
-        values[STIFFNESS_SIGMA] = hypot(constant, base.noise.stiffness_N)
-        values[STIFFNESS_RELATIVE_SIGMA] = hypot(relative, scale_sigma)
+    values, of_curve = _learned_values(training, fit, unchanged, base, highest - x[_CONTACT], factor_sigma)
     found = Evaluation(
         r.ACCEPTED,
         values={key: float(value) for key, value in values.items()},
@@ -439,8 +425,7 @@ def fit_training(
             "samples": len(rows),
             "curve_changed": float(not unchanged),
             "contact_sigma_rad": float(sigmas[_CONTACT]),
-            "force_sigma_N": force_sigma,
-            "top_force_N": float(characteristic_curve(top, curve)[0]),
+            **of_curve,
             "torque_gain": exp(x[_GAIN]),
             "torque_gain_sigma": float(sigmas[_GAIN]),
             "torque_offset_Nm": float(x[_TORQUE_OFFSET]),
@@ -449,6 +434,28 @@ def fit_training(
     )
     found.outcome, found.note = _judge(turned, fit, base, found)
     return found
+
+
+def _learned_values(training, fit, unchanged, base, top, factor_sigma):
+    """Values to be learned, by the calibration's keys, and as evidence the highest force, at angle ``top`` behind the contact,
+    and its standard deviation, N. A curve that is ``unchanged`` keeps its values and their standard deviations."""
+    calibration, x = training.calibration, fit.x
+    values = training.values(x)
+    if unchanged:
+        values |= {key: value_of(calibration, key) for key in curve_values(calibration, ())}
+    curve = to_parameters(moved(calibration, values))["curve"]
+    gain_sigma = sqrt(fit.covariance[_GAIN, _GAIN])
+    # An error of the torque constant scales the whole curve; the shape is known better than the scale.
+    along = fit.covariance[_GAIN] / max(gain_sigma, 1e-300)
+    constant, relative, force_sigma = _force_sigma(curve, training.scale, fit.covariance - np.outer(along, along), top)
+    if unchanged:
+        values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
+    else:
+        # Errors that the fit cannot see but the curve inherits: of the dynamics, the gear gain and the pad temperature.
+        scale_sigma = hypot(gain_sigma, calibration.adaptation.torque_constant_relative, factor_sigma)
+        values[STIFFNESS_SIGMA] = hypot(constant, base.noise.stiffness_N)
+        values[STIFFNESS_RELATIVE_SIGMA] = hypot(relative, scale_sigma)
+    return values, {"force_sigma_N": force_sigma, "top_force_N": float(characteristic_curve(top, curve)[0])}
 
 
 def _residual_evidence(fit, calibration):

@@ -21,6 +21,7 @@ from numba import types
 
 from emb_daemon import __version__
 from emb_daemon.ahead.library import Target, mark, seal
+from emb_daemon.ahead.parts import PartCompiler
 from emb_daemon.ahead.signature import Array, Entry, is_group
 from emb_daemon.atomic import write_atomically
 from emb_daemon.errors import Unavailable
@@ -73,7 +74,7 @@ def _lower(entry: Entry) -> str:
     name in C. It is the same for all targets."""
     wrapper, kinds = _wrapper(entry)
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-    compiled = numba.njit(types.void(*kinds), **options)(wrapper)
+    compiled = numba.njit(types.void(*kinds), pipeline_class=PartCompiler, **options)(wrapper)
     [overload] = compiled.overloads.values()
     kind_in_c = {types.int64: "i64", types.float64: "double"}
     loads, arguments = [], ["ptr %words"]

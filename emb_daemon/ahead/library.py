@@ -6,11 +6,13 @@ have written it.
 """
 
 import ctypes
+import grp
 import hashlib
 import importlib.util
 import operator
 import os
 import platform
+import pwd
 import stat
 import struct
 import sys
@@ -100,11 +102,23 @@ def who_else_writes(path: Path) -> str:
     of root are accepted like one's own, and root accepts files of anybody."""
     for place in (path, path.parent):
         status = place.stat()
-        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
-            return f"{place} is writable by anybody"
+        if not status.st_mode & stat.S_ISVTX:
+            if status.st_mode & stat.S_IWOTH:
+                return f"{place} is writable by anybody"
+            if status.st_mode & stat.S_IWGRP and not _is_own_group(status.st_gid):
+                return f"{place} is writable by a group with other users (id {status.st_gid})"
         if place == path and os.geteuid() != 0 and status.st_uid not in (0, os.geteuid()):
             return f"{place} belongs to another user"
     return ""
+
+
+def _is_own_group(number: int) -> bool:
+    """Whether a group is root's, or the one of the user's own name that many systems give each user, and nobody else's."""
+    try:
+        user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(number)
+    except KeyError:
+        return number == 0
+    return number == 0 or (group.gr_name == user.pw_name and not set(group.gr_mem) - {user.pw_name})
 
 
 def default_path() -> Path:

@@ -1,6 +1,7 @@
 """emb-daemon fleet."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parsers[name].add_argument(
             "--scheduler", metavar="ADDRESS", help="address of a Dask cluster whose workers see DIR (default: this machine)"
         )
+    for name in ("ingest", "replay", "learn", "diagnose", "bench"):
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
     add_path(parsers["diagnose"], "--units", "what units have in common: columns unit, batch, supplier, ...", "FILE.csv")
     add_path(parsers["prior"], "--output", "the calibration to write", "FILE.yaml", required=True)
@@ -53,6 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    workers = getattr(arguments, "workers", None)
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
     return _COMMANDS[arguments.fleet_command][0](arguments)
 
 
@@ -67,8 +72,6 @@ def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list,
     from emb_daemon.fleet.cluster import cluster
     from emb_daemon.fleet.cluster import run as run_on
 
-    if arguments.workers is not None and arguments.workers < 1:
-        raise InputError(f"--workers {arguments.workers}: expected 1 or more")
     if not items:
         return []
     with progress(text) as show, cluster(arguments.scheduler, arguments.workers) as client:
@@ -182,11 +185,14 @@ def _prior(arguments: argparse.Namespace) -> int:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from emb_daemon.fleet.speed import stages
+    from emb_daemon.fleet.speed import scaling, stages
 
+    calibration, workers = _calibration(arguments), arguments.workers or len(os.sched_getaffinity(0))
     print(f"{'stage':<24}µs a sample   × real time")
-    for stage in stages(arguments.log, _calibration(arguments)):
+    for stage in stages(arguments.log, calibration):
         print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
+    gain = scaling(arguments.log, calibration, workers)
+    print(f"{workers} workers replay {gain.replay:.2f} times as fast as one, and add {gain.additions:.2f} times as fast")
     return 0
 
 
@@ -201,5 +207,8 @@ _COMMANDS = {
     ),
     "prior": (_prior, "write a calibration with the population's values, their spread, and bounds for adaptation"),
     "report": (_report, "write the findings as one page: map of units, worst ten, batches, trend, next action"),
-    "bench": (_bench, "measure how fast one core of this machine replays a log, stage by stage"),
+    "bench": (
+        _bench,
+        "measure how fast one core of this machine replays a log, stage by stage, and how much faster all do",
+    ),
 }

@@ -1,14 +1,20 @@
-"""How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns."""
+"""How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns; and how
+much faster several workers are than one."""
 
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
 
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.fleet.dataset import Drive, read_drive
+from emb_daemon.fleet.cluster import cluster, run
+from emb_daemon.fleet.dataset import DIGEST, Drive, read_drive, write_drive
 from emb_daemon.fleet.ingest import Job, ingest
+from emb_daemon.fleet.replaying import replay_drive
 from emb_daemon.fleet.scores import Scorer
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
@@ -16,8 +22,15 @@ from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 #: Number of runs of each stage. The fastest counts, because other load of the machine only slows a run.
 _TIMES = 3
+#: Samples of all drives that several workers replay: seconds of one worker's time, in which giving out the work hardly counts.
+_SCALED_SAMPLES = 2_000_000
+#: Additions of a task that only computes: about as long as the replay of a minute.
+_ADDITIONS = 3_000_000
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,48 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
             "replay from columns": lambda: estimate(read_drive(root, drive)[0].samples, parameters),
         }
         return [Stage(name, 1e6 * (spent := _time(task)) / len(samples), seconds / spent) for name, task in work.items()]
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Speed of several workers over that of one: of a replay from columns that writes its estimates, and of additions, which
+    shows what the machine has left for them."""
+
+    replay: float
+    additions: float
+
+
+def scaling(path: Path, calibration: Calibration, workers: int) -> Scaling:
+    """Replay copies of a log's first drive with one worker and with several, in turns; medians.
+
+    Raises:
+        InputError: not readable, or without samples.
+    """
+    with tempfile.TemporaryDirectory() as folder, cluster(None, 1) as one, cluster(None, workers) as several:
+        root = Path(folder)
+        first = Drive(**ingest(root, Job(path, "unit", ""))["drives"][0])
+        log, about = read_drive(root, first)
+        count = max(8 * workers, -(-_SCALED_SAMPLES // len(log.samples)))
+        drives = [replace(first, digest=f"{number:0{DIGEST}x}") for number in range(count)]
+        for drive in drives:
+            write_drive(root, drive, about, log.samples, log.force_N)
+        replay = partial(replay_drive, root, calibration=calibration)
+        return Scaling(*(_gain(task, drives, one, several) for task in (replay, _add)))
+
+
+def _gain(task: Callable[[Drive], object], drives: list[Drive], one: "Client", several: "Client") -> float:
+    def wall_s(client: "Client") -> float:
+        begin = time.monotonic()
+        run(client, task, drives)
+        return time.monotonic() - begin
+
+    rounds = [(wall_s(one), wall_s(several)) for _ in range(1 + _TIMES)]
+    # The first loads the kernels.
+    return median(alone / together for alone, together in rounds[1:])
+
+
+def _add(_drive: Drive) -> int:
+    return sum(range(_ADDITIONS))
 
 
 def _time(task: Callable) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import Meta
 
 from emb_daemon.adapt import files
+from emb_daemon.atomic import write_in_reserve
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.bus import Bus
@@ -20,6 +21,9 @@ _FORMAT = 1
 #: Reset counters that a sender may be ahead of the stored one. Frames of this time, 45 s of a corner's, can be played back to
 #: a daemon that was killed. Storing every reset counter would write to flash memory once a second.
 _RESETS_NOT_KEPT = 64
+#: Room on the disk for the counters of all links, taken at the first start: a daemon that a full disk kept from storing them
+#: would not start, and after a kill would believe everything that was sent since they were last stored.
+_ROOM = 4096
 
 
 class Freshness(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,6 +43,7 @@ class FreshnessFile:
 
     def __init__(self, folder: Path):
         self.path: Path = Path(folder) / "freshness.json"
+        self._told: str | None = None
 
     def load(self) -> Freshness:
         """The stored values; none without a file. A damaged file is set aside. Without values old messages are accepted."""
@@ -65,16 +70,25 @@ class FreshnessFile:
         begun = kept.next_trip()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            files.write(self.path, begun)
+            self._write(begun)
         except OSError as error:
             raise Unavailable(f"{self.path}: trip counter cannot be stored: {error.strerror}") from None
         return begun
 
-    def keep(self, freshness: Freshness) -> None:
+    def keep(self, freshness: Freshness) -> bool:
+        """Whether the values could be stored; a reason why not is logged once."""
         try:
-            files.write(self.path, freshness)
+            self._write(freshness)
         except OSError as error:
-            log.error("%s: freshness cannot be stored: %s", self.path, error.strerror)
+            if error.strerror != self._told:
+                log.error("%s: freshness cannot be stored: %s", self.path, error.strerror)
+            self._told = error.strerror
+            return False
+        self._told = None
+        return True
+
+    def _write(self, freshness: Freshness) -> None:
+        write_in_reserve(self.path, files.encode(freshness), _ROOM)
 
 
 class Authentication:
@@ -116,9 +130,14 @@ class Authentication:
     def keep(self) -> None:
         """Start to store the received counters, in a thread."""
         if self._file and not (self._writer and self._writer.is_alive()):
-            self._kept = msgspec.structs.replace(self._kept, heard=self._kept.heard | self._verifier.last())
-            self._writer = threading.Thread(target=self._file.keep, args=(self._kept,), name="freshness")
+            heard = msgspec.structs.replace(self._kept, heard=self._kept.heard | self._verifier.last())
+            self._writer = threading.Thread(target=self._store, args=(self._file, heard), name="freshness")
             self._writer.start()
+
+    def _store(self, file: FreshnessFile, heard: Freshness) -> None:
+        """What could not be stored stays stale, and is tried again."""
+        if file.keep(heard):
+            self._kept = heard
 
     def close(self) -> None:
         """Store the received counters."""
