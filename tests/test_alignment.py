@@ -72,7 +72,7 @@ def test_a_filter_is_found(cycles, seed):
 
 def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
     torque, a = _torque(20.0), np.zeros(1, ALIGNMENT)[0]
-    before, after = torque[:3500], torque[3500:4000]
+    before, after = torque[:3500], torque[3500:4700]
     assert _compare(*_apart(before, 0.0), a, 0.0) == 0.0
     _compare(*_apart(after, 2.0), a, 0.0)
     assert a["slow"] == pytest.approx(2.0, rel=0.25)
