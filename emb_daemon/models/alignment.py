@@ -39,9 +39,10 @@ _KEPT, _ENOUGH = 20.0, 6.0
 #: Least shift that is taken out, and least time constant, cycles. Half of one is within what the estimate allows for, and
 #: interpolation costs as much; a current that is late by a third looks like a filter of as much.
 _WORTH, _WORTH_SLOW = 0.6, 0.5
-#: Standard deviations of a torque that its changes must be off by on the average: a difference's own are 1.4, and the shortest
-#: filter above makes two where changes are as small as may tell.
-_BEYOND = 1.75
+#: Standard deviations of a torque that its changes must be off by on the average: for a shift three of a difference's, because
+#: some shift explains much of noise; for a filter, which does not, little over a difference's 1.4. The shortest that is undone
+#: makes two where changes are as small as may tell.
+_BEYOND, _BEYOND_SLOW = 4.2, 1.75
 #: Least part of the sum of squares that a shift, or a filter of the current, must explain: a right one leaves a twentieth to
 #: a fifth, and friction that the calibration does not know, as of grease at -20 degC, has made a wrong one explain half. The
 #: same of a filter of the motion: a current that shows twice as much looks like one, and two thirds of it are explained.
@@ -155,7 +156,7 @@ def compare(a: Record, shown: float, needed: float, rubbed: float, noise: float)
     moved = a.needed[EARLIEST] - a.needed[EARLIEST + 1]
     curved = changed - before
     a.changed, a.moved = _add(a.changed, changed * changed), _add(a.moved, moved * moved)
-    a.noisy = _add(a.noisy, _BEYOND * _BEYOND * noise * noise)
+    a.noisy = _add(a.noisy, noise * noise)
     a.curved, a.against = _add(a.curved, curved * curved), _add(a.against, (moved - changed) * curved)
     for i in range(_SHIFTS):
         off = changed - (a.needed[i] - a.needed[i + 1])
@@ -186,7 +187,7 @@ def _add(total, term):
 def _found(a):
     """Shift and time constant, cycles, of which one at most is not 0: what explains most, if it explains enough."""
     apart = a.square[EARLIEST]
-    if a.told < _ENOUGH or apart < a.noisy:
+    if a.told < _ENOUGH or apart < _BEYOND_SLOW * _BEYOND_SLOW * a.noisy:
         return 0.0, 0.0
     # A current, or a motion, that shows nothing is explained by nothing.
     place, least = _least(a.square)
@@ -203,7 +204,7 @@ def _found(a):
         return 0.0, 0.0
     if slow != 0.0:
         return 0.0, slow if abs(slow) > _WORTH_SLOW else 0.0
-    return shift if abs(shift) > _WORTH else 0.0, 0.0
+    return shift if abs(shift) > _WORTH and apart > _BEYOND * _BEYOND * a.noisy else 0.0, 0.0
 
 
 @njit
