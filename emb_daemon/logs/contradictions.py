@@ -448,7 +448,7 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
     """Means of another signal over the lowest and the highest part of the travel with enough samples."""
     at = other.sampled(angle.time_ns)
     known = np.isfinite(at)
-    part = np.minimum(_PARTS * (angle.values - angle.values.min()) / np.ptp(angle.values), _PARTS - 1).astype(int)
+    part = np.minimum(_PARTS * (angle.values - angle.values.min()) / (np.ptp(angle.values) or 1.0), _PARTS - 1).astype(int)
     means = [np.mean(at[known & (part == n)]) for n in range(_PARTS) if np.sum(known & (part == n)) >= _LEAST_IN_PART]
     return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
 
