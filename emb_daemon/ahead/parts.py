@@ -1,5 +1,7 @@
 """Code in LLVM's form that becomes a part of other code: of kernels, or of a library."""
 
+from collections.abc import Callable
+
 from llvmlite.binding import parse_bitcode
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
@@ -11,18 +13,19 @@ class Part(JITCodeLibrary):
     numba's own libraries would do both before as well: of each function with all that it calls, once for each level of calls.
     """
 
-    serialize_using_object_code = JITCodeLibrary.serialize_using_bitcode
+    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
+        return self.serialize_using_bitcode()
 
     @property
-    def codegen(self):
+    def codegen(self) -> "Part":
         """Where numba would file constants of Python's for the machine code, which there is not."""
         return self
 
-    def set_env(self, name, environment):
+    def set_env(self, name: str, environment: object) -> None:
         pass
 
     @classmethod
-    def of_bitcode(cls, codegen, name: str, bitcode: bytes):
+    def of_bitcode(cls, codegen: object, name: str, bitcode: bytes) -> "Part":
         """What `serialize_using_bitcode` gave."""
         part = cls(codegen, name)
         part._final_module = parse_bitcode(bitcode)
@@ -40,6 +43,6 @@ class Part(JITCodeLibrary):
 class PartCompiler(Compiler):
     """numba's, into what is neither optimised nor translated."""
 
-    def compile_extra(self, func):
+    def compile_extra(self, func: Callable) -> object:
         self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
