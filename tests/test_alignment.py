@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, restart
-from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import CURRENT_APART
+from emb_daemon.estimator.step import _lead
 from emb_daemon.models import alignment
 from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, interrupt
 from emb_daemon.offline import estimate
@@ -92,7 +93,7 @@ def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
     ids=["nothing", "half", "twice", "gain", "offset", "dead", "friction"],
 )
 @pytest.mark.parametrize("seed", range(5))
-def test_what_no_shift_explains_is_none(wrong, seed):
+def test_what_neither_shift_nor_filter_explains_is_none(wrong, seed):
     needed = _torque(seed=seed)
     assert _compare(wrong(needed), needed) == 0.0
 
@@ -162,6 +163,7 @@ def test_it_is_undone_within_a_stop(names, by, cycles, seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_unit_within_tolerances_is_in_step(parameters, seed):
     a = _after(city.drive(seed, 40.0)[0], parameters)["alignment"]
+    # Of what the sums keep, three quarters: 27 samples told.
     assert (a["delay"], a["late"], a["lag"], a["slow"]) == (0.0, 0.0, 0.0, 0.0) and a["told"] > 15.0
 
 
@@ -281,26 +283,36 @@ def test_a_force_beyond_the_range_is_told_at_its_own_sample(parameters, late):
     assert np.all(estimates["reasons"][beyond] & OUTSIDE_RANGE) and np.all(estimates["sigma"] <= 5000.0)
 
 
-def test_it_survives_a_restart(parameters, late):
-    p, resumed, snapshot = parameters[0], new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
-    assert restart.take_snapshot(_after(late, parameters), p, snapshot) and not restart.why_implausible(snapshot, p)
-    assert snapshot["delay"] == pytest.approx(2.0, abs=0.2)
-    restart.resume(resumed, p, snapshot, 60.0)
-    assert resumed["alignment"]["delay"] == snapshot["delay"]
-    snapshot["delay"] = 5.0
-    assert restart.why_implausible(snapshot, p) == "delay"
-
-
-def test_a_filter_survives_a_restart(parameters):
+@pytest.mark.parametrize(
+    ("by", "cycles", "field", "beyond"),
+    [(_late, 2.0, "delay", 5.0), (_filtered, 3.0, "lag", 12.5), (_filtered, 3.0, "lag", -12.5)],
+)
+def test_it_survives_a_restart(parameters, by, cycles, field, beyond):
     p, resumed, snapshot = parameters[0], new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
     samples = city.drive(1, 25.0)[0].copy()
-    _moved(_CURRENT, 3.0, _filtered)(samples)
+    _moved(_CURRENT, cycles, by)(samples)
     assert restart.take_snapshot(_after(samples, parameters), p, snapshot) and not restart.why_implausible(snapshot, p)
-    assert snapshot["lag"] == pytest.approx(3.0, rel=0.15)
+    assert snapshot[field] == pytest.approx(cycles, rel=0.15)
     restart.resume(resumed, p, snapshot, 60.0)
-    assert resumed["alignment"]["lag"] == snapshot["lag"]
-    snapshot["lag"] = -12.5
-    assert restart.why_implausible(snapshot, p) == "lag"
+    assert resumed["alignment"][field] == snapshot[field]
+    snapshot[field] = beyond
+    assert restart.why_implausible(snapshot, p) == field
+
+
+def test_pads_are_led_on_by_the_delay_and_the_filter_together(parameters):
+    """A motor that turns steadily is as far on after two cycles and a filter of two as after four of either."""
+    p = brake.ideal(parameters)
+    rows = brake.samples(p, brake.clamp(p, 20.0, 1.0))[0]
+    state, forces = new_state(), []
+    estimate(rows, p, state)
+    s, last, out = state[0], rows[-1].copy(), np.zeros(1, ESTIMATE)[0]
+    angle, speed = float(last["angle"]), float(last["speed"])
+    for delay, lag in ((2.0, -2.0), (4.0, 0.0), (-2.0, -2.0), (0.0, -4.0)):
+        s["alignment"]["delay"], s["alignment"]["lag"] = delay, lag
+        last["angle"], out["force"] = angle - max(delay, 0.0) * _DT * speed, 1e4
+        _lead(s, p, last, angle, speed, out)
+        forces.append(float(out["force"]))
+    assert forces == pytest.approx(4 * [forces[-1]]) and forces[-1] > 1.01e4
 
 
 @pytest.mark.parametrize(

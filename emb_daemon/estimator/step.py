@@ -119,8 +119,9 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
 def _lead(s, p, m, angle, speed, out):
     """From the moment to which the sample was moved back to that in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads
     go on to where the motor is now."""
-    apart = CYCLE_S * (abs(s.alignment.delay) + max(-s.alignment.lag, 0.0))
-    way = angle - m.angle if s.alignment.delay > 0.0 else apart * speed
+    delay, filtered = CYCLE_S * s.alignment.delay, CYCLE_S * max(-s.alignment.lag, 0.0)
+    apart = abs(delay) + filtered
+    way = angle - m.angle + filtered * speed if delay > 0.0 else apart * speed
     here, _ = characteristic_curve(s.past_contact, p.curve)
     there, _ = characteristic_curve(s.past_contact + s.gear_slope * way, p.curve)
     drive = s.drive + s.factor * s.scale * (there - here)
