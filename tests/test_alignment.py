@@ -71,6 +71,29 @@ def test_a_filter_is_found(cycles, seed):
     assert a["late"] == 0.0
 
 
+@pytest.mark.parametrize("cycles", [-0.4, 0.4])
+def test_a_filter_within_what_the_estimate_allows_for_is_left(cycles):
+    """However clear it is: a current that is late by a third of a cycle looks like it."""
+    a, torque = np.zeros(1, ALIGNMENT)[0], _torque()
+    a["angle"][0] = 1.0
+    pair = (_filtered(torque, cycles), torque) if cycles > 0.0 else (torque, _filtered(torque, -cycles))
+    for shown, needed in zip(*pair, strict=True):
+        compare(a, shown, needed, 0.0, 0.1 * _NOISE)
+    assert a["told"] > 15.0 and a["slow"] == 0.0
+
+
+def test_noise_of_a_small_stroke_is_no_filter():
+    stroke = np.convolve(
+        np.repeat([0.0, 0.15, -0.075, 0.075], [20, 10, 10, 20]), np.hanning(12) / np.hanning(12).sum(), "same"
+    )
+    for seed in range(300):
+        a, noise = np.zeros(1, ALIGNMENT)[0], _NOISE * np.random.default_rng(seed).standard_normal(len(stroke))
+        a["angle"][0] = 1.0
+        for shown, needed in zip(stroke, stroke + noise, strict=True):
+            compare(a, shown, needed, 0.0, _NOISE)
+            assert a["slow"] == 0.0, seed
+
+
 def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
     torque, a = _torque(20.0), np.zeros(1, ALIGNMENT)[0]
     before, after = torque[:3500], torque[3500:4700]
@@ -158,6 +181,16 @@ def test_it_is_undone_within_a_stop(names, by, cycles, seed):
     error = (estimates["force"] - force)[second]
     assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean((unmoved["force"] - force)[second] ** 2)) + 25.0
     assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_does_not_go_through_a_filter_of_the_motion(parameters, seed):
+    """It turns over with the motion that is left. Counted with the rest it hides a filter of 16 ms, and 3 to 4 kN remain."""
+    samples, force = city.drive(seed, 40.0)
+    samples, state = samples.copy(), new_state()
+    _moved(_MOTION, 4.0, _filtered)(samples)
+    error = (estimate(samples, parameters, state)["force"] - force)[-2500:]
+    assert -5.5 < state[0]["alignment"]["lag"] < -3.5 and np.sqrt(np.mean(error**2)) < 100.0
 
 
 @pytest.mark.parametrize("seed", range(5))
