@@ -1,13 +1,15 @@
-"""A motor angle that is older than the speed beside it: found, undone, covered; nothing else is taken for it."""
+"""A motor angle that is older than the speed beside it, or a speed that went through a filter: found, undone, covered; nothing
+else is taken for it."""
 
 import brake
+import city
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import fuse, step
-from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator import fuse, restart, step
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
-from emb_daemon.models.lateness import LATENESS, follow, interrupt
+from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, unfilter
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import PATHS_DISAGREE
 
@@ -52,6 +54,71 @@ def test_an_angle_in_time_is_not_old(gain):
 
 def test_an_older_speed_says_nothing_of_the_angle():
     assert _age(speed_late_s=0.003) == 0.0
+
+
+def _filtered(speeds, filter_s):
+    """Speeds through a first-order filter."""
+    shown, state = np.empty_like(speeds), speeds[0]
+    for row, speed in enumerate(speeds):
+        state += (speed - state) / (1.0 + filter_s / _DT)
+        shown[row] = state
+    return shown
+
+
+def _unfilter(a, angles, speeds):
+    """Follow signals as the estimator does; the speeds that it takes them for."""
+    m, taken, before = np.zeros(1, SAMPLE)[0], [speeds[0]], angles[0]
+    m["dt"], a["reported"] = _DT, speeds[0]
+    for angle, speed in zip(angles[1:], speeds[1:], strict=True):
+        m["speed"] = speed
+        unfilter(a, m)
+        follow(a, angle - before, 0.5 * (m["speed"] + taken[-1]) * _DT, m["speed"] - taken[-1], _DT)
+        find_filter(a)
+        before, taken = angle, [*taken, float(m["speed"])]
+    return np.array(taken)
+
+
+@pytest.mark.parametrize("filter_s", [0.004, 0.01, 0.03])
+def test_a_filter_of_the_speed_is_undone(filter_s):
+    a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals()
+    taken = _unfilter(a, angles, _filtered(speeds, filter_s))
+    assert a["filtered"] == pytest.approx(filter_s, rel=0.1, abs=_DT / 2)
+    left = np.std((taken - speeds)[250:])
+    assert left < 0.25 * np.std((_filtered(speeds, filter_s) - speeds)[250:])
+
+
+def test_a_filter_that_comes_while_driving_is_found_in_a_stroke_and_one_that_goes_is_forgotten():
+    a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=60.0)
+    _unfilter(a, angles, speeds)
+    assert a["filtered"] == 0.0
+    angles, speeds = _signals(seconds=1.0)
+    _unfilter(a, angles, _filtered(speeds, 0.015))
+    assert a["filtered"] == pytest.approx(0.015, rel=0.2)
+    _unfilter(a, *_signals(seconds=2.0))
+    assert a["filtered"] < _DT / 2
+
+
+@pytest.mark.parametrize("signals", [{"gain": 0.93}, {"gain": 1.07}, {"late_s": 0.009}, {"speed_late_s": 0.0015}])
+def test_what_is_no_filter_of_the_speed_is_not_undone(signals):
+    """A gain of the resolver, an old angle, a speed that is the mean of its cycle as it was at calibration."""
+    a = np.zeros(1, LATENESS)[0]
+    _unfilter(a, *_signals(seconds=20.0, **signals))
+    assert a["filtered"] == 0.0
+
+
+def test_neither_slip_nor_noise_is_a_filter():
+    a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=30.0)
+    strokes = np.floor(9.0 * _DT * np.arange(len(angles)) / (2.0 * np.pi))
+    _unfilter(a, angles - 4.0 * strokes, speeds + 0.3)
+    assert a["filtered"] == 0.0
+    _unfilter(a, np.zeros(5000), 10.0 * np.random.default_rng(1).standard_normal(5000))
+    assert a["filtered"] == 0.0
+
+
+def test_a_filter_is_undone_up_to_twelve_cycles():
+    a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=20.0)
+    _unfilter(a, angles, _filtered(speeds, 0.08))
+    assert a["filtered"] == SLOWEST_S
 
 
 def _gain(**signals):
@@ -155,9 +222,9 @@ def s():
 
 
 def _turning(p):
-    """A sample of a motor that gains speed."""
+    """A sample of a motor that gains speed, whose angle is 5 ms late."""
     m = brake.samples(p, np.zeros(2))[0][1]
-    m["angle"], m["speed"] = 0.5, 100.0
+    m["angle"], m["speed"] = -0.3, 100.0
     return m
 
 
@@ -184,8 +251,8 @@ def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
 
 def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s):
     p, m = parameters[0], _turning(parameters[0])
-    s["lateness"]["ss"] = s["lateness"]["ww"] = 1e9
-    s["lateness"]["as_"] = -0.005 * 1e9
+    s["lateness"]["ss"] = s["lateness"]["ww"] = 2e5
+    s["lateness"]["as_"] = -0.005 * 2e5
     step._follow_age(s, p, m, False)
     assert s["late"] == pytest.approx(0.005, rel=0.01)
     p["effects"]["signal_delay"]["delay_s"] = 0.003
@@ -217,7 +284,37 @@ def test_a_current_that_changes_meanwhile_is_of_another_angle(parameters, s):
     assert fuse._moving_variance(s, p, m) - speeds == pytest.approx((1.3 * p["torque_constant"] * 20.0) ** 2)
 
 
-@pytest.mark.parametrize(("late_s", "told"), [(0.0079, False), (0.0081, True)])
-def test_an_angle_over_two_cycles_old_is_told(parameters, s, late_s, told):
-    s["late"] = late_s
+@pytest.mark.parametrize(
+    ("late_s", "filtered_s", "told"),
+    [(0.0079, 0.0, False), (0.0081, 0.0, True), (0.0, 0.047, False), (0.0, SLOWEST_S, True)],
+)
+def test_an_angle_over_two_cycles_old_is_told_and_a_speed_that_may_be_older_than_is_undone(
+    parameters, s, late_s, filtered_s, told
+):
+    s["late"], s["lateness"]["filtered"] = late_s, filtered_s
     assert bool(fuse._facts_of_torque(s, parameters[0]) & ANGLE_LATE) == told
+
+
+@pytest.mark.parametrize("filter_s", [0.004, 0.012, 0.025])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_a_filtered_speed_hides_is_not_taken_for_another_brake(parameters, filter_s, seed):
+    """Without this inertia comes kilonewtons too late. It is kept over a restart."""
+
+    def change(rows):
+        rows["speed"] = _filtered(rows["speed"], filter_s)
+
+    samples, force = city.drive(seed, 40.0)
+    samples, state = samples.copy(), new_state()
+    change(samples)
+    estimates = estimate(samples, parameters, state)
+    unmoved, _ = city.changed(seed=seed, seconds=40.0)
+    second = slice(city.SECOND_CLEARANCE, None)
+    error = (estimates["force"] - force)[second]
+    assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean((unmoved["force"] - force)[second] ** 2)) + 25.0
+    assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
+    p, resumed, snapshot = parameters[0], new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+    assert restart.take_snapshot(state[0], p, snapshot) and not restart.why_implausible(snapshot, p)
+    restart.resume(resumed, p, snapshot, 60.0)
+    assert resumed["lateness"]["filtered"] == snapshot["filtered"] == pytest.approx(filter_s, rel=0.15, abs=_DT / 2)
+    snapshot["filtered"] = 0.05
+    assert restart.why_implausible(snapshot, p) == "filtered"

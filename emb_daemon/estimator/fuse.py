@@ -78,6 +78,7 @@ from emb_daemon.models.fusion import (
     predict_errors,
 )
 from emb_daemon.models.gear import most_of_spring, steepest
+from emb_daemon.models.lateness import SLOWEST_S
 from emb_daemon.models.plausibility import (
     AGREE,
     BEYOND_CHANCE,
@@ -408,7 +409,7 @@ def _facts_of_torque(s, p):
         facts |= OFFSET_LARGE
     if uneven.unproven(s.uneven) > _NOTED * p.maximum_force:
         facts |= DISC_UNEVEN
-    if s.late > _TOLD_CYCLES * CYCLE_S:
+    if s.late > _TOLD_CYCLES * CYCLE_S or s.lateness.filtered == SLOWEST_S:
         facts |= ANGLE_LATE
     if out_of_step(s.alignment) or at_bound(s.alignment):
         facts |= CURRENT_APART

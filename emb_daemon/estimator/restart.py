@@ -25,6 +25,7 @@ from emb_daemon.estimator.unknown import (
 from emb_daemon.jit import Record, entry, njit, sq
 from emb_daemon.models.alignment import EARLIEST, LATEST, SLOWEST
 from emb_daemon.models.fusion import CONTACT, CREEPS, FAST, NOISE, STATES, copy_errors
+from emb_daemon.models.lateness import SLOWEST_S
 from emb_daemon.models.thermal import NODES, UNALTERED, heat_step
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -52,6 +53,7 @@ SNAPSHOT = np.dtype(
         ("housing", "f8"),
         ("delay", "f8"),
         ("lag", "f8"),
+        ("filtered", "f8"),
         ("temperature_known", "?"),
         ("pads", "f8", (2, NODES)),
         ("disc", "f8"),
@@ -84,7 +86,7 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
         snapshot.creep[i] = s.creep[i]
     copy_errors(snapshot.error, snapshot.covariance, s.error, s.covariance)
     snapshot.winding, snapshot.housing = s.winding, s.housing
-    snapshot.delay, snapshot.lag = s.alignment.delay, s.alignment.lag
+    snapshot.delay, snapshot.lag, snapshot.filtered = s.alignment.delay, s.alignment.lag, s.lateness.filtered
     snapshot.temperature_known = s.temperature_known
     _copy_pads(snapshot.pads, s.pads)
     snapshot.disc, snapshot.history = s.disc, s.history
@@ -122,6 +124,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
         "housing": 0.0 <= snapshot["housing"] <= _HEAT,
         "delay": -EARLIEST <= snapshot["delay"] <= LATEST,
         "lag": abs(snapshot["lag"]) <= SLOWEST,
+        "filtered": 0.0 <= snapshot["filtered"] <= SLOWEST_S,
     }
     for name in ("pads", "disc", "growth_start"):
         if snapshot["temperature_known"]:
@@ -150,7 +153,7 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.covariance[FAST, FAST] = 1.0
     s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
     add_rest(s.covariance, p, elapsed_s)
-    s.alignment.delay, s.alignment.lag = snapshot.delay, snapshot.lag
+    s.alignment.delay, s.alignment.lag, s.lateness.filtered = snapshot.delay, snapshot.lag, snapshot.filtered
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
     if snapshot.temperature_known:

@@ -42,7 +42,7 @@ TABLE = {
     "model_error": Fact("the residual is larger than noise explains", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque exceeds a healthy current sensor's", PATHS_DISAGREE, FUSED),
     "disc_uneven": Fact("the disc may vary in thickness beyond the calibration", PATHS_DISAGREE, FUSED),
-    "angle_late": Fact("the motor angle is over two cycles older than the speed of its sample", PATHS_DISAGREE, FUSED),
+    "angle_late": Fact("motor angle and motor speed of a sample are over two cycles apart", PATHS_DISAGREE, FUSED),
     "current_apart": Fact("current and motor angle are apart in time by more than is taken out", PATHS_DISAGREE, FUSED),
     "force_sensor_wrong": Fact("the force sensor contradicts angle and current, or is stuck", PATHS_DISAGREE, FUSED),
     "resolver_implausible": Fact("the resolver is frozen, or contradicts itself", PATHS_DISAGREE | STUCK, TORQUE_ONLY),

@@ -49,7 +49,7 @@ from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
-from emb_daemon.models.lateness import follow, interrupt
+from emb_daemon.models.lateness import find_filter, follow, interrupt, unfilter
 from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
@@ -110,6 +110,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
         out: ESTIMATE record to fill; the caller owns time, corner, counter and cycle.
     """
     angle, speed, current = m.angle, m.speed, m.current_q
+    unfilter(s.lateness, m)
     align(s.alignment, m)
     _advance(s, p, m, angle, speed, out)
     m.angle, m.speed, m.current_q = angle, speed, current
@@ -139,7 +140,7 @@ def _advance(s, p, m, angle, speed, out):
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT]), s.contact.confirmed)
-    _follow_age(s, p, m, moved_zero)
+    other_speed = _follow_age(s, p, m, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
@@ -158,7 +159,7 @@ def _advance(s, p, m, angle, speed, out):
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
     torque, leverage, friction_variance = torque_path(s, p, m)
-    if moved_zero:
+    if moved_zero or other_speed:
         torque = np.nan
     # Over a gap the current of its last cycle does not belong to the mean acceleration.
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment):
@@ -192,7 +193,7 @@ def _advance(s, p, m, angle, speed, out):
 
 @njit
 def _follow_age(s, p, m, moved_zero):
-    """Age of the angle beyond the calibration's, and whether its zero wanders."""
+    """Age of the angle beyond the calibration's, and whether its zero wanders; whether the speed is another from now on."""
     travel, turned, gained = m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero and s.drifting_s == 0.0
     if seen and s.plausibility.verdict != STIFFNESS_WRONG:
@@ -203,9 +204,16 @@ def _follow_age(s, p, m, moved_zero):
         follow_straying(s, travel, m.speed, m.dt)
     if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
-        return
+        return False
     follow(s.lateness, travel, turned, gained, m.dt)
     s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
+    if p.clearance_sigma == 0.0 or not find_filter(s.lateness):
+        return False
+    # The way so far was beside another speed, and what it told of the brake is wrong.
+    s.strayed, s.plausibility.apart = np.nan, 0.0
+    leave_stretch(s.wander)
+    open_all(s, p)
+    return True
 
 
 @njit
