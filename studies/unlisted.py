@@ -196,6 +196,15 @@ def stiction(rng, moments, size):
 
 
 @_family
+def cogging(rng, moments, size):
+    """Of a magnet that has moved or cracked, some hundredths of what the largest force asks of the motor."""
+    torque, phase = size.current * draw_size(rng, 0.005, 0.05), float(rng.uniform(0.0, 6.3))
+    order, at = float(rng.choice([1.0, 2.0, 6.0, 7.0, 12.0, 24.0, 36.0])), pick_sometime(rng, moments)
+    parts = {"cosine_Nm": torque * np.cos(phase), "sine_Nm": torque * np.sin(phase), "order_per_turn": order}
+    return Fault(f"{1e3 * torque:.0f} mN m, order {order:.0f}", at, car=once(at, effect("cogging_torque", **parts)))
+
+
+@_family
 def water(rng, moments, size):
     """A wet disc: half the friction, five times the cooling."""
     friction, cooling, at = float(rng.uniform(0.3, 0.7)), draw_size(rng, 2.0, 8.0), moments["go_1"]
@@ -374,6 +383,13 @@ def angle_filtered(rng, moments, size):
     if rng.random() < 0.5:
         change = chain(change, alter(wire.RESOLVER, wire.MOTOR_SPEED, _low_pass(seconds)))
     return Fault(f"{1e3 * seconds:.0f} ms", at, bus=during(change, at))
+
+
+@_family
+def speed_filtered(rng, moments, size):
+    """By a tracking loop or firmware, which leave the angle as it is."""
+    seconds, at = draw_size(rng, 0.003, 0.03), pick_sometime(rng, moments)
+    return Fault(f"{1e3 * seconds:.0f} ms", at, bus=during(alter(wire.RESOLVER, wire.MOTOR_SPEED, _low_pass(seconds)), at))
 
 
 @_family

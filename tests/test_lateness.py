@@ -9,9 +9,9 @@ import pytest
 from emb_daemon.estimator import fuse, restart, step
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
-from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, unfilter
+from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, stand, unfilter
 from emb_daemon.offline import estimate
-from emb_daemon.wire.contract import PATHS_DISAGREE
+from emb_daemon.wire.contract import OUT_OF_RANGE, PATHS_DISAGREE
 
 _DT = 0.004
 _COUNT = 2.0 * np.pi / 4096
@@ -33,7 +33,7 @@ def _signals(late_s=0.0, gain=1.0, speed_late_s=0.0, seconds=3.0, seed=1, size=1
 def _follow(a, angles, speeds):
     for i in range(1, len(angles)):
         turned = 0.5 * (speeds[i] + speeds[i - 1]) * _DT
-        follow(a, angles[i] - angles[i - 1], turned, speeds[i] - speeds[i - 1], _DT)
+        follow(a, angles[i] - angles[i - 1], turned, speeds[i] - speeds[i - 1], 0.3, _DT)
     return float(a["age"])
 
 
@@ -72,7 +72,7 @@ def _unfilter(a, angles, speeds):
     for angle, speed in zip(angles[1:], speeds[1:], strict=True):
         m["speed"] = speed
         unfilter(a, m)
-        follow(a, angle - before, 0.5 * (m["speed"] + taken[-1]) * _DT, m["speed"] - taken[-1], _DT)
+        follow(a, angle - before, 0.5 * (m["speed"] + taken[-1]) * _DT, m["speed"] - taken[-1], 0.3, _DT)
         find_filter(a)
         before, taken = angle, [*taken, float(m["speed"])]
     return np.array(taken)
@@ -174,10 +174,10 @@ def test_after_an_interruption_what_is_apart_is_counted_anew():
     """Samples of a fault that was found late say nothing of those after it; what was known before stays known."""
     a = np.zeros(1, LATENESS)[0]
     age = _follow(a, *_signals(late_s=0.004))
-    follow(a, 0.0, 0.05, 4.0, _DT)
+    follow(a, 0.0, 0.05, 4.0, 0.3, _DT)
     interrupt(a)
     assert a["apart"] == a["gained"] == a["gone"] == 0.0
-    follow(a, 0.0, 0.0, 0.0, _DT)
+    follow(a, 0.0, 0.0, 0.0, 0.3, _DT)
     assert a["age"] == pytest.approx(age, rel=0.02)
 
 
@@ -213,6 +213,50 @@ def test_a_delay_that_the_calibration_knows_is_undone_once(parameters):
     assert np.sqrt(np.mean(error**2)) < 60.0
 
 
+def _stand(a, speeds, noise=0.3):
+    """What an estimator takes for the speeds of a motor that stands."""
+    taken = []
+    for speed in speeds:
+        taken.append(speed - a["offset"])
+        stand(a, taken[-1], noise)
+    return np.array(taken)
+
+
+@pytest.mark.parametrize("offset", [-4.0, -0.2, 0.5])
+def test_an_offset_of_the_speed_is_found_while_the_motor_stands_and_refined(offset):
+    a, noise = np.zeros(1, LATENESS)[0], 0.3 * np.random.default_rng(1).standard_normal(6000)
+    _stand(a, offset + noise[:150])
+    assert a["offset"] == pytest.approx(offset, abs=0.1)
+    taken = _stand(a, offset + noise[150:])
+    assert a["offset"] == pytest.approx(offset, abs=0.015)
+    assert abs(np.mean(taken[-2000:])) < 0.02
+
+
+def test_an_offset_that_changes_is_found_anew():
+    a, noise = np.zeros(1, LATENESS)[0], 0.3 * np.random.default_rng(2).standard_normal(6000)
+    _stand(a, 0.5 + noise)
+    _stand(a, -1.0 + noise[:600])
+    assert a["offset"] == pytest.approx(-1.0, abs=0.05)
+
+
+def test_noise_and_what_no_motor_shows_that_stands_are_no_offset():
+    a, rng = np.zeros(1, LATENESS)[0], np.random.default_rng(3)
+    _stand(a, 0.3 * rng.standard_normal(100_000))
+    _stand(a, 9.0 * rng.standard_normal(100_000), noise=9.0)
+    _stand(a, np.full(1000, 40.0))
+    assert a["offset"] == 0.0
+
+
+def test_noise_of_the_speed_is_no_filter():
+    """Both what is apart and what the speed gains contain it."""
+    a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=30.0)
+    noisy = speeds + 6.0 * np.random.default_rng(4).standard_normal(len(speeds))
+    for i in range(1, len(angles)):
+        follow(a, angles[i] - angles[i - 1], 0.5 * (noisy[i] + noisy[i - 1]) * _DT, noisy[i] - noisy[i - 1], 6.0, _DT)
+        find_filter(a)
+        assert a["filtered"] == 0.0
+
+
 # In the estimator.
 
 
@@ -246,13 +290,12 @@ def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
     step._follow_age(s, parameters[0], m, what == "zero moved")
     followed = what == "nothing"
     assert (s["lateness"]["gained"] != 0.0) == (s["lateness"]["apart"] != 0.0) == followed
-    assert (s["lateness"]["ss"] != before["ss"]) == followed
+    assert (s["lateness"]["sums"][0] != before["sums"][0]) == followed
 
 
 def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s):
     p, m = parameters[0], _turning(parameters[0])
-    s["lateness"]["ss"] = s["lateness"]["ww"] = 2e5
-    s["lateness"]["as_"] = -0.005 * 2e5
+    s["lateness"]["sums"] = 1e9 * np.array([1.0, 0.0, 1.0, -0.005, 0.0])
     step._follow_age(s, p, m, False)
     assert s["late"] == pytest.approx(0.005, rel=0.01)
     p["effects"]["signal_delay"]["delay_s"] = 0.003
@@ -318,3 +361,19 @@ def test_what_a_filtered_speed_hides_is_not_taken_for_another_brake(parameters, 
     assert resumed["lateness"]["filtered"] == snapshot["filtered"] == pytest.approx(filter_s, rel=0.15, abs=_DT / 2)
     snapshot["filtered"] = 0.05
     assert restart.why_implausible(snapshot, p) == "filtered"
+
+
+@pytest.mark.parametrize("offset", [-2.0, 0.2])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_offset_of_the_speed_is_no_zero_that_wanders(offset, seed):
+    """Added up over a minute it would be kilonewtons; with sigma it would be a brake that is never used."""
+
+    def change(rows):
+        rows["speed"] += offset
+
+    estimates, force = city.changed(change, seed, 40.0)
+    unmoved, _ = city.changed(seed=seed, seconds=40.0)
+    error, as_it_is = (estimates["force"] - force)[500:], (unmoved["force"] - force)[500:]
+    assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(as_it_is**2)) + 15.0
+    assert np.median(estimates["sigma"][500:]) < 1.2 * np.median(unmoved["sigma"][500:])
+    assert not np.any(estimates["reasons"][500:] & OUT_OF_RANGE)

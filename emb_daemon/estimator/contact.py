@@ -128,7 +128,11 @@ def _drift(s, m, slip, turned):
         s.drifted += slip
         s.stood_s += m.dt
     if abs(s.drifted) > _unaccounted(s, s.stood_s):
-        return s.drifted
+        if s.plausibility.held * CYCLE_S < s.stood_s - ONE_CYCLE_S:
+            return s.drifted
+        # An angle that stays where it is does not drift: the speed has an offset.
+        s.drifted = s.stood_s = 0.0
+        s.strayed = np.nan
     moved = 0.0
     if s.stood_s > _AT_REST_S:
         # Only at the end of a motion: at the beginning of the next one a late speed lags the angle.

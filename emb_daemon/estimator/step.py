@@ -49,11 +49,11 @@ from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
-from emb_daemon.models.lateness import find_filter, follow, interrupt, unfilter
-from emb_daemon.models.plausibility import STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
+from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter
+from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
-from emb_daemon.models.wander import STANDING_RAD_PER_S, leave_stretch, watch_wander
+from emb_daemon.models.wander import STANDING_RAD_PER_S, forget_wander, leave_stretch, watch_wander
 from emb_daemon.wire.contract import CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
@@ -205,7 +205,7 @@ def _follow_age(s, p, m, moved_zero):
     if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
         return False
-    follow(s.lateness, travel, turned, gained, m.dt)
+    follow(s.lateness, travel, turned, gained, s.speed_sigma, m.dt)
     s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
     if p.clearance_sigma == 0.0 or not find_filter(s.lateness):
         return False
@@ -218,9 +218,13 @@ def _follow_age(s, p, m, moved_zero):
 
 @njit
 def _follow_noise(s, p, m):
-    """How noisy the speed is: a motor that stands has none."""
+    """How noisy the speed is, and how far it is off: a motor that stands has none."""
     if s.plausibility.held > _HELD and m.angle == s.angle:
         s.speed_square += min(m.dt / _NOISE_S, 1.0) * (s.speed * s.speed - s.speed_square)
+        watched = s.plausibility.verdict == AGREE and p.clearance_sigma > 0.0
+        if watched and stand(s.lateness, m.speed, s.speed_sigma):
+            s.strayed = np.nan
+            forget_wander(s.wander)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
 
 

@@ -4,6 +4,8 @@ An angle that is late lags the integrated speed by age times speed; one of wrong
 over a tenth of a second and fitted together, because otherwise a gain error of seven hundredths looks like an age. Neither
 signal can be ahead of the motor: where the angle leads, the speed went through a filter, as tracking loops and firmware have
 them, and inertia would seem to need kilonewtons at the wrong time. What went into the filter takes the speed's place.
+
+The speed that comes beside an angle that stays is an offset, and is taken off: added up it would pass for a zero that wanders.
 """
 
 from math import exp, sqrt
@@ -11,11 +13,12 @@ from math import exp, sqrt
 import numpy as np
 
 from emb_daemon.jit import Record, fields, njit
+from emb_daemon.models.wander import STANDING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Time over which angle and speed are followed, s: that of a stroke, in which neither an offset of the speed nor a slip of the
-#: resolver adds up much. Time over which the normal equations forget, s: some stops; and standard deviation of the age to
-#: which they remember, s: so that what changes while driving is found within a stroke or two.
+#: resolver adds up much. Time over which the normal equations forget, s: some stops; and standard deviation of an age to which
+#: recent ones remember, s, so that a filter that comes while driving is found within a stroke or two.
 _FOLLOWED_S, _KEPT_S, _PRECISE_S = 0.1, 60.0, 1e-4
 #: Noise of the angle less integrated speed, rad, standard deviation: 0.3 rad/s of the speed, added up over the time above in
 #: samples of 4 ms, make 0.004, a resolver's own error of ten arc minutes 0.003, counts 0.002. Number of samples with the same
@@ -34,26 +37,62 @@ _BEYOND_RAD = 0.1
 #: Least and largest time constant of the speed's filter, s: a speed that is the mean of its cycle is half a cycle old, as it
 #: was at calibration; through more than twelve cycles a stroke is not seen.
 _WORTH_S, SLOWEST_S = 0.5 * CYCLE_S, 12.0 * CYCLE_S
+#: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
+#: offset, and largest offset, rad/s: a motor that went faster for as long would have gone a turn. Samples over which an offset
+#: is refined, to a hundredth of the noise.
+_FEWEST, _MOST, _CERTAIN, _LARGEST, _REMEMBERED = 50.0, 250.0, 5.0, 6.0, 10_000.0
 
-#: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. The others:
-#: normal equations of age and gain, and their solution: ``age`` s, and ``gain``, the gain error if it is certain, or 0.
-#: ``ahead`` s: by which the angle leads the speed, or lags it if negative, if that is certain, or 0. ``filtered`` s: time
-#: constant of the speed's filter, which is undone; ``reported`` rad/s: the last speed as it came.
-LATENESS = np.dtype(fields("f8", "apart gained gone ss sw ww as_ aw age gain ahead filtered reported"), align=True)
+#: Normal equations of age and gain: sums of products of gained speed, way, and what is apart.
+_SS, _SW, _WW, _AS, _AW, _SUMS = 0, 1, 2, 3, 4, 5
+
+#: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. ``sums`` of some
+#: stops, and ``recent`` ones; ``age`` s, and ``gain``, the gain error if it is certain, or 0. ``ahead`` s: by which the angle
+#: leads the speed of late, or lags it if negative, if that is certain, or 0. ``filtered`` s: time constant of the speed's
+#: filter, which is undone; ``reported`` rad/s: the last speed as it came. ``offset`` rad/s of it, which is taken off, a
+#: mean of ``known`` samples, and what a standing motor shows beside: ``standing`` rad/s, the sum over ``stood`` samples.
+LATENESS = np.dtype(
+    [
+        *((name, "f8", (_SUMS,)) for name in ("sums", "recent")),
+        *fields("f8", "apart gained gone age gain ahead filtered reported offset known standing stood"),
+    ],
+    align=True,
+)
 
 
 @njit
 def unfilter(a: Record, m: Record) -> None:
-    """Replace the speed of SAMPLE ``m`` by what went into its filter."""
+    """Replace the speed of SAMPLE ``m`` by what went into its filter, without its offset."""
     reported = m.speed
     if a.filtered > 0.0 and m.dt > 0.0:
         m.speed += a.filtered * (reported - a.reported) / m.dt
     a.reported = reported
+    m.speed -= a.offset
 
 
 @njit
-def follow(a: Record, travel: float, turned: float, gained: float, dt: float) -> None:
-    """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s."""
+def stand(a: Record, speed: float, noise: float) -> bool:
+    """Take the ``speed`` rad/s of a motor whose angle stays where it is; ``noise`` rad/s of one.
+
+    Returns whether the speed's offset is found to be another, which is taken off from the next sample on."""
+    a.standing += speed
+    a.stood += 1.0
+    mean = a.standing / a.stood
+    found = a.stood >= _FEWEST and abs(mean) > _CERTAIN * noise / sqrt(a.stood) and abs(a.offset + mean) < _LARGEST
+    if found:
+        a.offset += mean
+        a.known = a.stood
+    elif a.known > 0.0:
+        a.known = min(a.known + 1.0, _REMEMBERED)
+        a.offset += speed / a.known
+    if found or a.stood >= _MOST:
+        a.standing = a.stood = 0.0
+    return found
+
+
+@njit
+def follow(a: Record, travel: float, turned: float, gained: float, noise: float, dt: float) -> None:
+    """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s; ``noise``
+    rad/s of the speed."""
     keep = exp(-dt / _FOLLOWED_S)
     a.apart = keep * a.apart + travel - turned
     a.gained = keep * a.gained + gained
@@ -61,22 +100,37 @@ def follow(a: Record, travel: float, turned: float, gained: float, dt: float) ->
     leads = a.apart if a.gained > 0.0 else -a.apart
     if not -_OLDEST_S * abs(a.gained) - _BEYOND_RAD <= leads <= SLOWEST_S * abs(a.gained) + _BEYOND_RAD:
         return
-    noise = _ALIKE * _NOISE_RAD * _NOISE_RAD
-    old = min(exp(-dt / _KEPT_S), noise / (_PRECISE_S * _PRECISE_S) / max(a.ss, 1.0))
-    a.ss = old * a.ss + a.gained * a.gained
-    a.sw = old * a.sw + a.gained * a.gone
-    a.ww = old * a.ww + a.gone * a.gone
-    a.as_ = old * a.as_ + a.apart * a.gained
-    a.aw = old * a.aw + a.apart * a.gone
-    ss, ww = a.ss + noise / (_AGE_S * _AGE_S), a.ww + noise / (_GAIN * _GAIN)
-    determinant = ss * ww - a.sw * a.sw
-    age, gain = (a.aw * a.sw - a.as_ * ww) / determinant, abs(a.aw * ss - a.as_ * a.sw) / determinant
+    variance, old = _ALIKE * max(_NOISE_RAD * _NOISE_RAD, 0.5 * noise * noise * dt * _FOLLOWED_S), exp(-dt / _KEPT_S)
+    _add(a.sums, old, a.apart, a.gained, a.gone)
+    age, _, gain, gain_sigma = _solve(a.sums, variance, _AGE_S)
     a.age = min(max(age, 0.0), _OLDEST_S)
-    a.gain = gain if gain > _MISSED + _SURELY * sqrt(noise * ss / determinant) else 0.0
+    a.gain = abs(gain) if abs(gain) > _MISSED + _SURELY * gain_sigma else 0.0
+    if abs(a.gained) < STANDING_RAD_PER_S:
+        return
+    _add(a.recent, min(old, variance / (_PRECISE_S * _PRECISE_S) / max(a.recent[_SS], 1.0)), a.apart, a.gained, a.gone)
     # Of a filter nothing is known before.
-    determinant = (a.ss + noise / (SLOWEST_S * SLOWEST_S)) * ww - a.sw * a.sw
-    ahead = (a.as_ * ww - a.aw * a.sw) / determinant
-    a.ahead = ahead if abs(ahead) > _WORTH_S + _SURELY * sqrt(noise * ww / determinant) else 0.0
+    age, age_sigma, _, _ = _solve(a.recent, variance, SLOWEST_S)
+    a.ahead = -age if abs(age) > _WORTH_S + _SURELY * age_sigma else 0.0
+
+
+@njit
+def _add(sums, old, apart, gained, gone):
+    sums[_SS] = old * sums[_SS] + gained * gained
+    sums[_SW] = old * sums[_SW] + gained * gone
+    sums[_WW] = old * sums[_WW] + gone * gone
+    sums[_AS] = old * sums[_AS] + apart * gained
+    sums[_AW] = old * sums[_AW] + apart * gone
+
+
+@njit
+def _solve(sums, variance, age_sigma):
+    """Age of the angle (s), of which before only its standard deviation ``age_sigma`` is known, and gain error (share), each
+    with its standard deviation."""
+    ss, ww = sums[_SS] + variance / (age_sigma * age_sigma), sums[_WW] + variance / (_GAIN * _GAIN)
+    determinant = ss * ww - sums[_SW] * sums[_SW]
+    age = (sums[_AW] * sums[_SW] - sums[_AS] * ww) / determinant
+    gain = (sums[_AW] * ss - sums[_AS] * sums[_SW]) / determinant
+    return age, sqrt(variance * ww / determinant), gain, sqrt(variance * ss / determinant)
 
 
 @njit
@@ -87,7 +141,9 @@ def find_filter(a: Record) -> bool:
         return False
     # All that was followed so far was beside another speed.
     a.filtered = filtered
-    a.age = a.gain = a.ahead = a.ss = a.sw = a.ww = a.as_ = a.aw = 0.0
+    a.age = a.gain = a.ahead = 0.0
+    for i in range(len(a.sums)):
+        a.sums[i] = a.recent[i] = 0.0
     interrupt(a)
     return True
 

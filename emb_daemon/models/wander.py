@@ -81,6 +81,18 @@ def leave_stretch(a: Record) -> None:
 
 
 @njit
+def forget_wander(a: Record) -> None:
+    """Begin anew: what was seen so far was beside a speed with another offset."""
+    leave_stretch(a)
+    a.offset_weight = a.offset_sum = a.strayed = a.drift = a.rate = a.loss = a.unseen = 0.0
+    a.found = False
+    for i in range(_CAUSES):
+        a.right[i] = 0.0
+        for j in range(_CAUSES):
+            a.normal[i, j] = 0.0
+
+
+@njit
 def _take_stretch(a, noise):
     variance = noise * noise * CYCLE_S * a.seconds + _COUNTS_RAD * _COUNTS_RAD + sq(_MISSED * a.way)
     keep = exp(-a.seconds / _KEPT_S)
