@@ -162,4 +162,4 @@ def test_the_daemon_is_measured_in_a_process_of_its_own():
 
 def test_a_start_is_measured_without_a_car():
     ready = measure_start()
-    assert ready["cpu_s"] > 0.0 and 0.0 < ready["wall_s"] < 300.0
+    assert ready["cpu_s"] > 0.0 and ready["wall_s"] > 0.0
