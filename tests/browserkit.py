@@ -18,7 +18,7 @@ _BEFORE = "<script>window.failures = []; window.onerror = function (text) { wind
 #: Stands behind the page's own scripts, which draw as they run.
 _AFTER = """<script>
 var places = Array.from(document.querySelectorAll("[data-figure]"));
-var points = places.flatMap(function (place) { return (place.calcdata || []).map(function (trace) { return trace.length; }); });
+var points = places.flatMap(function (place) { return (place.calcdata || []).map(function (line) { return line.length; }); });
 document.title = JSON.stringify({
   failures: window.failures, plots: places.length, points: points,
   drawn: places.filter(function (place) { return place.querySelectorAll("path.js-line, .points path").length > 0; }).length,
@@ -51,6 +51,5 @@ def assert_is_drawn(html: str, folder, plots: int) -> dict:
     """No script error, all of ``plots`` drawn, nothing wider than the window, of so few points that nobody waits for them."""
     said = opened(html, folder)
     assert said["failures"] == [] and said["plots"] == said["drawn"] == plots
-    print(len(html), max(said["points"]), sum(said["points"]), said["plots"])
     assert said["width"] <= 1280 and max(said["points"]) <= SCREEN_POINTS + 2 and sum(said["points"]) <= _POINTS
     return said
