@@ -24,6 +24,7 @@ from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
 from studies import fleet as study
 from studies import fleet_speed
+from studies.drives import training
 
 pytest.importorskip("distributed")
 
@@ -373,7 +374,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
 
 def test_a_training_is_learned_once(tmp_path, calibration):
     plant = plant_from_calibration(calibration, 3)
-    frames, _ = simulate_log(plant, sc.rest(1.0) + sc.training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
+    frames, _ = simulate_log(plant, sc.rest(1.0) + training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
     drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
     told = learning.learn_unit(tmp_path, drives, calibration)
     [entry] = told["entries"]

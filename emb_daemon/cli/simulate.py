@@ -15,7 +15,7 @@ EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario driv
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds (default: on Ctrl-C or SIGTERM)")
-    parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
+    parser.add_argument("--scenario", default="drive", help="drive (in town) or park (drive)")
     add_path(parser, "--calibration", "calibration of the simulated brake (default: the shipped one)")
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
     add_mapping_argument(parser)
@@ -32,11 +32,13 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
-    from emb_daemon.plant.scenarios import scenario
+    from emb_daemon.plant.scenarios import SCENARIOS
     from emb_daemon.wire.layout import CORNERS
 
     _check(arguments)
-    schedule = scenario(arguments.scenario)
+    if arguments.scenario not in SCENARIOS:
+        raise InputError(f"--scenario {arguments.scenario}: expected {' or '.join(SCENARIOS)}")
+    schedule = SCENARIOS[arguments.scenario]()
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
     plants = np.array([plant_from_calibration(calibration, arguments.seed + row) for row in range(len(corners))])
