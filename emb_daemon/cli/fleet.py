@@ -6,9 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from emb_daemon.cli.logoptions import add_mapping_argument
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import CALIBRATION_HELP, add_path
+from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource

@@ -2,9 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import add_mapping_argument
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
