@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from numba.core import config, event, types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.core.compiler import compile_result
 from numba.core.registry import CPUDispatcher
 
@@ -99,8 +99,27 @@ config.CACHE_DIR = str(_cache_folder())
 _OPTIONS = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
-class _PartsInCache(CompileResultCacheImpl):
-    """Parts as they are kept on disk: LLVM's bitcode."""
+class _Place(UserProvidedCacheLocator):
+    """Names folders after where a source is in the package: the same sources installed elsewhere are not compiled again."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file):
+        folder, package = Path(py_file).parent, Path(__file__).parent
+        if folder.is_relative_to(package):
+            return "_".join(folder.relative_to(package.parent).parts)
+        return super().get_suitable_cache_subpath(py_file)
+
+
+class _OnDisk(CompileResultCacheImpl):
+    _locator_classes = (_Place, *CompileResultCacheImpl._locator_classes)
+
+
+class _KernelCache(FunctionCache):
+    _impl_class = _OnDisk
+
+
+class _PartsOnDisk(_OnDisk):
+    """Parts as they are kept: LLVM's bitcode."""
 
     def rebuild(self, target_context, payload):
         (name, _, bitcode), description, environment, signature, *_ = payload
@@ -121,7 +140,7 @@ class _PartsInCache(CompileResultCacheImpl):
 class _WithinCache(FunctionCache):
     """Keeps code for kernels apart from code for Python, of which numba's index would give one for the other."""
 
-    _impl_class = _PartsInCache
+    _impl_class = _PartsOnDisk
 
     def _index_key(self, sig, codegen):
         return *super()._index_key(sig, codegen), "within"
@@ -145,7 +164,7 @@ class _Kernel(CPUDispatcher):
 
     def __init__(self, function: Function):
         super().__init__(function, targetoptions=_OPTIONS)
-        self.enable_caching()
+        self._cache = _KernelCache(function)
         self._within = _Within(function)
 
     @property

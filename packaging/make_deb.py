@@ -115,7 +115,10 @@ def pack(root: Path, version: str, architecture: str, python: str, folder: Path)
             path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
     root.chmod(0o755)
     package = folder / f"emb-daemon_{version}_{architecture}.deb"
-    subprocess.run(["dpkg-deb", "--root-owner-group", "-Zxz", "--build", root, package], check=True, stdout=subprocess.DEVNULL)
+    # A ninth larger than at the best level, in half of its minute.
+    subprocess.run(
+        ["dpkg-deb", "--root-owner-group", "-Zxz", "-z3", "--build", root, package], check=True, stdout=subprocess.DEVNULL
+    )
     return package
 
 

@@ -77,7 +77,8 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
     """
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
-    from emb_daemon.plant.scenarios import commands_of, random_angle, training
+    from emb_daemon.plant.scenarios import commands_of, random_angle
+    from studies.drives import training
 
     thickness = calibration.pad_thickness_mm
     rows = []

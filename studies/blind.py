@@ -36,9 +36,10 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import ONSET, POWER, SATURATION, SIGNALS, drawn_amount
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import PLANT, PLANT_STATE
-from emb_daemon.plant.scenarios import Schedule, random_angle, rest, rig_drag, rig_stop, simulate_log, training
+from emb_daemon.plant.scenarios import Schedule, random_angle, rest, simulate_log
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
+from studies.drives import rig_drag, rig_stop, training
 from studies.unlisted import WHOLE
 
 #: Effects with ranges from which they can be drawn.

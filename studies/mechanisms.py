@@ -16,6 +16,7 @@ from emb_daemon.models.stiffness import travel_at
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.records import LATCH
 from emb_daemon.wire.contract import PARK_APPLIED
+from studies.drives import rig_stop
 from studies.strangers import Stranger, draw_brake, main, plan
 
 #: Points of the brake's own table and of the datasheet's, which are every so many of them.
@@ -55,7 +56,7 @@ def _latched(calibration: Calibration, rng: np.random.Generator) -> sc.Schedule:
     hold = sc.rest(10.0)
     hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
     park = sc.park(high * rng.uniform(0.4, 0.6), 6.0).first(4.8) + hold + sc.rest(2.0)
-    return park + sc.rig_stop(0.3 * high, 40.0) + park + sc.rest(1.0)
+    return park + rig_stop(0.3 * high, 40.0) + park + sc.rest(1.0)
 
 
 def draw_mechanism(seed: int) -> Stranger:

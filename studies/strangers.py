@@ -34,6 +34,7 @@ from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
 from studies.blind import DRAWN, draw, draw_sized
+from studies.drives import rig_drag, rig_stop, training
 
 _THICKNESSES_MM = (3.5, 6.5, 9.5)
 #: RMS of the effect that no catalogue lists, as a share of the brake's force: 300 N at 30 kN.
@@ -121,7 +122,7 @@ def plan(stranger: Stranger, seed: int, rng: np.random.Generator) -> None:
         stranger.logs[f"curve_{thickness:g}"] = sc.curve(plant, 0.85 * high) + sc.rest(0.5), thickness
         stranger.logs[f"random_{thickness:g}"] = _random(plant, rng, high), thickness
     plant = _plant(stranger, seed, 5.0)
-    stranger.logs["training_5"] = sc.training(plant, 42.0, 0.5 * high), 5.0
+    stranger.logs["training_5"] = training(plant, 42.0, 0.5 * high), 5.0
     stranger.logs["random_5"] = _random(plant, rng, high), 5.0
     for name in ("tune", "validate"):
         stranger.logs[name] = _heat(calibration, rng), 10.0
@@ -143,8 +144,8 @@ def _drive(calibration: Calibration, rng: np.random.Generator, stops: int) -> sc
     high, schedule = calibration.stiffness.maximum_force_N, sc.rest(2.0)
     for _ in range(stops):
         force = high * float(np.exp(rng.uniform(np.log(0.06), np.log(0.7))))
-        schedule += sc.rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.0), rng.uniform(6.0, 8.0))
-    drag = sc.rig_drag(0.15 * high, rng.uniform(20.0, 40.0), 40.0)
+        schedule += rig_stop(force, rng.uniform(20.0, 60.0), rng.uniform(2.5, 4.0), rng.uniform(6.0, 8.0))
+    drag = rig_drag(0.15 * high, rng.uniform(20.0, 40.0), 40.0)
     plant = plant_from_calibration(calibration)
     return schedule + drag + sc.random_angle(plant, 15.0, rng, 0.5 * high) + sc.rest(0.5)
 
@@ -152,9 +153,9 @@ def _drive(calibration: Calibration, rng: np.random.Generator, stops: int) -> sc
 def _heat(calibration: Calibration, rng: np.random.Generator) -> sc.Schedule:
     high, schedule = calibration.stiffness.maximum_force_N, sc.rest(2.0)
     for _ in range(2):
-        schedule += sc.rig_drag(high * rng.uniform(0.08, 0.2), rng.uniform(15.0, 50.0), 40.0) + sc.rest(30.0)
+        schedule += rig_drag(high * rng.uniform(0.08, 0.2), rng.uniform(15.0, 50.0), 40.0) + sc.rest(30.0)
         for _ in range(4):
-            schedule += sc.rig_stop(high * rng.uniform(0.2, 0.6), rng.uniform(30.0, 60.0))
+            schedule += rig_stop(high * rng.uniform(0.2, 0.6), rng.uniform(30.0, 60.0))
     return schedule + sc.rest(60.0)
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import random_angle, rig_drag, rig_stop, simulate_log, training
+from emb_daemon.plant.scenarios import random_angle, simulate_log
+from studies.drives import rig_drag, rig_stop, training
 
 
 def drive(plant, rng, stops):

@@ -31,12 +31,13 @@ from emb_daemon.logs.read import read_frames
 from emb_daemon.models.fusion import CONTACT, GAIN, INERTIA, LOAD
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.pipeline import Pipeline
-from emb_daemon.plant.scenarios import park, random_angle, rest, training
+from emb_daemon.plant.scenarios import park, random_angle, rest
 from emb_daemon.replay import Replay
 from emb_daemon.wire import contract
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, INVALID
 from emb_daemon.wire.layout import load_database
 from studies.adaptation import specimen, wear
+from studies.drives import training
 
 RIG_CONTACT = 7.497
 

@@ -5,25 +5,24 @@ import copy
 import numpy as np
 import pytest
 
-from emb_daemon.bench.logs import difference
 from emb_daemon.bench.loop import is_held_up, measure_loop, measure_start
 from emb_daemon.bench.report import text, verdict
-from emb_daemon.cli import bench
 from emb_daemon.estimator.records import ESTIMATE
+from studies import speed
 
 
 def test_a_difference_is_told_by_its_size():
     one = np.zeros(3, ESTIMATE)
     one["force"], one["innovation"] = 1000.0, np.nan
-    assert difference(one, one.copy()) == 0.0
+    assert speed.difference(one, one.copy()) == 0.0
     other = one.copy()
     other["force"][1] *= 1.0 + 1e-9
-    assert difference(one, other) == pytest.approx(1e-9, rel=1e-6)
+    assert speed.difference(one, other) == pytest.approx(1e-9, rel=1e-6)
     other["innovation"][2] = 0.0
-    assert difference(one, other) == np.inf
+    assert speed.difference(one, other) == np.inf
     other = one.copy()
     other["source"][0] = 1
-    assert difference(one, other) == np.inf
+    assert speed.difference(one, other) == np.inf
 
 
 _QUANTILES = {"p50_us": 20.0, "p99_us": 40.0}
@@ -33,7 +32,6 @@ _FIGURES = {
     "loops": [
         {
             "corners": corners,
-            "daemons": max(1, corners // 4),
             "seconds": 20.0,
             "measures": ["SCHED_FIFO priority 60"],
             "core_share": 0.03 * corners,
@@ -49,24 +47,8 @@ _FIGURES = {
             "cyclictest": _QUANTILES | {"ticks": 5000},
             "answers": {"samples": 20_000, "answered": 20_000, "in_time": 20_000, "p50_us": 300.0, "p99_us": 630.0},
         }
-        for corners in (4, 16)
+        for corners in (4, 2)
     ],
-    "kernels": None,
-    "logs": {
-        "seconds": 120.0,
-        "frames": 100_000,
-        "read_frames_per_s": 1e7,
-        "replay_frames_per_s": 2e6,
-        "replay_times_real_time": 2000.0,
-        "decode_frames_per_s": 1e7,
-        "cantools_decode_frames_per_s": 3e5,
-        "step": {
-            "samples": 30_000,
-            "compiled_us": 0.4,
-            "plain_us": 1200.0,
-            "plain_difference": 2e-16,
-        },
-    },
 }
 
 
@@ -96,9 +78,7 @@ def test_the_verdict_is_of_four_corners_and_above_the_machines_own_latency(figur
         (("loops", 0, "answers", "in_time"), 19_970, "answered within their cycle"),
         (("loops", 0, "ready", "wall_s"), 3.1, "compiled before"),
         (("cold_start", "wall_s"), 20.1, "nothing compiled"),
-        (("logs", "replay_times_real_time"), 999.0, "replay"),
-        (("logs", "step", "compiled_us"), 3.1, "compiled step"),
-        (("logs", "step", "compiled_us"), float("nan"), "compiled step"),
+        (("cold_start", "wall_s"), float("nan"), "nothing compiled"),
     ],
 )
 def test_each_budget_can_be_missed(figures, where, value, budget):
@@ -130,19 +110,16 @@ def test_what_is_missing_is_said(figures):
 
 def test_kernels_from_numba_and_compiled_ahead_stand_side_by_side(figures):
     ahead = copy.deepcopy(figures["loops"][0]) | {"ready": {"wall_s": 0.45, "cpu_s": 0.4}, "resident_KiB": [58_000, 58_400]}
-    figures["kernels"] = {"numba": figures["loops"][0], "ahead": ahead}
-    figures["verdict"] = verdict(figures)
-    shown = [line.split() for line in text(figures).splitlines()]
+    shown = [line.split() for line in speed._kernels({"numba": figures["loops"][0], "ahead": ahead})]
     assert ["start", "to", "ready,", "s", "1.00", "0.45"] in shown and ["resident,", "MiB", "186", "57"] in shown
 
 
 def test_kernels_take_turns_and_the_median_round_counts(monkeypatch):
     ticks = iter([3, 13, 1, 11, 2, 12, 9, 19, 0, 10])
     monkeypatch.setattr(
-        "emb_daemon.bench.loop.measure_loop",
-        lambda corners, seconds, kernels: {"kernels": kernels, "tick": {"p50_us": next(ticks)}},
+        speed, "measure_loop", lambda corners, seconds, kernels: {"kernels": kernels, "tick": {"p50_us": next(ticks)}}
     )
-    assert bench._compare("k.so", 3.0) == {
+    assert speed.compare_kernels("k.so") == {
         "numba": {"kernels": "", "tick": {"p50_us": 2}},
         "ahead": {"kernels": "k.so", "tick": {"p50_us": 12}},
     }
@@ -162,4 +139,4 @@ def test_the_daemon_is_measured_in_a_process_of_its_own():
 
 def test_a_start_is_measured_without_a_car():
     ready = measure_start()
-    assert ready["cpu_s"] > 0.0 and 0.0 < ready["wall_s"] < 300.0
+    assert ready["cpu_s"] > 0.0 and ready["wall_s"] > 0.0

@@ -9,10 +9,11 @@ from scipy.signal import lfilter
 from emb_daemon.plant.brake import ONSET, POWER
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import rig_drag, simulate_log
+from emb_daemon.plant.scenarios import simulate_log
 from emb_daemon.wire.contract import CYCLE_S
 from studies import blind
 from studies.blind import run_trial
+from studies.drives import rig_drag
 
 
 @pytest.mark.trial

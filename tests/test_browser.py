@@ -1,4 +1,4 @@
-"""Reports in a real browser: no script error, every plot drawn, soon enough. `.ci/run` installs Chromium.
+"""Reports in a real browser: no script error, every plot drawn, of few points. `.ci/run` installs Chromium.
 
 Those of identify and diagnose are opened where their tests make them.
 """

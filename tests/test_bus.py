@@ -9,7 +9,7 @@ import pytest
 import wirekit
 
 from emb_daemon.calibration.configuration import Bus
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
+from emb_daemon.cli.options import add_bus_arguments, bus_options
 from emb_daemon.errors import Unavailable
 from emb_daemon.runtime.bus import open_bus
 from emb_daemon.wire.frames import ERROR, FRAME

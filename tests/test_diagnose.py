@@ -26,9 +26,10 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.offline import load_log, log_of
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import random_angle, simulate_log, training
+from emb_daemon.plant.scenarios import random_angle, simulate_log
 from emb_daemon.resources import resource
 from studies.blind import campaign
+from studies.drives import training
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,9 @@ from emb_daemon.offline import estimate, log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import simulate_log, training
+from emb_daemon.plant.scenarios import simulate_log
 from studies.blind import campaign
+from studies.drives import training
 
 
 def _coordinates(calibration):

@@ -205,7 +205,7 @@ def test_what_the_kernel_says_beside_a_frame_is_read(order):
     """Its stamp and how many frames it dropped, as control messages in either order."""
     near, far = socket_pair()
     time.sleep(0.005)
-    arrived_ns, stamp_ns = time.monotonic_ns(), time.time_ns()
+    before_ns, stamp_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     time.sleep(0.005)
     stamp = struct.pack("=QiiQQ", 32, socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, *divmod(stamp_ns, 1_000_000_000))
     drops = struct.pack("=QiiI4x", 20, socket.SOL_SOCKET, rawcan._SO_RXQ_OVFL, 0x01020304)
@@ -213,7 +213,7 @@ def test_what_the_kernel_says_beside_a_frame_is_read(order):
     near._received.control.view(np.uint8)[0, : len(content)] = np.frombuffer(content, np.uint8)
     near._received.headers["length"][0], near._received.headers["control_length"][0] = 16, len(content)
     assert near._take(1, time.monotonic_ns()) == (1, 0x01020304)
-    assert abs(near._frames["time_ns"][0] - arrived_ns) < _CLOCKS_NS
+    assert before_ns - _CLOCKS_NS < near._frames["time_ns"][0] < after_ns + _CLOCKS_NS
     near.close()
     far.close()
 
@@ -250,7 +250,7 @@ def test_a_stamp_that_cannot_be_is_held_between_what_was_heard_before_and_now():
 
 def _wait_for_stamps(ours, theirs):
     """The kernel begins to stamp what arrives some time after it was asked to; until then it stamps what is read."""
-    for _ in range(100):
+    for _ in range(4000):
         theirs.send(bytes(16))
         time.sleep(0.005)
         asked_ns = time.time_ns()

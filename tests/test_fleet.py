@@ -14,7 +14,7 @@ import pytest
 from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.fleet import dataset, findings, learning, population, scores, speed
+from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
 from emb_daemon.fleet.replaying import replay_drive
@@ -23,6 +23,8 @@ from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
 from studies import fleet as study
+from studies import fleet_speed
+from studies.drives import training
 
 pytest.importorskip("distributed")
 
@@ -293,10 +295,12 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
 # -- end to end -------------------------------------------------------------------------------------------------------
 
 
-def test_bench_prints_stages_and_what_a_second_worker_gains(logs, monkeypatch, capsys):
+def test_the_study_of_speed_prints_stages_and_what_a_second_worker_gains(logs, monkeypatch, capsys):
     """On a machine with one core the second gains nothing, and nothing is promised here."""
-    monkeypatch.setattr(speed, "_SCALED_SAMPLES", 1)
-    assert main(["fleet", "bench", str(logs / "car0" / "drive.0.log.gz"), "--workers", "2"]) == 0
+    for name, least in (("_SCALED_SAMPLES", 1), ("_TIMES", 1), ("_ADDITIONS", 100_000)):
+        monkeypatch.setattr(fleet_speed, name, least)
+    monkeypatch.setattr("sys.argv", ["fleet_speed", str(logs / "car0" / "drive.0.log.gz"), "2"])
+    fleet_speed.main()
     title, *rows, last = capsys.readouterr().out.splitlines()
     assert title.split()[0] == "stage" and [row[:24].strip() for row in rows] == [
         "unpack", "parse", "check and decode", "estimate", "read columns", "project on all causes", "replay from the file",
@@ -304,7 +308,7 @@ def test_bench_prints_stages_and_what_a_second_worker_gains(logs, monkeypatch, c
     ]  # fmt: skip
     assert all(float(cell) > 0.0 for row in rows for cell in row[24:].split())
     told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", last)
-    assert told and all(0.1 < float(gain) < 10.0 for gain in told.groups())
+    assert told and all(float(gain) > 0.0 for gain in told.groups())
 
 
 @pytest.fixture(scope="module")
@@ -370,7 +374,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
 
 def test_a_training_is_learned_once(tmp_path, calibration):
     plant = plant_from_calibration(calibration, 3)
-    frames, _ = simulate_log(plant, sc.rest(1.0) + sc.training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
+    frames, _ = simulate_log(plant, sc.rest(1.0) + training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
     drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
     told = learning.learn_unit(tmp_path, drives, calibration)
     [entry] = told["entries"]

@@ -19,6 +19,7 @@ from emb_daemon.logs.write import write_frames
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
+from studies.drives import rig_stop
 
 _PAGE = Path(__file__).parent.parent / "docs" / "own_actuator.md"
 
@@ -139,7 +140,7 @@ def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
     effects = {"stribeck_friction": {"rise": 0.25, "speed_rad_per_s": 14.0}, "backlash": {"play_rad": 0.12}}
     shipped = load_calibration(resource("config/calibration.yaml"))
     plant = plant_from_calibration(shipped, effects=effects)
-    drive = sum((sc.rig_stop(force, 40.0, 3.0, 6.0) for force in (4e3, 9e3, 16e3, 6e3)), sc.rest(2.0))
+    drive = sum((rig_stop(force, 40.0, 3.0, 6.0) for force in (4e3, 9e3, 16e3, 6e3)), sc.rest(2.0))
     for seed, (name, schedule) in enumerate({"curve": sc.curve(plant), "fit": drive, "judge": drive}.items()):
         write_frames(tmp_path / f"{name}.log", sc.simulate_log(plant, schedule, seed=seed)[0])
     (tmp_path / "datasheet.yaml").write_text((FILES / "datasheet.yaml").read_text())

@@ -29,6 +29,7 @@ from emb_daemon.plant.brake import equivalent_angle, motor_angle
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
+from studies.drives import training
 
 replace = msgspec.structs.replace
 
@@ -174,7 +175,7 @@ def test_a_training_is_learned_from_through_the_gear(shipped, tmp_path):
     sprung = replace(shipped, motor=replace(shipped.motor, release_spring_N_per_m=1e6))
     plant = plant_from_calibration(ramp(sprung, 121), pad_thickness_mm=8.0)
     path = tmp_path / "training.log"
-    write_frames(path, sc.simulate_log(plant, sc.rest(1.0) + sc.training(plant, 42.0, 19e3), seed=3)[0])
+    write_frames(path, sc.simulate_log(plant, sc.rest(1.0) + training(plant, 42.0, 19e3), seed=3)[0])
     log, calibration, state = load_log(path), ramp(sprung), new_state()
     before = estimate(log.samples, to_parameters(calibration), state)["stiffness_force"]
     rows = np.zeros(len(log.samples), TRAINING)

@@ -41,8 +41,9 @@ from emb_daemon.offline.run import run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import rest, rig_stop, simulate_log
+from emb_daemon.plant.scenarios import rest, simulate_log
 from emb_daemon.resources import resource
+from studies.drives import rig_stop
 
 
 def _datasheet_of(truth, rng) -> Datasheet:

@@ -115,6 +115,24 @@ def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
         assert done.stdout == result + "\n", done.stderr
 
 
+_HYPOTENUSE = """
+from emb_daemon.jit import hypot
+from emb_daemon.numba_cache import _compilations
+
+print(hypot(3.0, 4.0), _compilations.count)
+"""
+
+
+def test_the_same_sources_in_another_place_are_not_compiled_again(tmp_path):
+    """As in a new environment, or a package that was put elsewhere."""
+    for place, said in (("here", "5.0 2"), ("there", "5.0 0")):
+        folder = tmp_path / place
+        shutil.copytree(_PACKAGE, folder / "emb_daemon", ignore=shutil.ignore_patterns("__pycache__", "_resources"))
+        (folder / "call.py").write_text(_HYPOTENUSE)
+        done = processkit.python(str(folder / "call.py"), PYTHONPATH="", NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        assert done.stdout == said + "\n", done.stderr
+
+
 def test_compiled_code_goes_where_it_is_told(tmp_path):
     done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0 and not done.stderr

@@ -2,6 +2,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import processkit
@@ -21,6 +22,7 @@ _ABOVE = ("cli", "api", "__init__")
 _OFFLINE = {"scipy", "pyarrow", "matplotlib", "plotly"}
 
 
+@cache
 def _imports() -> dict[tuple[str, str], set[str]]:
     """Parts of the package that import others, at the top of a module or within a function, and the files that do."""
     found = defaultdict(set)

@@ -1,7 +1,7 @@
 """The simulated car in a process of its own, on an inherited socket; measures when the daemon's answers leave.
 
-Run as ``python -m emb_daemon.bench.car CORNERS SECONDS PRIORITY FD...``; prints a line when it is ready, waits for the
-daemon's first frame, and prints a JSON line at the end. All buses get the same frames; the car listens to the first only.
+Run as ``python -m emb_daemon.bench.car CORNERS SECONDS PRIORITY FD``; prints a line when it is ready, waits for the daemon's
+first frame, and prints a JSON line at the end.
 """
 
 import json
@@ -29,22 +29,17 @@ from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, default_layout, load_da
 _COMPUTING_NS = 500_000
 
 
-class _Buses:
-    """Several buses that get the same frames; frames are received from the first only."""
+class _Bus:
+    """The bus, on which frames leave at their time in the cycle."""
 
-    def __init__(self, descriptors: list[int]):
-        self._descriptor = descriptors[0]
-        self._first, *self._others = [RawCanSocket(socket.socket(fileno=fd), stamped=True) for fd in descriptors]
-        self._epoch_ns = 0
+    def __init__(self, descriptor: int):
+        self._descriptor, self._epoch_ns = descriptor, 0
+        self._bus = RawCanSocket(socket.socket(fileno=descriptor), stamped=True)
+        self.drain = self._bus.drain
 
     def wait(self, timeout_s: float) -> bool:
         # poll() is not used: it counts in ms, and the car's delay would count as the daemon's latency.
         return bool(select.select([self._descriptor], [], [], timeout_s)[0])
-
-    def drain(self) -> np.ndarray:
-        for bus in self._others:
-            bus.drain()
-        return self._first.drain()
 
     def send(self, frames: np.ndarray) -> None:
         now = time.monotonic_ns()
@@ -52,9 +47,7 @@ class _Buses:
         early = (self._epoch_ns - now) % CYCLE_NS
         if early < 2 * _COMPUTING_NS:
             time.sleep(1e-9 * early)
-        # The first bus last, because its answers are timed from here.
-        for bus in (*self._others, self._first):
-            bus.send(frames)
+        self._bus.send(frames)
 
 
 class _Answers:
@@ -84,8 +77,8 @@ class _Answers:
 
 
 def main() -> None:
-    corners, seconds, priority, descriptors = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
-    bus = _Buses([int(descriptor) for descriptor in descriptors])
+    corners, seconds, priority, descriptor = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+    bus = _Bus(descriptor)
     calibration = load_calibration(resource("config/calibration.yaml"))
     plants = np.array([plant_from_calibration(calibration, seed) for seed in range(corners)])
     live = LiveCar(Car(plants, CORNERS[:corners], reference=False), bus, city_drive())

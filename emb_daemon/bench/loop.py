@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -31,22 +30,19 @@ _IDLE = 0.1
 
 
 class _Child:
-    """A module of this package in a process of its own, which prints a line when it is ready and one at its end.
+    """A module of this package in a process of its own, which prints a line when it is ready and one at its end. The last of
+    its arguments is its socket.
 
     Attributes:
         ready: ``wall_s`` and ``cpu_s`` from its start to its first line.
     """
 
-    def __init__(self, module: str, *arguments, inherited: list[socket.socket], environment: dict | None = None):
-        command = [sys.executable, "-m", f"emb_daemon.bench.{module}", *map(str, arguments)]
+    def __init__(self, module: str, *arguments, environment: dict | None = None):
+        *words, bus = arguments
+        command = [sys.executable, "-m", f"emb_daemon.bench.{module}", *map(str, words), str(bus.fileno())]
         begin = time.monotonic()
-        self._process = subprocess.Popen(
-            command,
-            pass_fds=[end.fileno() for end in inherited],
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | (environment or {}),
-        )
+        environment = os.environ | (environment or {})
+        self._process = subprocess.Popen(command, pass_fds=[bus.fileno()], stdout=subprocess.PIPE, text=True, env=environment)
         assert self._process.stdout is not None
         said = self._process.stdout.readline()
         wall = time.monotonic() - begin
@@ -80,30 +76,20 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     """Run the real daemon and a simulated car, each in a process of its own, together with an empty loop and, if it is
     installed, cyclictest.
 
-    More than four ``corners`` are several daemons of four in one process, each on its own bus. ``kernels`` is the library that
-    the daemon uses; empty: it uses numba; None: what it would use by itself. ``share``: file in which it shares its estimates.
+    ``kernels`` is the library that the daemon uses; empty: it uses numba; None: what it would use by itself. ``share``: file
+    in which it shares its estimates.
 
     Returns:
         What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
         where there is none), and ``ready``, the daemon's start in ``wall_s`` and ``cpu_s``.
     """
-    daemons = max(1, corners // len(CORNERS))
-    pairs = [connected_sockets() for _ in range(daemons)]
-    each = corners // daemons
-    car = _Child(
-        "car", each, seconds, _CAR_PRIORITY, *(theirs.fileno() for _, theirs in pairs), inherited=[b for _, b in pairs]
-    )
+    ours, theirs = connected_sockets()
+    car = _Child("car", corners, seconds, _CAR_PRIORITY, theirs)
     served = None
     try:
-        with _temporary_configuration(each) as arguments:
-            served = _Child(
-                "served",
-                *arguments,
-                share or "",
-                *(ours.fileno() for ours, _ in pairs),
-                inherited=[a for a, _ in pairs],
-                environment=None if kernels is None else {library.VARIABLE: kernels},
-            )
+        with _temporary_configuration(corners) as arguments:
+            environment = None if kernels is None else {library.VARIABLE: kernels}
+            served = _Child("served", *arguments, share or "", ours, environment=environment)
             command = [sys.executable, empty.__file__, str(seconds), str(_PRIORITY)]
             with subprocess.Popen(command, stdout=subprocess.PIPE) as nothing:
                 latency = cyclictest(seconds)
@@ -114,17 +100,10 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
         for child in filter(None, (car, served)):
             child.kill()
         # Not earlier: a bus continues without the car, but a socket fails without its other end.
-        for end in (end for pair in pairs for end in pair):
-            end.close()
-    return {
-        "corners": corners,
-        "daemons": daemons,
-        "seconds": seconds,
-        "ready": served.ready,
-        **result,
-        "answers": answers,
-        "cyclictest": latency,
-    }
+        ours.close()
+        theirs.close()
+    figures = {"corners": corners, "seconds": seconds, "ready": served.ready}
+    return figures | result | {"answers": answers, "cyclictest": latency}
 
 
 def is_held_up(late_ns: int, worked_ns: int) -> bool:
@@ -137,7 +116,7 @@ def measure_start(cold: bool = False) -> dict[str, float]:
     ours, theirs = connected_sockets()
     with ours, theirs, _temporary_configuration(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
-        served = _Child("served", *arguments, "", ours.fileno(), inherited=[ours], environment=environment)
+        served = _Child("served", *arguments, "", ours, environment=environment)
         try:
             served.stop()
         finally:

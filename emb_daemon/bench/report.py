@@ -28,15 +28,13 @@ def _budgets(result: dict) -> list[tuple[str, float, str, float, str]]:
     """(budget, measured, sense, limit, unit). Those of the loop apply to the run with four corners, or to the last run if
     there was none."""
     loop = next((loop for loop in result["loops"] if loop["corners"] == 4), result["loops"][-1])
-    logs, step, answers, empty = result["logs"], result["logs"]["step"], loop["answers"], loop["empty_loop"]
-    corners = loop["corners"]
+    answers, empty, corners = loop["answers"], loop["empty_loop"], loop["corners"]
     wake = loop["cyclictest"] or empty
     whose = "cyclictest's" if loop["cyclictest"] else "an empty loop's"
     first, last = (value / 1024.0 for value in loop["resident_KiB"])
     response = answers["p99_us"] - wake["p99_us"]
     in_time = 100.0 * answers["in_time"] / max(answers["samples"], 1)
     return [
-        ("compiled step of one corner, both pads", step["compiled_us"], "<=", 3.0, "us"),
         (f"tick of {corners} corners, p99", loop["tick"]["p99_us"], "<=", 500.0, "us"),
         (f"last frame of a sample to answer, p99, minus {whose} wake-up", response, "<=", 600.0, "us"),
         (f"share of one core, {corners} corners", 100.0 * loop["core_share"], "<=", 12.0, "%"),
@@ -44,7 +42,6 @@ def _budgets(result: dict) -> list[tuple[str, float, str, float, str]]:
         ("ticks missed, except those held up by the machine", loop["missed"] - loop["held_up"], "<=", 0, "ticks"),
         ("start to ready, kernels compiled before", loop["ready"]["wall_s"], "<=", 3.0, "s"),
         ("start to ready, nothing compiled", result["cold_start"]["wall_s"], "<=", 20.0, "s"),
-        ("replay of a single-corner log", logs["replay_times_real_time"], ">=", 1000.0, "times real time"),
         (f"resident memory of the daemon, {corners} corners", last, "<=", 250.0, "MiB"),
         ("its growth after the first second", last - first, "<=", 4.0, "MiB"),
     ]
@@ -55,9 +52,7 @@ def text(result: dict[str, Any]) -> str:
     lines = [result["machine"]]
     for loop in result["loops"]:
         lines += ["", *_loop(loop)]
-    if result["kernels"]:
-        lines += ["", *_kernels(result["kernels"])]
-    lines += ["", *_logs(result["logs"]), f"start with nothing compiled: ready after {_start(result['cold_start'])}"]
+    lines += ["", f"start with nothing compiled: ready after {_start(result['cold_start'])}"]
     lines += ["", *_verdict(result["verdict"])]
     return "\n".join(lines)
 
@@ -65,11 +60,8 @@ def text(result: dict[str, Any]) -> str:
 def _loop(loop: dict) -> list[str]:
     answers, beside = loop["answers"], loop["empty_loop"]
     first, last = (value / 1024.0 for value in loop["resident_KiB"])
-    title = f"{loop['corners']} corner{'s' if loop['corners'] > 1 else ''}"
-    if loop["daemons"] > 1:
-        title += f", as {loop['daemons']} daemons of four in one process on a bus each"
     lines = [
-        f"{title}, {loop['seconds']:g} s; {'; '.join(loop['measures'])}",
+        f"{loop['corners']} corner{'s' if loop['corners'] > 1 else ''}, {loop['seconds']:g} s; {'; '.join(loop['measures'])}",
         f"  {loop['missed']} of {loop['ticks']} ticks missed, {loop['held_up']} of them held up by the machine; "
         f"{beside['missed']} of {beside['ticks']} by an empty loop",
         f"  {answers['in_time']} of {answers['samples']} samples answered within their cycle",
@@ -88,45 +80,8 @@ def _loop(loop: dict) -> list[str]:
     return lines
 
 
-def _kernels(measured: dict) -> list[str]:
-    """The daemon with kernels from numba's cache, compared with the daemon with a library."""
-    rows = [
-        ("start to ready, s", lambda loop: f"{loop['ready']['wall_s']:.2f}"),
-        ("of them on a CPU, s", lambda loop: f"{loop['ready']['cpu_s']:.2f}"),
-        ("resident, MiB", lambda loop: f"{loop['resident_KiB'][1] / 1024.0:.0f}"),
-        ("tick, us, p50 / p99", lambda loop: _both(loop["tick"])),
-        *((f"  {part}", lambda loop, part=part: _both(loop["parts"][part])) for part in measured["numba"]["parts"]),
-        ("ticks missed", lambda loop: f"{loop['missed']} of {loop['ticks']}"),
-        ("  held up by the machine", lambda loop: str(loop["held_up"])),
-    ]
-    lines = [f"{'4 corners, kernels':<38}{'from numba':>18}{'compiled ahead':>18}"]
-    return lines + [f"  {name:<36}{figure(measured['numba']):>18}{figure(measured['ahead']):>18}" for name, figure in rows]
-
-
-def _both(figures: dict) -> str:
-    return f"{figures['p50_us']:.0f} / {figures['p99_us']:.0f}"
-
-
-def _logs(logs: dict) -> list[str]:
-    step, bulk, single = logs["step"], logs["decode_frames_per_s"], logs["cantools_decode_frames_per_s"]
-    return [
-        f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames per second of CPU time:",
-        f"  read {logs['read_frames_per_s'] / 1e6:.1f}; replayed {logs['replay_frames_per_s'] / 1e6:.2f}, "
-        f"{logs['replay_times_real_time']:.0f} times real time",
-        f"  decoded {bulk / 1e6:.1f} with E2E check; {single / 1e6:.2f} by cantools, frame by frame, without",
-        f"step: {step['compiled_us']:.2f} us compiled",
-        f"      {step['plain_us']:.0f} us in plain Python over numpy records, {_equal(step['plain_difference'])}",
-    ]
-
-
 def _start(ready: dict) -> str:
     return f"{ready['wall_s']:.1f} s, {ready['cpu_s']:.1f} s of them on a CPU"
-
-
-def _equal(difference: float) -> str:
-    if difference == 0.0:
-        return "estimates equal to the last bit"
-    return f"estimates equal within {difference:.1g}" if math.isfinite(difference) else "ESTIMATES DIFFER"
 
 
 def _verdict(budgets: list[dict]) -> list[str]:

@@ -1,9 +1,7 @@
-"""The daemon in a process of its own, on inherited sockets, set up as ``emb-daemon run`` sets it up, with a stopwatch.
+"""The daemon in a process of its own, on an inherited socket, set up as ``emb-daemon run`` sets it up, with a stopwatch.
 
-Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD...``. Prints a line when it is ready, with the CPU time that
+Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD``. Prints a line when it is ready, with the CPU time that
 took, and, after SIGTERM, a JSON line with what its ticks cost. SHARE is as in ``emb-daemon run --share``, empty for none.
-With several descriptors there are as many daemons, which run one after the other in each tick of one loop. This only measures
-the cost of more corners; the daemon of this package has at most four in one process.
 """
 
 # Before modules with kernels are imported.
@@ -63,9 +61,8 @@ class Pacer(loop.Pacer):
 class Ledger:
     """Records the cost of ticks with a sample, by parts, the delay of wake-ups, and the cause of missed ticks."""
 
-    def __init__(self, daemons: list[loop.Daemon], buses: list[RawCanSocket]):
-        self._daemons = daemons
-        self._ticks = [daemon.tick for daemon in daemons]
+    def __init__(self, daemon: loop.Daemon, bus: RawCanSocket):
+        self._daemon, self._daemons_tick = daemon, daemon.tick
         self._rows = _allocate_shared(_ROOM, len(_PARTS) + 1)
         self._late = _allocate_shared(_ROOM)
         self._used = self._woken = 0
@@ -73,14 +70,9 @@ class Ledger:
         self._missed = self._held_up = 0
         self._settled_KiB = resident_KiB()
         self._begun = self._ended = self._stand()
-        for daemon, bus in zip(daemons, buses, strict=True):
-            for column, (_, owner, name) in enumerate(_PARTS):
-                self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
-        now = time.monotonic_ns()
-        self._pacers = [Pacer(now) for _ in daemons[1:]]
-        for daemon in daemons[1:]:
-            daemon.pipeline.begin(now)
-        daemons[0].tick = self._tick
+        for column, (_, owner, name) in enumerate(_PARTS):
+            self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
+        daemon.tick = self._tick
 
     def _watch(self, holder, name: str, column: int) -> None:
         method, spent = getattr(holder, name), self._spent
@@ -95,12 +87,11 @@ class Ledger:
 
     def _tick(self, now_ns: int, pacer: Pacer) -> None:
         self._attribute(now_ns, pacer)
-        corners = self._daemons[0].pipeline.corners
+        corners = self._daemon.pipeline.corners
         cycles = corners["cycle"].sum()
         begin = time.perf_counter_ns()
         self._spent[:] = [0] * len(_PARTS)
-        for tick, its in zip(self._ticks, [pacer, *self._pacers], strict=True):
-            tick(now_ns, its)
+        self._daemons_tick(now_ns, pacer)
         taken = time.perf_counter_ns() - begin
         if not corners["started"].any():
             return
@@ -117,13 +108,12 @@ class Ledger:
 
     def _attribute(self, now_ns: int, pacer: Pacer) -> None:
         """Count missed periods that the machine caused: the loop was not woken, and nothing of the process ran."""
-        missed, self._missed = self._daemons[0].missed - self._missed, self._daemons[0].missed
+        missed, self._missed = self._daemon.missed - self._missed, self._daemon.missed
         if missed and is_held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
             self._held_up += missed
 
     def _stand(self) -> tuple:
-        daemon = self._daemons[0]
-        return time.monotonic(), time.process_time(), daemon.ticks, daemon.missed, self._held_up
+        return time.monotonic(), time.process_time(), self._daemon.ticks, self._daemon.missed, self._held_up
 
     def figures(self) -> dict[str, Any]:
         """From the time when memory has settled to the last sample: share of a core, ticks, missed ticks, those held up by the
@@ -166,26 +156,25 @@ def resident_KiB() -> int:
 def main() -> None:
     # As in emb-daemon run: cantools and python-can import it where it is installed, and with it pandas.
     sys.modules.setdefault("asammdf", None)
-    config, state, share, descriptors = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], sys.argv[4:]
-    setup = Setup(config)
+    config, state, share, descriptor = sys.argv[1:]
+    setup = Setup(Path(config))
     set_up_logging(setup.configuration.log_level)
-    buses = [RawCanSocket(socket.socket(fileno=int(descriptor)), stamped=True) for descriptor in descriptors]
+    bus = RawCanSocket(socket.socket(fileno=int(descriptor)), stamped=True)
     loop.Pacer = Pacer
-    daemons = [loop.Daemon(setup, bus, state=state / str(number)) for number, bus in enumerate(buses)]
+    daemon = loop.Daemon(setup, bus, state=Path(state))
     if share:
-        daemons[0].share(Path(share))
-    for daemon in daemons:
-        daemon.warm_up()
+        daemon.share(Path(share))
+    daemon.warm_up()
     if jit.compiled_for_the_next_start():
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
-    signal.signal(signal.SIGTERM, lambda *_: daemons[0].stop())
-    ledger = Ledger(daemons, buses)
+    signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
+    ledger = Ledger(daemon, bus)
     realtime = setup.configuration.realtime
     measures = list(set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu))
     settle_memory()
     # With what a process took that compiled beside this one.
     print("ready", sum(os.times()[:4]), flush=True)
-    daemons[0].run()
+    daemon.run()
     gc.enable()
     print(json.dumps({"measures": measures, **ledger.figures()}))
 

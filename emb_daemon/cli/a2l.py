@@ -2,8 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.busoptions import add_id_arguments, host_and_port
-from emb_daemon.cli.paths import CONFIG_HELP, add_path
+from emb_daemon.cli.options import CONFIG_HELP, add_id_arguments, add_path, host_and_port
 
 EXAMPLE = "emb-daemon a2l --config /etc/emb_daemon/emb.yaml --output emb_daemon.a2l --udp 192.168.1.10:5555"
 
@@ -21,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.atomic import write_atomically
     from emb_daemon.calibration.configuration import Setup
-    from emb_daemon.cli.outputs import check_output
+    from emb_daemon.cli.options import check_output
     from emb_daemon.workshop.a2l import make_a2l, version_of
     from emb_daemon.workshop.ifdata import over_can, over_udp
 

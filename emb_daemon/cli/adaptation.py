@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon adaptation show --state /var/lib/emb_daemon"

@@ -7,21 +7,11 @@ from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon bench --seconds 120"
 _LEAST_S = 2.0
-#: Of the comparison of kernels.
-_ROUNDS = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long each number of corners runs (20)")
-    parser.add_argument(
-        "--corners",
-        type=int,
-        nargs="+",
-        choices=(1, 2, 4, 16),
-        default=[1, 2, 4, 16],
-        metavar="N",
-        help="1, 2, 4, or 16 (four daemons in one process)",
-    )
+    parser.add_argument("--corners", type=int, nargs="+", choices=(1, 2, 4), default=[1, 2, 4], metavar="N", help="1, 2 or 4")
     parser.add_argument("--json", action="store_true", help="figures as JSON")
 
 
@@ -36,7 +26,6 @@ def run(arguments: argparse.Namespace) -> int:
             library.check(kernels)
     except library.Refused as refusal:
         raise InputError(f"{kernels}: {refusal}") from None
-    from emb_daemon.bench.logs import measure_logs
     from emb_daemon.bench.loop import machine, measure_loop, measure_start
     from emb_daemon.bench.report import text, verdict
 
@@ -45,24 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
     result = {
         "machine": machine(),
         "loops": [measure_loop(corners, arguments.seconds) for corners in arguments.corners],
-        "kernels": _compare(str(kernels), max(_LEAST_S, arguments.seconds / _ROUNDS)) if kernels else None,
-        "logs": measure_logs(),
         "cold_start": measure_start(cold=True),
     }
     result["verdict"] = verdict(result)
     print(json.dumps(result, indent=1) if arguments.json else text(result))
     return 0
-
-
-def _compare(kernels: str, seconds: float) -> dict[str, dict]:
-    """Figures of the daemon with kernels from numba and with a library, in turn, so that a busy machine affects both alike;
-    of each the round whose tick is the median."""
-    from emb_daemon.bench.loop import measure_loop
-
-    codes = {"numba": "", "ahead": kernels}
-    rounds = [{code: measure_loop(4, seconds, path) for code, path in codes.items()} for _ in range(_ROUNDS)]
-    return {code: sorted((found[code] for found in rounds), key=_tick)[_ROUNDS // 2] for code in codes}
-
-
-def _tick(loop: dict) -> float:
-    return loop["tick"]["p50_us"]

@@ -2,8 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_mapping_argument, add_path, open_mapping
 from emb_daemon.errors import InputError, InputErrors
 
 EXAMPLE = "emb-daemon check --config config/emb.yaml"

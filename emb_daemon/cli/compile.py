@@ -6,7 +6,7 @@ import platform
 import tempfile
 
 from emb_daemon.ahead.library import TARGETS, default_path, installed_digest
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_path
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"

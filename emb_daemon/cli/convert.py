@@ -2,9 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
 
 EXAMPLE = "emb-daemon convert bench.csv --mapping my_rig.yaml --output bench.log"
 

@@ -3,8 +3,7 @@
 import argparse
 from pathlib import Path
 
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_path, check_output
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon demo --corners 4 --seconds 30"

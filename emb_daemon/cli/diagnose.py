@@ -4,8 +4,7 @@ import argparse
 import json
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.cli.logoptions import add_mapping_argument, log_reader
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_mapping_argument, add_path, log_reader
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 

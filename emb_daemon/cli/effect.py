@@ -3,8 +3,7 @@
 import argparse
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_path, check_output
 from emb_daemon.errors import InputError
 
 EXAMPLE = "emb-daemon effect export calibration.yaml term:gear_friction:motor_angle --output screw_friction.py"

@@ -4,8 +4,7 @@ import argparse
 
 from emb_daemon.ahead.library import default_path
 from emb_daemon.atomic import write_atomically
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_path, check_output
 
 EXAMPLE = "emb-daemon export --calibration calibration.yaml --output brake.fmu"
 

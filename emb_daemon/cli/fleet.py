@@ -1,15 +1,12 @@
 """emb-daemon fleet."""
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from emb_daemon.cli.logoptions import add_mapping_argument
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import CALIBRATION_HELP, add_path
+from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
@@ -36,8 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mapping_argument(ingest)
     for name in ("replay", "learn", "diagnose", "prior", "report"):
         add_path(parsers[name], "data", "data set of emb-daemon fleet ingest", "DIR")
-    add_path(parsers["bench"], "log", "a log of a minute or more", "LOG")
-    for name in ("replay", "learn", "diagnose", "prior", "bench"):
+    for name in ("replay", "learn", "diagnose", "prior"):
         add_path(parsers[name], "--calibration", CALIBRATION_HELP)
     for name in ("replay", "learn", "diagnose"):
         parsers[name].add_argument(
@@ -47,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parsers[name].add_argument(
             "--scheduler", metavar="ADDRESS", help="address of a Dask cluster whose workers see DIR (default: this machine)"
         )
-    for name in ("ingest", "replay", "learn", "diagnose", "bench"):
         parsers[name].add_argument("--workers", type=int, metavar="N", help="processes of this machine; default: one per core")
     add_path(parsers["diagnose"], "--units", "what units have in common: columns unit, batch, supplier, ...", "FILE.csv")
     add_path(parsers["prior"], "--output", "the calibration to write", "FILE.yaml", required=True)
@@ -184,31 +179,12 @@ def _prior(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _bench(arguments: argparse.Namespace) -> int:
-    from emb_daemon.fleet.speed import scaling, stages
-
-    calibration, workers = _calibration(arguments), arguments.workers or len(os.sched_getaffinity(0))
-    print(f"{'stage':<24}µs a sample   × real time")
-    for stage in stages(arguments.log, calibration):
-        print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
-    gain = scaling(arguments.log, calibration, workers)
-    print(f"{workers} workers replay {gain.replay:.2f} times as fast as one, and add {gain.additions:.2f} times as fast")
-    return 0
-
-
 #: Function and description of each command.
 _COMMANDS = {
     "ingest": (_ingest, "read log files into a data set by unit, corner and day; each once, damaged ones are listed"),
     "replay": (_replay, "compute estimates, figures and integrity of every drive, equal to those of emb-daemon replay"),
     "learn": (_learn, "run park brake adaptation over each unit's drives, one after the other"),
-    "diagnose": (
-        _diagnose,
-        "find what distinguishes units and batches, and what drifts, from the disagreement of the force paths",
-    ),
+    "diagnose": (_diagnose, "find what distinguishes units and batches, and what drifts, by the disagreement of the paths"),
     "prior": (_prior, "write a calibration with the population's values, their spread, and bounds for adaptation"),
     "report": (_report, "write the findings as one page: map of units, worst ten, batches, trend, next action"),
-    "bench": (
-        _bench,
-        "measure how fast one core of this machine replays a log, stage by stage, and how much faster all do",
-    ),
 }

@@ -4,9 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_mapping_argument, add_path, check_output, open_mapping
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError
 

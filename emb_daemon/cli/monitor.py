@@ -4,10 +4,7 @@ import argparse
 import json
 import sys
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options, host_and_port
-from emb_daemon.cli.logoptions import add_mapping_argument
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options, check_output, host_and_port
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 

@@ -5,9 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.logoptions import LOG_HELP, add_mapping_argument, log_reader
-from emb_daemon.cli.outputs import check_output
-from emb_daemon.cli.paths import CALIBRATION_HELP, add_path
+from emb_daemon.cli.options import CALIBRATION_HELP, LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
 

@@ -6,9 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import add_mapping_argument, open_mapping
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options, open_mapping
 
 EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0"
 

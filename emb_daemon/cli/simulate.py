@@ -2,9 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.busoptions import add_bus_arguments, bus_options
-from emb_daemon.cli.logoptions import add_mapping_argument
-from emb_daemon.cli.paths import add_path
+from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
 from emb_daemon.resources import resource
@@ -15,7 +13,7 @@ EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario driv
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corners", type=int, choices=range(1, 5), default=4, metavar="N", help="1 to 4 brakes, FL first (4)")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds (default: on Ctrl-C or SIGTERM)")
-    parser.add_argument("--scenario", default="drive", help="drive, stops, cruise or park (drive)")
+    parser.add_argument("--scenario", default="drive", help="drive (in town) or park (drive)")
     add_path(parser, "--calibration", "calibration of the simulated brake (default: the shipped one)")
     parser.add_argument("--reference", action="store_true", help="send the rig's reference instruments (RIG_*) too")
     add_mapping_argument(parser)
@@ -32,11 +30,13 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
-    from emb_daemon.plant.scenarios import scenario
+    from emb_daemon.plant.scenarios import SCENARIOS
     from emb_daemon.wire.layout import CORNERS
 
     _check(arguments)
-    schedule = scenario(arguments.scenario)
+    if arguments.scenario not in SCENARIOS:
+        raise InputError(f"--scenario {arguments.scenario}: expected {' or '.join(SCENARIOS)}")
+    schedule = SCENARIOS[arguments.scenario]()
     calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
     corners = CORNERS[: arguments.corners]
     plants = np.array([plant_from_calibration(calibration, arguments.seed + row) for row in range(len(corners))])

@@ -3,8 +3,7 @@
 import argparse
 import sys
 
-from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids
-from emb_daemon.cli.paths import CONFIG_HELP, add_path
+from emb_daemon.cli.options import CONFIG_HELP, add_bus_arguments, add_id_arguments, add_path, bus_options, check_ids
 from emb_daemon.cli.serving import serve
 from emb_daemon.errors import InputError
 

@@ -2,8 +2,15 @@
 
 import argparse
 
-from emb_daemon.cli.busoptions import add_bus_arguments, add_id_arguments, bus_options, check_ids, host_and_port
-from emb_daemon.cli.paths import CONFIG_HELP, add_path
+from emb_daemon.cli.options import (
+    CONFIG_HELP,
+    add_bus_arguments,
+    add_id_arguments,
+    add_path,
+    bus_options,
+    check_ids,
+    host_and_port,
+)
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_daemon.errors import InputError
 from emb_daemon.plant.brake import motor_angle, static_angle
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.records import ANGLE, COMMAND, DRIVE, FORCE, RELEASE
@@ -46,7 +45,7 @@ def rest(seconds: float, wheel_speed: float = np.nan, target_speed: float = 0.0,
     return Schedule(commands, drives)
 
 
-def _angles(schedule: Schedule, angle: np.ndarray) -> Schedule:
+def move(schedule: Schedule, angle: np.ndarray) -> Schedule:
     """Command angles past the released position (rad), smoothly."""
     schedule.commands["mode"] = ANGLE
     schedule.commands["target"] = angle
@@ -54,18 +53,12 @@ def _angles(schedule: Schedule, angle: np.ndarray) -> Schedule:
     return schedule
 
 
-def _forces(schedule: Schedule, force: np.ndarray) -> Schedule:
+def clamp(schedule: Schedule, force: np.ndarray) -> Schedule:
+    """Command clamp forces (N); a brake is requested above `_REQUEST_N`."""
     schedule.commands["mode"] = np.where(force > 0.0, FORCE, RELEASE)
     schedule.commands["target"] = force
     schedule.drives["brake_request"] = force > _REQUEST_N
     return schedule
-
-
-def _approach(angle: np.ndarray) -> np.ndarray:
-    """Move from the released position into a motion within half a second, and back at its end."""
-    time = CYCLE_S * np.arange(len(angle))
-    share = np.clip(np.minimum(time, time[-1] - time) / 0.5, 0.0, 1.0)
-    return 0.5 * (1.0 - np.cos(np.pi * share)) * angle
 
 
 def angle_at(plant: np.void, force_N: float) -> float:
@@ -78,7 +71,7 @@ def curve(plant: np.void, force_N: float = 25000.0, seconds: float = 40.0) -> Sc
     schedule = rest(seconds)
     time = CYCLE_S * np.arange(len(schedule))
     shape = 0.5 * (1.0 - np.cos(2.0 * np.pi * time / seconds))
-    return _angles(schedule, angle_at(plant, force_N) * shape)
+    return move(schedule, angle_at(plant, force_N) * shape)
 
 
 def random_angle(plant: np.void, seconds: float, rng: np.random.Generator, high_N: float = 15000.0) -> Schedule:
@@ -92,38 +85,6 @@ def random_angle(plant: np.void, seconds: float, rng: np.random.Generator, high_
     return schedule + rest(0.5)
 
 
-def training(plant: np.void, seconds: float = 42.0, high_N: float = 15000.0) -> Schedule:
-    """Park brake applied; slow clamp and release in 20 s, a sinusoid of 0.8 rad and 6 Hz on top (thesis Fig. 3-9)."""
-    schedule = rest(seconds)
-    time = CYCLE_S * np.arange(len(schedule))
-    low, high = angle_at(plant, 0.0) - 2.0, angle_at(plant, high_N) - 0.8
-    angle = low + (high - low) * 0.5 * (1.0 - np.cos(2.0 * np.pi * time / 20.0))
-    angle += 0.8 * np.sin(2.0 * np.pi * 6.0 * time)
-    schedule.drives["park_brake"] = PARK_APPLIED
-    return _angles(schedule, _approach(angle)) + rest(0.5)
-
-
-def rig_stop(force_N: float, wheel_speed: float, clamp_seconds: float = 3.0, cycle_seconds: float = 9.0) -> Schedule:
-    """On the rig: the disc is brought to ``wheel_speed`` rad/s, braked to a stand and held a moment."""
-    schedule = rest(cycle_seconds)
-    time = CYCLE_S * np.arange(len(schedule))
-    begin = cycle_seconds - clamp_seconds - 1.5
-    stop = begin + 0.85 * clamp_seconds
-    schedule.drives["wheel_speed"] = wheel_speed * np.clip(
-        np.minimum(time / (0.7 * begin), (stop - time) / (stop - begin)), 0, 1
-    )
-    force = force_N * np.clip((time - begin) / 0.2, 0.0, 1.0) * (time < begin + clamp_seconds)
-    return _forces(schedule, force)
-
-
-def rig_drag(force_N: float, wheel_speed: float, seconds: float) -> Schedule:
-    """On the rig: a long brake application at constant disc speed."""
-    force = np.full(round(seconds / CYCLE_S), force_N)
-    return _forces(rest(seconds, wheel_speed), force * np.clip(CYCLE_S * np.arange(len(force)) / 0.5, 0.0, 1.0)) + rest(
-        2.0, wheel_speed
-    )
-
-
 def accelerate(speed: float, seconds: float) -> Schedule:
     """The car reaches and holds ``speed`` m/s."""
     return rest(seconds, target_speed=speed)
@@ -133,7 +94,7 @@ def stop(force_N: float, seconds: float, rise: float = 0.25) -> Schedule:
     """The car is braked with ``force_N`` at each corner, comes to a stand if the time is enough, and is released."""
     schedule = rest(seconds, target_speed=np.nan)
     time = CYCLE_S * np.arange(len(schedule))
-    return _forces(schedule, force_N * np.clip(np.minimum(time / rise, (seconds - 0.3 - time) / 0.15), 0.0, 1.0))
+    return clamp(schedule, force_N * np.clip(np.minimum(time / rise, (seconds - 0.3 - time) / 0.15), 0.0, 1.0))
 
 
 def drag(force_N: float, speed: float, seconds: float) -> Schedule:
@@ -148,7 +109,7 @@ def park(force_N: float, seconds: float) -> Schedule:
     schedule = rest(seconds, target_speed=0.0)
     time = CYCLE_S * np.arange(len(schedule))
     ramp = np.clip(np.minimum(time / 1.0, (seconds - 0.5 - time) / 0.3), 0.0, 1.0)
-    _forces(schedule, force_N * ramp)
+    clamp(schedule, force_N * ramp)
     schedule.drives["brake_request"] = 0
     parked = np.where(ramp >= 1.0, PARK_APPLIED, PARK_IN_TRANSITION)
     schedule.drives["park_brake"] = np.where(ramp > 0.0, parked, PARK_RELEASED)
@@ -170,33 +131,12 @@ def city_drive() -> Schedule:
     )
 
 
-def two_stops() -> Schedule:
-    """Brake stops from 20 and 14 m/s."""
-    return rest(1.0) + accelerate(20.0, 7.0) + stop(9000.0, 5.0) + accelerate(14.0, 5.0) + stop(18000.0, 3.0) + rest(1.0)
-
-
-def cruise() -> Schedule:
-    """Driving with a long slight brake application."""
-    return rest(1.0) + accelerate(22.0, 30.0) + drag(2500.0, 22.0, 20.0) + accelerate(22.0, 30.0) + stop(6000.0, 9.0)
-
-
 def parking() -> Schedule:
     """Parked for two minutes: training motion when the daemon requests it."""
     return rest(1.0) + park(12000.0, 120.0) + rest(2.0)
 
 
-SCENARIOS = {"drive": city_drive, "stops": two_stops, "cruise": cruise, "park": parking}
-
-
-def scenario(name: str) -> Schedule:
-    """A named scenario.
-
-    Raises:
-        InputError: no such scenario.
-    """
-    if name not in SCENARIOS:
-        raise InputError(f"scenario {name}: expected one of {', '.join(SCENARIOS)}")
-    return SCENARIOS[name]()
+SCENARIOS = {"drive": city_drive, "park": parking}
 
 
 #: Share of the demanded force at a rear brake.

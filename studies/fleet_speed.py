@@ -1,6 +1,11 @@
 """How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns; and how
-much faster several workers are than one."""
+much faster several workers are than one.
 
+``python -m studies.fleet_speed LOG [WORKERS]``, with the shipped calibration; by default as many workers as cores.
+"""
+
+import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -10,6 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import DIGEST, Drive, read_drive, write_drive
@@ -21,6 +27,7 @@ from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
+from emb_daemon.resources import resource
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -123,3 +130,17 @@ def _time(task: Callable) -> float:
         task()
         spent.append(time.thread_time() - begin)
     return max(min(spent), 1e-9)
+
+
+def main() -> None:
+    path, calibration = Path(sys.argv[1]), load_calibration(resource("config/calibration.yaml"))
+    workers = int(sys.argv[2]) if len(sys.argv) > 2 else len(os.sched_getaffinity(0))
+    print(f"{'stage':<24}µs a sample   × real time")
+    for stage in stages(path, calibration):
+        print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
+    gain = scaling(path, calibration, workers)
+    print(f"{workers} workers replay {gain.replay:.2f} times as fast as one, and add {gain.additions:.2f} times as fast")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,8 @@
-"""Speed of reading, decoding and estimating logs; and of the step, compiled and in plain Python."""
+"""How fast are the parts? Reading, decoding and estimating a log; a step, compiled and in plain Python; and, with a library
+from ``emb-daemon compile``, the daemon with each of the two kinds of kernels.
+
+``python -m studies.speed [KERNELS]``
+"""
 
 import os
 import subprocess
@@ -11,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from emb_daemon.bench.loop import machine, measure_loop
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import PARAMETERS
@@ -30,6 +35,8 @@ _SECONDS = 120.0
 _ONE_BY_ONE = 20_000
 #: Number of samples for plain Python.
 _PLAIN = 2000
+#: Of the comparison of kernels; length of each, s.
+_ROUNDS, _ROUND_S = 5, 4.0
 
 
 def medians_s(*functions: Callable[[], object]) -> list[float]:
@@ -114,9 +121,72 @@ def measure_step(samples: np.ndarray, parameters: np.ndarray) -> dict[str, Any]:
         files = [f"{folder}/{name}.npy" for name in ("samples", "parameters", "estimates")]
         np.save(files[0], samples[:_PLAIN])
         np.save(files[1], parameters)
-        command = [sys.executable, "-m", "emb_daemon.bench.plain", *files]
+        command = [sys.executable, "-m", "studies.speed", "--plain", *files]
         environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
         done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
         result["plain_us"] = float(done.stdout)
         result["plain_difference"] = difference(np.load(files[2]), compiled[:_PLAIN])
     return result
+
+
+def _plain(samples: str, parameters: str, estimates: str) -> None:
+    """In a process without a compiler: the step over files of numpy; prints the CPU time of one, us."""
+    rows, calibrated = np.load(samples), np.load(parameters)
+    begin = time.process_time()
+    answers = estimate(rows, calibrated)
+    print(1e6 * (time.process_time() - begin) / len(rows))
+    np.save(estimates, answers)
+
+
+def compare_kernels(library: str) -> dict[str, dict[str, Any]]:
+    """Figures of the daemon with kernels from numba and with a library, in turn, so that a busy machine affects both alike;
+    of each the round whose tick is the median."""
+    codes = {"numba": "", "ahead": library}
+    rounds = [{code: measure_loop(4, _ROUND_S, path) for code, path in codes.items()} for _ in range(_ROUNDS)]
+    return {
+        code: sorted((found[code] for found in rounds), key=lambda loop: loop["tick"]["p50_us"])[_ROUNDS // 2]
+        for code in codes
+    }
+
+
+def _kernels(measured: dict) -> list[str]:
+    rows = [
+        ("start to ready, s", lambda loop: f"{loop['ready']['wall_s']:.2f}"),
+        ("of them on a CPU, s", lambda loop: f"{loop['ready']['cpu_s']:.2f}"),
+        ("resident, MiB", lambda loop: f"{loop['resident_KiB'][1] / 1024.0:.0f}"),
+        ("tick, us, p50 / p99", lambda loop: _both(loop["tick"])),
+        *((f"  {part}", lambda loop, part=part: _both(loop["parts"][part])) for part in measured["numba"]["parts"]),
+        ("ticks missed", lambda loop: f"{loop['missed']} of {loop['ticks']}"),
+        ("  held up by the machine", lambda loop: str(loop["held_up"])),
+    ]
+    lines = [f"{'4 corners, kernels':<38}{'from numba':>18}{'compiled ahead':>18}"]
+    return lines + [f"  {name:<36}{figure(measured['numba']):>18}{figure(measured['ahead']):>18}" for name, figure in rows]
+
+
+def _both(figures: dict) -> str:
+    return f"{figures['p50_us']:.0f} / {figures['p99_us']:.0f}"
+
+
+def _logs(logs: dict) -> list[str]:
+    step, bulk, single = logs["step"], logs["decode_frames_per_s"], logs["cantools_decode_frames_per_s"]
+    return [
+        f"log of {logs['seconds']:g} s, {logs['frames']} frames, one corner, in million frames per second of CPU time:",
+        f"  read {logs['read_frames_per_s'] / 1e6:.1f}; replayed {logs['replay_frames_per_s'] / 1e6:.2f}, "
+        f"{logs['replay_times_real_time']:.0f} times real time",
+        f"  decoded {bulk / 1e6:.1f} with E2E check; {single / 1e6:.2f} by cantools, frame by frame, without",
+        f"step: {step['compiled_us']:.2f} us compiled, {step['plain_us']:.0f} in plain Python over numpy records; "
+        f"estimates differ by {step['plain_difference']:.1g} at most",
+    ]
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--plain"]:
+        _plain(*sys.argv[2:])
+        return
+    print(machine(), *_logs(measure_logs()), sep="\n")
+    if len(sys.argv) > 1:
+        print("", *_kernels(compare_kernels(sys.argv[1])), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
