@@ -73,6 +73,9 @@ _TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
 _KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
+#: Least time for which a value stays while the motor turns, s, and in ordinary times between two of its changes; least share
+#: of the travel that it turns meanwhile.
+_STAYS_S, _STAYS, _PASSED = 0.1, 20.0, 0.05
 #: Change from sample to sample, over the whole of it, below which a small motion is no noise, whose is 1.4.
 _SMOOTH = 0.3
 
@@ -95,6 +98,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     lines += _find_gaps(own)
+    lines += _find_staying(angle, force) if angle is not None and force is not None else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
@@ -216,6 +220,28 @@ def _find_gaps(signals: dict[str, Series]) -> list[str]:
             many = f"{len(gaps)} gaps, together {np.sum(steps[gaps]):.3g} s, the longest of" if len(gaps) > 1 else "a gap of"
             names.setdefault(f"{many} {steps[longest]:.3g} s, {at:.4g} s after the first value", []).append(name)
     return [f"{', '.join(own)}: {text}; nothing is known of it meanwhile" for text, own in names.items()]
+
+
+def _find_staying(angle: Series, force: Series) -> list[str]:
+    """A line on a force that stays to the bit while the motor turns, above the least, at which an amplifier may end."""
+    changes = np.concatenate([[0], np.flatnonzero(np.diff(force.values)) + 1, [len(force.values)]])
+    if len(changes) < _LEAST:
+        return []
+    starts, last = force.time_ns[changes[:-1]], force.time_ns[changes[1:] - 1]
+    passed = np.abs(angle.sampled(last) - angle.sampled(starts))
+    lasts_s = 1e-9 * (last - starts)
+    stays = (lasts_s > max(_STAYS_S, _STAYS * np.median(np.diff(changes)) * 1e-9 * force.period_ns)) & (
+        passed > _PASSED * np.ptp(angle.values)
+    )
+    stays &= force.values[changes[:-1]] > np.min(force.values)
+    if not stays.any():
+        return []
+    longest = int(np.argmax(np.where(stays, lasts_s, 0.0)))
+    return [
+        f"ClampForceRef stays at {force.values[changes[longest]]:.4g} N for {lasts_s[longest]:.3g} s, "
+        f"{1e-9 * (starts[longest] - force.time_ns[0]):.4g} s after the first value, while the motor turns by "
+        f"{passed[longest]:.3g} rad: did the sensor, or its recorder, end there?"
+    ]
 
 
 def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
