@@ -696,9 +696,11 @@ def test_numbers_that_stand_for_none_are_no_force(truth, tmp_path, capsys, force
     [
         (lambda f, t: np.where(t > 1.5, f[375], f), "N for 1.4"),
         (lambda f, _: np.maximum(f, 0.0), ""),
+        (lambda f, _: np.minimum(f, 8000.0), "stays at 8000 N"),
         (lambda f, _: 500.0 * np.rint(f / 500.0), ""),
+        (lambda f, _: np.where(np.arange(len(f)) == 5, -200.0, 200.0 * np.rint(f / 200.0)), ""),
     ],
-    ids=["a recorder that ended", "nothing below zero", "coarse"],
+    ids=["a recorder that ended", "nothing below zero", "an amplifier's end", "coarse", "coarse in the clearance"],
 )
 def test_a_force_that_stays_while_the_motor_turns_is_said(truth, tmp_path, capsys, force, said):
     """Judged by it, every estimate would be wrong."""

@@ -98,7 +98,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     lines += _find_gaps(own)
-    lines += _find_staying(angle, force) if angle is not None and force is not None else []
+    lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
@@ -223,24 +223,28 @@ def _find_gaps(signals: dict[str, Series]) -> list[str]:
 
 
 def _find_staying(angle: Series, force: Series) -> list[str]:
-    """A line on a force that stays to the bit while the motor turns, above the least, at which an amplifier may end."""
+    """A line on the longest time for which a force stays to the bit while the motor turns, if it is another than that of a
+    clearance: elsewhere it changes over the angles that are passed, or is less."""
     changes = np.concatenate([[0], np.flatnonzero(np.diff(force.values)) + 1, [len(force.values)]])
     if len(changes) < _LEAST:
         return []
-    starts, last = force.time_ns[changes[:-1]], force.time_ns[changes[1:] - 1]
-    passed = np.abs(angle.sampled(last) - angle.sampled(starts))
-    lasts_s = 1e-9 * (last - starts)
-    stays = (lasts_s > max(_STAYS_S, _STAYS * np.median(np.diff(changes)) * 1e-9 * force.period_ns)) & (
-        passed > _PASSED * np.ptp(angle.values)
-    )
-    stays &= force.values[changes[:-1]] > np.min(force.values)
-    if not stays.any():
+    longest = int(np.argmax(np.diff(changes)))
+    first, last = changes[longest], changes[longest + 1] - 1
+    at, lasts_s = angle.sampled(force.time_ns), 1e-9 * (force.time_ns[last] - force.time_ns[first])
+    passed, stays = at[first : last + 1], np.zeros(len(at), bool)
+    stays[first : last + 1] = True
+    if lasts_s < max(_STAYS_S, _STAYS * np.median(np.diff(changes)) * 1e-9 * force.period_ns):
         return []
-    longest = int(np.argmax(np.where(stays, lasts_s, 0.0)))
+    if not np.ptp(passed) > _PASSED * np.ptp(angle.values):
+        return []
+    elsewhere = force.values[(at >= np.min(passed)) & (at <= np.max(passed)) & ~stays]
+    least = _FOLLOWS * np.ptp(force.values)
+    if (np.ptp(elsewhere) if len(elsewhere) >= _LEAST_IN_PART else force.values[first] - np.min(force.values)) < least:
+        return []
     return [
-        f"ClampForceRef stays at {force.values[changes[longest]]:.4g} N for {lasts_s[longest]:.3g} s, "
-        f"{1e-9 * (starts[longest] - force.time_ns[0]):.4g} s after the first value, while the motor turns by "
-        f"{passed[longest]:.3g} rad: did the sensor, or its recorder, end there?"
+        f"ClampForceRef stays at {force.values[first]:.4g} N for {lasts_s:.3g} s, "
+        f"{1e-9 * (force.time_ns[first] - force.time_ns[0]):.4g} s after the first value, while the motor turns by "
+        f"{np.ptp(passed):.3g} rad: did the sensor, or its recorder, end there?"
     ]
 
 
