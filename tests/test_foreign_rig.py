@@ -586,7 +586,9 @@ def test_of_sheets_alike_the_one_that_is_read_is_named(tmp_path, capsys):
 
 
 def test_a_time_may_be_a_duration_and_a_name_have_a_blank_that_breaks_no_line(tmp_path):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("signal: force_N", "signal: clamp force"))
+    mapping = foreignkit.COLUMNS.replace("signal: force_N", "signal: clamp force")
+    # A duration has its unit, whatever the mapping says.
+    foreignkit.write_rig(tmp_path, mapping.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     table = pyarrow.table(columns).set_column(
         0, "time_s", pyarrow.array(np.rint(1e6 * columns["time_s"]).astype(np.int64)).cast(pyarrow.duration("us"))

@@ -13,7 +13,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import _find_late_force, contradictions, other_current, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time, strays
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.offline import load_log
 
 
@@ -689,6 +689,11 @@ def test_numbers_that_stand_for_none_are_no_force(truth, tmp_path, capsys, force
     assert least_N < np.nanmin(log.force_N) and np.nanmax(log.force_N) < 40e3
     at = np.interp(1e-9 * (log.samples["time_ns"] - log.samples["time_ns"][0]), truth.time_s, truth.force)
     assert not said or np.nanmax(np.abs(log.force_N - at)) < 4e3
+
+
+def test_a_coarse_sensor_about_zero_is_filled_with_nothing():
+    steps = 50.0 * np.rint(np.abs(np.random.default_rng(5).normal(0.0, 40.0, 2000)) / 50.0)
+    assert not no_values(steps).any() and np.sum(steps == 0.0) > 500
 
 
 @pytest.mark.parametrize(
