@@ -650,8 +650,8 @@ def test_a_unit_in_the_file_that_is_not_the_mappings_is_said(truth, tmp_path, ca
         lines = [",".join(columns), ",".join(units[name] for name in columns), *(",".join(map(repr, row)) for row in rows)]
         path.write_text("\n".join(lines), encoding="utf-8")
     else:
-        if "time_s" in stated:
-            pytest.skip("channels have seconds")
+        # Channels have times of their own, in seconds.
+        said = "" if "time_s" in stated else said
         asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
         foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time: {signal: time_s}\n", ""))
         file = asammdf.MDF(version="4.10")
