@@ -23,7 +23,7 @@ from emb_daemon.fleet.ingest import Job, ingest
 from emb_daemon.fleet.replaying import replay_drive
 from emb_daemon.fleet.scores import Scorer
 from emb_daemon.logs.candump import parse_candump
-from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack_gzip
+from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
@@ -64,9 +64,9 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
     with tempfile.TemporaryDirectory() as folder:
         root, scorer = Path(folder), Scorer(calibration)
         drive = next(Drive(**entry) for entry in ingest(root, Job(path, "unit", ""))["drives"] if entry["corner"] == corner)
-        work: dict[str, Callable] = {"unpack": lambda: unpack_gzip(path, raw)}
+        work: dict[str, Callable] = {"unpack": lambda: unpack(path, raw)}
         if log_ending(path) == ".log":
-            text = unpack_gzip(path, raw)
+            text = unpack(path, raw)
             work["parse"] = lambda: parse_candump(text)
         work |= {
             "check and decode": lambda: samples_in(frames, (corner,)),

@@ -170,10 +170,13 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (_PAIRS + 6 * "X,Y," + "\n" + _table(100, "7,{t:.3f},7,{a:.1f},7,25,7,1.5,7,22,7,0"), ""),
         (_PAIRS + _table(100, "{t:.3f},0,{a:.1f},0,25.0,0,1.5,0,22,0,0,0"), ""),
         ("sep=;\n" + (_HEADER + "\n" + _table(100, "{t:g},{a:g},25,1.5,22,0")).replace(",", ";").replace(".", ","), ""),
+        ('"' + _HEADER.replace(",", '"; "') + '"\n' + _table(100).replace(",", "; "), ""),
+        (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,\N{MINUS SIGN}5"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside", "late decimal commas",
+        "quotes after blanks", "a typesetter's minus",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
@@ -196,12 +199,17 @@ def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, conte
         ("11/22/2026 08:15:{s:06.3f} PM", "s"),
         ("22/11/2026 08:15:{s:06.3f}", "s"),
         ("2026/11/22 08:15:{s:06.3f}", "s"),
+        ("08:15:{whole:02d}:{ms:03d}", "s"),
+        ("22.11.2026 08:15:{whole:02d}:{ms:03d}", "s"),
+        ("22-Nov-2026 08:15:{s:06.3f}", "s"),
         ("{ns:d}", "ns"),
     ],
 )
 def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
-    rows = (stamp.format(s=10.0 + 0.004 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n) for n in range(100))
+    rows = (
+        stamp.format(s=10.0 + 0.004 * n, whole=10, ms=4 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n) for n in range(100)
+    )
     table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
     (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
     log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
@@ -227,6 +235,18 @@ def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
     log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
     assert np.allclose(log.time_s, 0.004 * np.arange(400), atol=1e-6)
     assert set(np.round(log.force_N).tolist()) == {600.0, 610.0, 1500.0, 1510.0}
+
+
+@pytest.mark.parametrize(("whole", "largest_N"), [(1, 20_399.0), (0, 19.399)], ids=["thousands", "decimals"])
+def test_a_point_beside_decimal_commas_parts_thousands(tmp_path, whole, largest_N):
+    """As a spreadsheet of such a country shows whole newtons; nobody writes thousands that begin with a zero."""
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    rows = [
+        f"{0.004 * n:.3f};{0.1 * n:.1f};25,0;1,5;22,0".replace(".", ",") + f";{whole + n % 20}.{n:03d}" for n in range(400)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", ";"), *rows]) + "\n")
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert np.nanmax(log.force_N) == pytest.approx(largest_N, abs=0.2)
 
 
 def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, capsys):
@@ -255,7 +275,7 @@ def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
             mapping.read(tmp_path / "c.csv")
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le"])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le", "utf-16-be"])
 def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time_s", "Uhrzeit").replace("plate_C", '"Temperatur [°C]"'))
     head = _HEADER.replace("time_s", "Uhrzeit").replace("plate_C", "Temperatur [°C]")
@@ -491,6 +511,10 @@ def _as_file(path: Path, columns: dict[str, np.ndarray]) -> Path:
             file.write_segment([nptdms.ChannelObject("log", name, values) for name, values in columns.items()])
     elif path.suffix == ".json":
         path.write_text(json.dumps({"rig": "A", "log": {name: values.tolist() for name, values in columns.items()}}))
+    elif path.suffix == ".ndjson":
+        # pandas numbers the rows of each column.
+        numbered = {name: {str(row): value for row, value in enumerate(values.tolist())} for name, values in columns.items()}
+        path.write_text(json.dumps({"log": numbered}))
     elif path.suffix == ".jsonl":
         rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         lines = [json.dumps({"log": dict(zip(columns, row, strict=True))}) for row in rows]
@@ -500,7 +524,7 @@ def _as_file(path: Path, columns: dict[str, np.ndarray]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("ending", [".xlsx", ".h5", ".mat", ".tdms", ".json", ".jsonl", ".feather", ".npy"])
+@pytest.mark.parametrize("ending", [".xlsx", ".h5", ".mat", ".tdms", ".json", ".jsonl", ".ndjson", ".feather", ".npy"])
 def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
     """The format goes by how the file begins where that tells it, not by its name."""
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
@@ -512,7 +536,7 @@ def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
         mapping = mapping.replace(f"signal: {name}", f"signal: {theirs}")
     (tmp_path / "mapping.yaml").write_text(mapping)
     path = _as_file(tmp_path / f"b{ending}", columns)
-    if ending not in (".json", ".jsonl"):
+    if "json" not in ending:
         path = path.rename(tmp_path / "b.txt")
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
     assert ("its last line is cut off" in capsys.readouterr().err) == (ending == ".jsonl")
@@ -559,6 +583,21 @@ def test_of_sheets_alike_the_one_that_is_read_is_named(tmp_path, capsys):
     )
     Mapping(tmp_path / "m.yaml").read(tmp_path / "a.xlsx")
     assert "2 sheets have these columns (first, second); the first alone is read" in capsys.readouterr().err
+
+
+def test_a_time_may_be_a_duration_and_a_name_have_a_blank_that_breaks_no_line(tmp_path):
+    mapping = foreignkit.COLUMNS.replace("signal: force_N", "signal: clamp force")
+    # A duration has its unit, whatever the mapping says.
+    foreignkit.write_rig(tmp_path, mapping.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    table = pyarrow.table(columns).set_column(
+        0, "time_s", pyarrow.array(np.rint(1e6 * columns["time_s"]).astype(np.int64)).cast(pyarrow.duration("us"))
+    )
+    names = ["clamp\N{NO-BREAK SPACE}force" if name == "force_N" else name for name in table.column_names]
+    pyarrow.parquet.write_table(table.rename_columns(names), tmp_path / "a.parquet")
+    log = load_log(tmp_path / "a.parquet", read=Mapping(tmp_path / "mapping.yaml").read)
+    assert log.time_s == pytest.approx(columns["time_s"] - columns["time_s"][0], abs=1e-5)
+    assert np.nanmax(log.force_N) == pytest.approx(np.max(columns["force_N"]), rel=1e-3)
 
 
 def test_stamps_of_json_lines_may_be_dates(tmp_path):

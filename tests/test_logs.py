@@ -1,6 +1,9 @@
 """Log files: our bulk reader beside python-can's, and what is said of files that are damaged."""
 
+import bz2
+import contextlib
 import gzip
+import lzma
 import os
 import tracemalloc
 
@@ -129,6 +132,20 @@ def test_names_with_dots(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(gzip.compress(_GOOD.encode()) if name.endswith("gz") else _GOOD.encode())
     assert len(read_frames(path)) == 1
+
+
+@pytest.mark.parametrize(("packer", "name"), [(bz2, "bzip2"), (lzma, "xz")])
+def test_other_packers_are_unpacked_or_their_damage_named(tmp_path, capsys, packer, name):
+    packed, path = packer.compress(_GOOD.encode() * 5000), tmp_path / "a.log"
+    path.write_bytes(packed)
+    assert len(read_frames(path)) == 5000
+    path.write_bytes(packed[: len(packed) // 2])
+    with contextlib.suppress(InputError):
+        read_frames(path)
+    assert "cut off, read up to there" in capsys.readouterr().err
+    path.write_bytes(packed[:20] + bytes(40) + packed[60:])
+    with pytest.raises(InputError, match=f"damaged {name} file"):
+        read_frames(path)
 
 
 def test_what_is_too_large_or_no_file_is_not_read(tmp_path, monkeypatch):
@@ -297,7 +314,7 @@ def test_a_fast_library_changes_nothing_of_what_is_read_or_said(damage, tmp_path
 
     def outcome():
         try:
-            return read.unpack_gzip(tmp_path, raw), capsys.readouterr().err
+            return read.unpack(tmp_path, raw), capsys.readouterr().err
         except InputError as error:
             return str(error), capsys.readouterr().err
 

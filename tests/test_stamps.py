@@ -13,7 +13,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import _find_late_force, contradictions, other_current, other_motor, starts_anew
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time, strays
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.offline import load_log
 
 
@@ -145,13 +145,10 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
 @pytest.mark.parametrize(
     ("time_s", "said"),
     [
-        (lambda t: 1e3 * t, "one value every 4 s; expected 1e-05 to 1 s; is the unit of time right?"),
+        (lambda t: 1e3 * t, "4 s; expected 1e-05 to 1 s; is the unit of time right? With `unit: ms` it is 0.004 s"),
         (lambda t: 1e6 * t, "one value every 4e+03 s"),
         (lambda t: 1e-6 * t, "one value every 4e-09 s"),
-        (
-            lambda t: 45000.0 + t / 86400.0,
-            "is the unit of time right? In days (`unit: d`) it is 0.00",
-        ),
+        (lambda t: 45000.0 + t / 86400.0, "is the unit of time right? With `unit: d` it is 0.00"),
         (lambda t: 1e6 * (1.79e9 + t), "1.79e+15 s are no time; is `time.unit`, s, right? As us it is 1790000"),
         (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
         (lambda t: 0.0 * t, "749 values, all of them of one time"),
@@ -313,7 +310,8 @@ def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path,
     lost &= columns["angle_rad"] > 15.0
     log = _read(tmp_path, columns | {"angle_rad": np.where(lost, stray, columns["angle_rad"] + 5.0)})
     told = capsys.readouterr().err
-    assert f"{np.sum(lost)} values of MotorAngle are far from both beside them: left out" in told and "start anew" not in told
+    how = "values are -999, which stand for none" if stray == -999.0 else "values of MotorAngle are far from both beside them"
+    assert f"{np.sum(lost)} {how}: left out" in told and "start anew" not in told
     assert np.ptp(log.samples["angle"]) == pytest.approx(np.ptp(columns["angle_rad"]), abs=0.1)
 
 
@@ -616,6 +614,7 @@ def test_a_slow_clamp_that_is_turned_round_is_told_at_any_rate(tmp_path, capsys,
         ("force (kN), unit: N", "force (kN) says kN and is taken in N: which is right?"),
         ("force (kN), unit: kN", ""),
         ("force (kN), unit: N, scale: -1000", ""),
+        ("force (kN), unit: kN, scale: 10", ""),
         ("'force [Newtons]', unit: N", ""),
         ("force (raw), unit: N", ""),
     ],
@@ -624,6 +623,97 @@ def test_a_unit_in_a_columns_name_that_is_not_the_mappings_is_said(tmp_path, sig
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", signal))
     notes = "\n".join(Mapping(tmp_path / "mapping.yaml").notes)
     assert said in notes and ("which is right" in notes) == bool(said)
+
+
+_ROW = {"angle_rad": "rad", "speed_rad_per_s": "rad/s", "current_A": "A", "plate_C": "°C", "force_N": "N", "time_s": "s"}
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({}, ""),
+        ({"angle_rad": "mm", "plate_C": "V", "current_A": "?"}, ""),
+        ({"force_N": "[kgf]"}, "RIG_FL_Force.ClampForceRef: force_N says kgf and is taken in N: which is right?"),
+        ({"plate_C": "°F"}, "InnerBackplateTemp: plate_C says °F and is taken in degC"),
+        ({"plate_C": "K"}, "InnerBackplateTemp: plate_C says K and is taken in degC"),
+        ({"time_s": "ms"}, "time_s says ms and is taken in s"),
+    ],
+)
+@pytest.mark.parametrize("ending", [".csv", ".mf4"])
+def test_a_unit_in_the_file_that_is_not_the_mappings_is_said(truth, tmp_path, capsys, ending, stated, said):
+    """All plausible: a load cell in kilograms hides 90 % of the force, a thermocouple in °F doubles the heat."""
+    units, columns = _ROW | stated, foreignkit.sampled(truth, 250.0)
+    path = tmp_path / f"a{ending}"
+    if ending == ".csv":
+        foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        lines = [",".join(columns), ",".join(units[name] for name in columns), *(",".join(map(repr, row)) for row in rows)]
+        path.write_text("\n".join(lines), encoding="utf-8")
+    else:
+        # Channels have times of their own, in seconds.
+        said = "" if "time_s" in stated else said
+        asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+        foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time: {signal: time_s}\n", ""))
+        file = asammdf.MDF(version="4.10")
+        time_s = columns.pop("time_s")
+        file.append([asammdf.Signal(values, time_s, unit=units[name], name=name) for name, values in columns.items()])
+        file.save(path)
+    Mapping(tmp_path / "mapping.yaml").read(path)
+    told = capsys.readouterr().err
+    assert said in told and told.count("which is right?") == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("force", "said", "least_N"),
+    [
+        (
+            lambda f, _: np.where(np.arange(len(f)) % 90 < 9, -9999.0, f),
+            "values are -9999, which stand for none",
+            -200.0,
+        ),
+        (lambda f, _: np.where(np.arange(len(f)) == 300, 3.4e38, f), "values are 3.4e+38, which stand for none", -200.0),
+        (lambda f, _: np.where(np.arange(len(f)) % 4 == 0, f, 0.0), "values are 0, which stand for none", -200.0),
+        (lambda f, _: np.minimum(f, 9999.0), "", -200.0),
+        (lambda f, _: 2000.0 * np.rint(f / 2000.0), "", -200.0),
+        (lambda f, t: 9000.0 * np.sin(2 * np.pi * 30.0 * t) * (np.sin(9.0 * t) > 0.0), "", -9100.0),
+    ],
+    ids=["nines", "largest float", "filled with zeros", "end of a sensor", "coarse", "bursts"],
+)
+def test_numbers_that_stand_for_none_are_no_force(truth, tmp_path, capsys, force, said, least_N):
+    columns = foreignkit.sampled(truth, 250.0)
+    noisy = columns["force_N"] + np.random.default_rng(5).normal(0, 25, 749)
+    columns["force_N"] = np.round(force(noisy, columns["time_s"]), 3)
+    log = _read(tmp_path, columns)
+    told = capsys.readouterr().err
+    assert said in told and ("which stand for none" in told) == bool(said)
+    assert least_N < np.nanmin(log.force_N) and np.nanmax(log.force_N) < 40e3
+    at = np.interp(1e-9 * (log.samples["time_ns"] - log.samples["time_ns"][0]), truth.time_s, truth.force)
+    assert not said or np.nanmax(np.abs(log.force_N - at)) < 4e3
+
+
+def test_a_coarse_sensor_about_zero_is_filled_with_nothing():
+    steps = 50.0 * np.rint(np.abs(np.random.default_rng(5).normal(0.0, 40.0, 2000)) / 50.0)
+    assert not no_values(steps).any() and np.sum(steps == 0.0) > 500
+
+
+@pytest.mark.parametrize(
+    ("force", "said"),
+    [
+        (lambda f, t: np.where(t > 1.5, f[375], f), "N for 1.4"),
+        (lambda f, _: np.maximum(f, 0.0), ""),
+        (lambda f, _: np.minimum(f, 8000.0), "stays at 8000 N"),
+        (lambda f, _: 500.0 * np.rint(f / 500.0), ""),
+        (lambda f, _: np.where(np.arange(len(f)) == 5, -200.0, 200.0 * np.rint(f / 200.0)), ""),
+    ],
+    ids=["a recorder that ended", "nothing below zero", "an amplifier's end", "coarse", "coarse in the clearance"],
+)
+def test_a_force_that_stays_while_the_motor_turns_is_said(truth, tmp_path, capsys, force, said):
+    """Judged by it, every estimate would be wrong."""
+    columns = foreignkit.sampled(truth, 250.0)
+    columns["force_N"] = force(columns["force_N"] + np.random.default_rng(5).normal(0, 25, 749), columns["time_s"])
+    _read(tmp_path, columns)
+    told = capsys.readouterr().err
+    assert said in told and ("while the motor turns by" in told) == bool(said)
 
 
 def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):

@@ -112,6 +112,9 @@ _READERS = {
 
 
 def _add(columns: dict[str, np.ndarray | list[object]], name: str, variable) -> None:
+    if isinstance(variable, dict) and all(key.isdigit() and not isinstance(v, (dict, list)) for key, v in variable.items()):
+        # pandas numbers the rows of a column.
+        variable = list(variable.values())
     if isinstance(variable, dict):
         for key, value in variable.items():
             _add(columns, _within(name, key), value)

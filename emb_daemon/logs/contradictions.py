@@ -73,6 +73,9 @@ _TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
 _KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
+#: Least time for which a value stays while the motor turns, s, and in ordinary times between two of its changes; least share
+#: of the travel that it turns meanwhile.
+_STAYS_S, _STAYS, _PASSED = 0.1, 20.0, 0.05
 #: Change from sample to sample, over the whole of it, below which a small motion is no noise, whose is 1.4.
 _SMOOTH = 0.3
 
@@ -95,6 +98,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     lines += _find_gaps(own)
+    lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
@@ -216,6 +220,32 @@ def _find_gaps(signals: dict[str, Series]) -> list[str]:
             many = f"{len(gaps)} gaps, together {np.sum(steps[gaps]):.3g} s, the longest of" if len(gaps) > 1 else "a gap of"
             names.setdefault(f"{many} {steps[longest]:.3g} s, {at:.4g} s after the first value", []).append(name)
     return [f"{', '.join(own)}: {text}; nothing is known of it meanwhile" for text, own in names.items()]
+
+
+def _find_staying(angle: Series, force: Series) -> list[str]:
+    """A line on the longest time for which a force stays to the bit while the motor turns, if it is another than that of a
+    clearance: elsewhere it changes over the angles that are passed, or is less."""
+    changes = np.concatenate([[0], np.flatnonzero(np.diff(force.values)) + 1, [len(force.values)]])
+    if len(changes) < _LEAST:
+        return []
+    longest = int(np.argmax(np.diff(changes)))
+    first, last = changes[longest], changes[longest + 1] - 1
+    at, lasts_s = angle.sampled(force.time_ns), 1e-9 * (force.time_ns[last] - force.time_ns[first])
+    passed, stays = at[first : last + 1], np.zeros(len(at), bool)
+    stays[first : last + 1] = True
+    if lasts_s < max(_STAYS_S, _STAYS * np.median(np.diff(changes)) * 1e-9 * force.period_ns):
+        return []
+    if not np.ptp(passed) > _PASSED * np.ptp(angle.values):
+        return []
+    elsewhere = force.values[(at >= np.min(passed)) & (at <= np.max(passed)) & ~stays]
+    least = _FOLLOWS * np.ptp(force.values)
+    if (np.ptp(elsewhere) if len(elsewhere) >= _LEAST_IN_PART else force.values[first] - np.min(force.values)) < least:
+        return []
+    return [
+        f"ClampForceRef stays at {force.values[first]:.4g} N for {lasts_s:.3g} s, "
+        f"{1e-9 * (force.time_ns[first] - force.time_ns[0]):.4g} s after the first value, while the motor turns by "
+        f"{np.ptp(passed):.3g} rad: did the sensor, or its recorder, end there?"
+    ]
 
 
 def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:

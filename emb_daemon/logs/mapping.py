@@ -34,11 +34,11 @@ from emb_daemon.logs.resample import (
     standing,
     turns_free,
 )
-from emb_daemon.logs.stamps import held_rows, in_time, strays
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
-from emb_daemon.wire.units import TRAVELS, UNITS, conversion, stated_in
+from emb_daemon.wire.units import TRAVELS, UNITS, conversion, known_as, stated_in
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -48,8 +48,8 @@ _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 #: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
-#: A day, in which spreadsheets count, and the shortest period of a table that is one, s.
-_DAY_S, _USUAL_S = 86_400.0, 1e-3
+#: Shortest period that another unit of time is suggested for, s; a day is what spreadsheets count in.
+_USUAL_S, _OF_TIME = 5e-4, ("s", "ms", "us", "ns", "d")
 #: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
 _LOST_COPIES = 0.1
 #: What DBCs call a raw value that is none, once words are apart; and a flag that says that all is well.
@@ -153,18 +153,36 @@ class MappingFile(Struct, kw_only=True):
 
 class Source:
     """One foreign signal of a bus (None: the only one), its ``name`` in a DBC ``message`` and ``signal``, and how it becomes
-    ours: ``scale`` and ``offset`` from the rig's unit to ours, ``span_ns`` None is a sampling period."""
+    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period.
 
-    def __init__(self, mapped: Mapped, scale: float, offset: float, span_ns: float | None):
+    Raises:
+        InputError: the unit cannot become ours.
+    """
+
+    def __init__(self, mapped: Mapped, unit: str, target: str, span_ns: float | None):
         self.name: str = mapped.signal
+        self.unit = unit
+        self.target = target
         self.bus: str | None = mapped.bus
         self.period: float | None = mapped.period
         message, _, signal = mapped.signal.rpartition(".")
         self.message: str = message
         self.signal: str = signal
-        self.scale = scale
-        self.offset = offset
+        factor, shift = conversion(unit, target)
+        self.scale: float = mapped.scale * factor
+        self.offset: float = mapped.scale * shift + mapped.offset
+        self._shifted = mapped.offset != 0.0
         self.span_ns = span_ns
+
+    def questioned(self, stated: str) -> str:
+        """A question if the unit that the rig states makes other values of the signal; a scale of that same unit is meant."""
+        own = known_as(stated)
+        if not own or UNITS[own][0] != UNITS[self.target][0]:
+            return ""
+        factor, zero = conversion(own, self.target)
+        as_stated = conversion(self.unit, self.target) == (factor, zero)
+        as_scaled = math.isclose(abs(self.scale), factor, rel_tol=1e-3) and (self._shifted or self.offset == zero)
+        return "" if as_stated or as_scaled else f"{self.name} says {own} and is taken in {self.unit}: which is right?"
 
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
@@ -249,19 +267,16 @@ class Mapping:
                 f"{mapped.signal} is {what[0]} in {unit}, not {what[1]}'s {what[2]}; state `unit: {ours.unit}`, and as "
                 f"`scale` the radians that {what[1]} turns for one of them: {what[3]}",
             )
+        span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
+        span_ns = None if span_ms is None else 1e6 * span_ms
         try:
-            factor, shift = conversion(unit, ours.unit or "")
+            source = Source(mapped, unit, ours.unit or "", span_ns)
         except InputError as error:
             hint = "; state `unit:`" if not unit else "" if ours.unit else '; of a number without one state `unit: "1"`'
             return self._fault(name, f"{mapped.signal} {error}{hint}")
-        own = stated_in(mapped.signal)
-        if own and UNITS[own][0] == UNITS[ours.unit or ""][0] and not self.databases:
-            theirs, zero = conversion(own, ours.unit or "")
-            if not math.isclose(abs(mapped.scale) * factor, theirs, rel_tol=1e-3) or (mapped.scale == 1.0 and shift != zero):
-                self.notes.append(f"{self.path}: {name}: {mapped.signal} says {own} and is taken in {unit}: which is right?")
-        span_ms = 0.0 if mapped.mean_ms is None and signal_name != "CurrentQ" else mapped.mean_ms
-        span_ns = None if span_ms is None else 1e6 * span_ms
-        signals[signal_name] = Source(mapped, mapped.scale * factor, mapped.scale * shift + mapped.offset, span_ns)
+        if not self.databases and (question := source.questioned(stated_in(mapped.signal))):
+            self.notes.append(f"{self.path}: {name}: {question}")
+        signals[signal_name] = source
         return None
 
     def _signals_of(self, message: str) -> str:
@@ -380,11 +395,17 @@ class Mapping:
         path = Path(path)
         wanted = {(source.bus, source.name) for name in self.messages for source in self._sources(name).values()}
         if not self.databases:
-            table, digest = read_table(path, sorted(name for _, name in wanted), self._file.time)
+            table, units, digest = read_table(path, sorted(name for _, name in wanted), self._file.time)
             raw = {(None, name): series for name, series in table.items()}
+            self._question(path, units)
         else:
             recorded = read_log(path)
             raw, digest = self._decode(path, recorded, wanted), recorded.digest
+        for (_, name), (stamps, values) in raw.items():
+            if len(values) and np.any(none := no_values(values)):
+                these = ", ".join(f"{value:g}" for value in np.unique(values[none]))
+                print(f"{path}: {name}: {np.sum(none)} values are {these}, which stand for none: left out", file=sys.stderr)
+                raw[_, name] = stamps[~none], values[~none]
         messages = {
             name: {
                 key: source.converted(*raw[source.bus, source.name]) if isinstance(source, Source) else source
@@ -422,17 +443,29 @@ class Mapping:
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
 
+    def _question(self, path: Path, units: dict[str, str]) -> None:
+        """Say which units a file states that the mapping contradicts, of columns whose names state none."""
+        for name in self.messages:
+            for key, source in self._sources(name).items():
+                stated = "" if stated_in(source.name) else units.get(source.name, "")
+                if question := source.questioned(stated):
+                    print(f"{path}: {name}.{key}: {question}", file=sys.stderr)
+
     def _check_rate(self, path: Path, messages: dict) -> None:
         for corner in CORNERS:
             for name, source in self._sources(f"EMB_{corner}_Resolver").items():
                 series = messages[f"EMB_{corner}_Resolver"][name]
                 if len(series.time_ns) > 2 and not _SHORTEST_S <= 1e-9 * series.period_ns <= _LONGEST_S:
                     seconds = 1e-9 * series.period_ns
-                    in_days = _DAY_S * seconds
-                    days = f" In days (`unit: d`) it is {in_days:.3g} s" if _USUAL_S < in_days < _LONGEST_S else ""
+                    counts = seconds / UNITS[self._file.time.unit if self._file.time else "s"][1]
+                    likely = (
+                        f" With `unit: {u}` it is {counts * UNITS[u][1]:.3g} s"
+                        for u in _OF_TIME
+                        if _USUAL_S <= counts * UNITS[u][1] <= _LONGEST_S
+                    )
                     raise InputError(
                         f"{path}: {source.name}: one value every {seconds:.3g} s; expected {_SHORTEST_S:g} to "
-                        f"{_LONGEST_S:g} s; is the unit of time right?{days}"
+                        f"{_LONGEST_S:g} s; is the unit of time right?{next(likely, '')}"
                     )
 
     def _clocks(self) -> str:

@@ -1,9 +1,11 @@
 """Any log file as an array of frames."""
 
+import bz2
 import contextlib
 import gzip
 import hashlib
 import io
+import lzma
 import os
 import sys
 import zlib
@@ -38,6 +40,12 @@ LOG_ENDINGS = (".log", *_PYTHON_CAN)
 _BEGINNINGS = {
     b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
 }  # fmt: skip
+#: First bytes of a packed file: its packer, and what opens it.
+_PACKED = {
+    b"\x1f\x8b": ("gzip", lambda file: gzip.GzipFile(fileobj=file)),
+    b"BZh": ("bzip2", bz2.BZ2File),
+    b"\xfd7zXZ": ("xz", lzma.LZMAFile),
+}
 #: How python-can's tables begin; number of bytes shown of a text that does not.
 _CSV, _SHOWN_BYTES = b"timestamp,arbitration_id", 60
 #: Number of ids listed if the expected ones are not in a log.
@@ -50,8 +58,8 @@ def _most_bytes() -> int:
 
 
 def log_ending(path: Path) -> str:
-    """The ending that decides a log's format: the last one before .gz."""
-    return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    """The ending that decides a log's format: the last one before that of a packer."""
+    return Path(path.stem).suffix.lower() if path.suffix.lower() in (".gz", ".bz2", ".xz") else path.suffix.lower()
 
 
 def ending_of_content(content: bytes) -> str:
@@ -69,11 +77,16 @@ def read_file(path: Path) -> bytes:
     return read_input(path, _most_bytes())
 
 
-def unpack_gzip(path: Path, raw: bytes) -> bytes:
-    """A file's bytes, unpacked if they are gzip's, whatever the file is called; a truncated one up to its end."""
-    if raw[:2] != b"\x1f\x8b":
+def unpack(path: Path, raw: bytes) -> bytes:
+    """A file's bytes, unpacked if it was packed, whatever it is called; a truncated one up to its end.
+
+    Raises:
+        InputError: damaged, or too large once it is unpacked.
+    """
+    packer, opened = next((how for beginning, how in _PACKED.items() if raw.startswith(beginning)), ("", None))
+    if opened is None:
         return raw
-    if isal_zlib:
+    if isal_zlib and packer == "gzip":
         # For a file that is not one complete stream, zlib says what is wrong and how much can be read.
         unpacker = isal_zlib.decompressobj(zlib.MAX_WBITS | 16)
         with contextlib.suppress(isal_zlib.error):
@@ -82,14 +95,14 @@ def unpack_gzip(path: Path, raw: bytes) -> bytes:
                 return content
     parts, left = [], _most_bytes()
     try:
-        with gzip.GzipFile(fileobj=io.BytesIO(raw)) as file:
+        with opened(io.BytesIO(raw)) as file:
             while part := file.read1(1 << 20):
                 parts.append(part)
                 left -= len(part)
                 if left < 0:
                     raise InputError(f"{path}: unpacks to more than {_most_bytes()} bytes, a quarter of this machine's memory")
-    except (zlib.error, gzip.BadGzipFile) as error:
-        raise InputError(f"{path}: damaged gzip file ({error})") from None
+    except (OSError, zlib.error, lzma.LZMAError) as error:
+        raise InputError(f"{path}: damaged {packer} file ({error})") from None
     except EOFError:
         content = b"".join(parts)
         print(f"{path}: cut off, read up to there ({len(content)} bytes)", file=sys.stderr)
@@ -198,7 +211,7 @@ def read_log(path: str | Path) -> Recorded:
     """
     path = Path(path)
     raw = read_file(path)
-    content = unpack_gzip(path, raw)
+    content = unpack(path, raw)
     if rewritten := as_candump(content):
         content = rewritten
     ending = ".log" if rewritten else ending_of_content(content) or log_ending(path)

@@ -29,6 +29,12 @@ _LEAST_CHANGES, _IN_STEP = 50, 0.98
 #: Share of the others' range that a stray is away, and of ordinary steps (normal noise's are 2.3 standard deviations); largest
 #: share of strays, and least number of values to tell them in.
 _FAR, _STEPS, _FEW, _FEWEST = 0.5, 5.0, 0.02, 100
+#: Numbers that stand for none: nines, and ends of 8, 16 and 32 bits, besides what is larger than any measurement; share of the
+#: others' range that they are away, which the end of a sensor's range is not.
+_NONE = {*(10.0**k - 1.0 for k in range(3, 8)), *(2.0**k - n for k in (7, 8, 15, 16, 31, 32) for n in (0, 1))}
+_NO_MEASUREMENT, _AWAY = 1e20, 0.3
+#: Least number of times that a value is 0 between others, and how many times further they are from it than from each other.
+_LEAST_FILLED, _JUMPS = 50, 3.0
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
 
@@ -114,6 +120,31 @@ def strays(values: np.ndarray) -> np.ndarray:
         before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
         stray[1:-1] = (np.minimum(np.abs(before), np.abs(after)) > far) & (np.abs(before - after) < 0.5 * far) & (far > 0.0)
     return stray if np.sum(stray) <= _FEW * len(values) else np.zeros_like(stray)
+
+
+def no_values(values: np.ndarray) -> np.ndarray:
+    """Which values of a column, shape (n,), as it was recorded, stand for none: a number such as -9999 or 65535 far from all
+    others, and zeros with which rows were filled in which nothing was sampled."""
+    none = np.zeros(len(values), bool)
+    for end in (np.max, np.min):
+        if none.all():
+            break
+        value = float(end(values[~none]))
+        others = values[~none & (values != value)]
+        special = abs(value) in _NONE or abs(value) > _NO_MEASUREMENT
+        if special and len(others) and abs(value - end(others)) > _AWAY * np.ptp(others):
+            none |= values == value
+    zero = values == 0.0
+    starts, ends = np.flatnonzero(~zero[:-1] & zero[1:]), np.flatnonzero(zero[:-1] & ~zero[1:]) + 1
+    if len(starts) > _LEAST_FILLED:
+        ends = ends[ends > starts[0]]
+        before, after = values[starts[: len(ends)]], values[ends]
+        # What passes through zero, or has steps about it, is near it before or after.
+        step = np.maximum(np.abs(after - before), np.min(np.diff(np.unique(values))))
+        filled = np.minimum(np.abs(before), np.abs(after)) > _JUMPS * step
+        if np.sum(filled) > max(_LEAST_FILLED, 0.5 * len(filled)):
+            none |= zero
+    return none
 
 
 def held_rows(values: np.ndarray) -> np.ndarray | None:

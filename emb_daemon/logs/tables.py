@@ -4,6 +4,7 @@ import contextlib
 import csv
 import hashlib
 import io
+import itertools
 import re
 import sys
 from datetime import UTC, datetime
@@ -15,9 +16,9 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs import arrays
-from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack_gzip
+from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack
 from emb_daemon.logs.stamps import LATEST_S, in_time
-from emb_daemon.wire.units import UNITS
+from emb_daemon.wire.units import UNITS, known_as, stated_in
 
 if TYPE_CHECKING:
     from emb_daemon.logs.mapping import Time
@@ -38,14 +39,16 @@ _PREAMBLE, _UNITS = 60, 3
 _MOST_ODD, _FEW_WORDS = 0.01, 3
 #: A time of day with parts of a second, or minutes and seconds, after a date or none; pyarrow reads ISO 8601.
 _CLOCK = re.compile(
-    r"(?:(?P<date>\d{1,4}[./-]\d{1,2}[./-]\d{1,4}),?[ T])?"
-    r"(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?"
+    r"(?:(?P<date>\d{1,4}[./-](?:\d{1,2}|[A-Za-z]{3})[./-]\d{1,4}),?[ T])?"
+    r"(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?"
 )
 #: A number with thousands separators or a decimal comma; separators that are never decimal.
 _GROUPED, _SPACES = re.compile(r"[+-]?\d[\d.,'’\s]*(?:[eE][+-]?\d+)?"), re.compile(r"['’\s]")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
-#: Number of months in a year, and of digits of a year at the beginning of a date.
-_MONTHS, _YEAR = 12, 4
+#: Months as tools abbreviate them, and number of digits of a year at the beginning of a date.
+_MONTHS, _YEAR = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"], 4
+#: Keys in a column's metadata: of its unit, and of the decimal comma of its table.
+_UNIT, _DECIMAL = b"unit", b"decimal comma"
 #: Name of a column by its number.
 _BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -69,8 +72,10 @@ _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
 
-def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
-    """Times (int64 ns) and values of the named columns or channels, and the SHA-256 of the file.
+def read_table(
+    path: Path, names: list[str], time: "Time | None"
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, str], str]:
+    """Times (int64 ns) and values of the named columns or channels, the units that the file states of them, and its SHA-256.
 
     Args:
         time: `logs.mapping.Time`, the column of times of a table; None for a measurement.
@@ -80,13 +85,13 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
     """
     raw = read_file(path)
     ending = log_ending(path)
-    content, digest = unpack_gzip(path, raw), hashlib.sha256(raw).hexdigest()
+    content, digest = unpack(path, raw), hashlib.sha256(raw).hexdigest()
     if bag := next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), ""):
         raise InputError(f"{path}: is {bag}, which is not read; expected what it holds as CSV, Parquet or .mat")
     begins = ending_of_content(content)
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
     if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):
-        return _channels(path, content, names), digest
+        return *_channels(path, content, names), digest
     if begins or ending in _FRAMES:
         tables, measurements = ", ".join(_TABLES), ", ".join(_MEASUREMENTS)
         raise InputError(f"{path}: expected a table ({tables}) or a measurement ({measurements}): no dbc")
@@ -98,10 +103,11 @@ def read_table(path: Path, names: list[str], time: "Time | None") -> tuple[dict[
     if time.name is not None:
         table = _table(path, content, ending, [time.signal, time.name, time.value])
         parts = {name: table.filter(_named(path, table[time.name], name)) for name in names}
-        return {name: _in_time(f"{path}: {name}", part, [time.value], time) for name, part in parts.items()}, digest
+        return {name: _in_time(f"{path}: {name}", part, [time.value], time) for name, part in parts.items()}, {}, digest
     table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
     stamps, *columns = _in_time(f"{path}", table, names, time)
-    return {name: (stamps, values) for name, values in zip(names, columns, strict=True)}, digest
+    units = {field.name: field.metadata[_UNIT].decode() for field in table.schema if _UNIT in (field.metadata or {})}
+    return {name: (stamps, values) for name, values in zip(names, columns, strict=True)}, units, digest
 
 
 def _named(path: Path, column, name: str):
@@ -142,6 +148,9 @@ def _seconds(path: str, table, time) -> np.ndarray:
     # Times of a clock are in seconds already.
     if is_clock:
         return times
+    stated = stated_in(time.signal) or (table.schema.field(time.signal).metadata or {}).get(_UNIT, b"").decode()
+    if stated and time.rate_Hz is None and UNITS[stated] != UNITS[time.unit]:
+        print(f"{path}: {time.signal} says {stated} and is taken in {time.unit}: which is right?", file=sys.stderr)
     return times * UNITS[time.unit][1] if time.rate_Hz is None else times / time.rate_Hz
 
 
@@ -188,7 +197,7 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
             count = table.column_names.count(name)
             there = f"{count} such columns, of which `column N` is one by its place" if count else "no such column"
             raise InputError(f"{path}: {name}: {there}; the table has {_some(name, table.column_names)}")
-    return pyarrow.table({name: table.column(place) for name, place in found.items()})
+    return table.select(list(found.values())).rename_columns(list(found))
 
 
 def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
@@ -243,8 +252,10 @@ def _column(values: np.ndarray | list):
 
 def _place(name: str, names: list[str]) -> int | None:
     """Index of a column among a table's ``names``, by name or by number; None if there is none, or several."""
-    if names.count(name) == 1:
-        return names.index(name)
+    # A blank that breaks no line looks like any other.
+    alike = [" ".join(known.split()) for known in names] if name not in names else names
+    if alike.count(name) == 1:
+        return alike.index(name)
     place = _BY_PLACE.fullmatch(name)
     return int(place[1]) - 1 if place and int(place[1]) <= len(names) else None
 
@@ -259,7 +270,7 @@ def _is_clock(column) -> bool:
 
     if pyarrow.types.is_string(column.type):
         return any(cell and _CLOCK.fullmatch(cell.strip()) for cell in column.slice(0, _PREAMBLE).to_pylist())
-    return pyarrow.types.is_timestamp(column.type) or pyarrow.types.is_time(column.type)
+    return any(test(column.type) for test in (pyarrow.types.is_timestamp, pyarrow.types.is_time, pyarrow.types.is_duration))
 
 
 def _numbers(path: str, table, name: str) -> np.ndarray:
@@ -272,15 +283,22 @@ def _numbers(path: str, table, name: str) -> np.ndarray:
         return 1e-9 * column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64()).to_numpy()
     if pyarrow.types.is_time(column.type):
         return 1e-9 * column.cast(pyarrow.time64("ns")).cast(pyarrow.int64()).to_numpy()
+    if pyarrow.types.is_duration(column.type):
+        return 1e-9 * column.cast(pyarrow.duration("ns")).cast(pyarrow.int64()).to_numpy()
     if not pyarrow.types.is_string(column.type):
         try:
             return column.cast(pyarrow.float64(), safe=False).to_numpy()
         except pyarrow.ArrowException:
             raise InputError(f"{path}: {name}: expected a column of numbers, found {column.type}") from None
     cells = column.to_pylist()
-    texts = _ungrouped([cell if cell is None else cell.strip() for cell in cells])
+    # Typesetters have a minus of their own.
+    decimal_comma = _DECIMAL in (table.schema.field(name).metadata or {})
+    texts = _ungrouped(
+        [cell if cell is None else cell.strip().replace("\N{MINUS SIGN}", "-") for cell in cells], decimal_comma
+    )
     dates = [found["date"] for text in texts if text and (found := _CLOCK.fullmatch(text)) and found["date"]]
-    day_first = any(int(re.split("[./-]", date)[0]) > _MONTHS for date in dates) or any("." in date for date in dates)
+    # After a number the name of a month, as a point, tells that it is the day's.
+    day_first = any(re.search("[.A-Za-z]", date) or int(re.split("[/-]", date)[0]) > len(_MONTHS) for date in dates)
     values = np.array([_number(text, day_first) for text in texts])
     odd = [row for row in np.flatnonzero(np.isnan(values)).tolist() if cells[row] is not None]
     if not odd:
@@ -293,8 +311,9 @@ def _numbers(path: str, table, name: str) -> np.ndarray:
     return values
 
 
-def _ungrouped(cells: list[str | None]) -> list[str | None]:
-    """A column's numbers without thousands separators and with a decimal point; other texts unchanged."""
+def _ungrouped(cells: list[str | None], decimal_comma: bool) -> list[str | None]:
+    """A column's numbers without thousands separators and with a decimal point, other texts unchanged; ``decimal_comma`` of a
+    table with such."""
     numbers = [cell for cell in cells if cell and _GROUPED.fullmatch(cell)]
     both = next((cell for cell in numbers if "," in cell and "." in cell), None)
     if both is not None:
@@ -302,11 +321,14 @@ def _ungrouped(cells: list[str | None]) -> list[str | None]:
     else:
         commas = [cell for cell in numbers if "," in cell]
         group = "," if commas and all(map(_THOUSANDS.fullmatch, commas)) else "."
+        points = [cell for cell in numbers if "." in cell]
+        # No thousands begin with a zero.
+        grouped = decimal_comma and not commas and all(re.fullmatch(r"[+-]?[1-9]\d{,2}(\.\d{3})+", cell) for cell in points)
 
     def plain(cell: str) -> str:
         text = _SPACES.sub("", cell)
-        # A single point is a decimal point.
-        return (text.replace(group, "") if both or group == "," else text).replace(",", ".")
+        # A single point is a decimal point, unless the table's other decimals are commas.
+        return (text.replace(group, "") if both or group == "," or grouped else text).replace(",", ".")
 
     return [plain(cell) if cell and _GROUPED.fullmatch(cell) else cell for cell in cells]
 
@@ -321,7 +343,7 @@ def _number(cell: str | None, day_first: bool) -> float:
         found = _CLOCK.fullmatch(cell)
     if not found:
         return np.nan
-    hours, minutes, seconds = (float((found[part] or "0").replace(",", ".")) for part in ("h", "m", "s"))
+    hours, minutes, seconds = (float(re.sub("[,:]", ".", found[part] or "0")) for part in ("h", "m", "s"))
     if found["half"]:
         hours = hours % 12.0 + 12.0 * (found["half"] in "Pp")
     of_day = 3600.0 * hours + 60.0 * minutes + seconds
@@ -330,7 +352,8 @@ def _number(cell: str | None, day_first: bool) -> float:
     parts = re.split("[./-]", found["date"])
     year, month, day = parts if len(parts[0]) == _YEAR else (parts[2], *(parts[1::-1] if day_first else parts[:2]))
     try:
-        return of_day + datetime(int(year), int(month), int(day), tzinfo=UTC).timestamp()
+        number = int(month) if month.isdigit() else _MONTHS.index(month.lower()) + 1
+        return of_day + datetime(int(year), number, int(day), tzinfo=UTC).timestamp()
     except ValueError:
         return np.nan
 
@@ -402,7 +425,8 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
     texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
     # A comma that does not separate is decimal; it may occur for the first time after many rows.
-    if delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell):
+    commas = delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell)
+    if commas:
         table = read(",")
     if len(odd) > table.num_rows:
         raise InputError(
@@ -411,7 +435,13 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         )
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
-    return table
+    stated = [next(filter(None, map(known_as, column)), "") for column in zip(*rows[:units], strict=False)]
+    marks = {_DECIMAL: b","} if commas else {}
+    fields = [
+        field.with_metadata(marks | ({_UNIT: unit} if unit else {}))
+        for field, unit in itertools.zip_longest(table.schema, stated[: table.num_columns], fillvalue="")
+    ]
+    return pyarrow.Table.from_arrays(table.columns, schema=pyarrow.schema(fields))
 
 
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
@@ -452,8 +482,9 @@ def _as_utf8(content: bytes, names: list[str]) -> bytes:
     in which the columns' ``names`` stand in it, and otherwise Latin-1."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", errors="replace").encode()
-    if content[1:_MARK:2].count(0) > 0.9 * len(content[1:_MARK:2]) > 0.0:
-        return content.decode("utf-16-le", errors="replace").encode()
+    for first, order in ((1, "le"), (0, "be")):
+        if content[first:_MARK:2].count(0) > 0.9 * len(content[first:_MARK:2]) > 0.0:
+            return content.decode(f"utf-16-{order}", errors="replace").encode()
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -486,7 +517,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
     line = line.lstrip("#%")
     if delimiter == " ":
         line = " ".join(line.split())
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
 def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
@@ -542,7 +573,8 @@ def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
     return places[0]
 
 
-def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _channels(path: Path, content: bytes, names: list[str]) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, str]]:
+    """Times and values of a measurement's channels, and their units."""
     try:
         from asammdf import MDF
     except ImportError as error:
@@ -550,14 +582,14 @@ def _channels(path: Path, content: bytes, names: list[str]) -> dict[str, tuple[n
     try:
         with MDF(io.BytesIO(content)) as file:
             start_ns = round(1e9 * file.header.start_time.timestamp())
-            found = {}
+            found, units = {}, {}
             for name in names:
                 signal = file.get(None, *_group_and_index(path, file, name))
                 values = np.asarray(signal.samples).astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
                 stamps, rows = in_time(f"{path}: {name}", stamps, [values])
-                found[name] = (stamps, values[rows])
-            return found
+                found[name], units[name] = (stamps, values[rows]), signal.unit
+            return found, units
     except InputError:
         raise
     except Exception as error:

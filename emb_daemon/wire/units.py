@@ -49,7 +49,12 @@ TRAVELS = ("m", "cm", "mm", "um", "µm", "in", "m/s", "cm/s", "mm/s", "mm/min", 
 def stated_in(name: str) -> str:
     """The unit that a column's name ends with, in brackets or parentheses, as `UNITS` spells it; empty if it states none."""
     found = _IN_NAME.search(name)
-    unit = found[1] or found[2] if found else ""
+    return known_as(found[1] or found[2] if found else "")
+
+
+def known_as(unit: str) -> str:
+    """A unit as `UNITS` spells it, also from brackets or parentheses; empty if it is none of them."""
+    unit = unit.strip(" []()")
     return unit if unit in UNITS else _SPELLINGS.get(unit.lower(), "")
 
 

@@ -106,7 +106,7 @@ def identify(
     if beyond > _TOLD:
         campaign.fault(
             f"curves: no log clamps harder than {1e-3 * stiffness.reached_N:.3g} of {1e-3 * rated:.3g} kN, and a cubic that "
-            f"goes on leaves {100.0 * beyond:.2g} % of the largest force unsure; sigma holds that share of any force; "
+            f"goes on leaves {100.0 * beyond:.3g} % of the largest force unsure; sigma holds that share of any force; "
             "needed: a slow clamp to the largest force"
         )
     levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
