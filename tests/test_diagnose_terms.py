@@ -85,7 +85,7 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
 
 
 def test_what_friction_does_as_it_turns_over_makes_no_term(calibration):
-    """A motor that holds just behind a reversal holds with a friction that no model knows, in each stop. Where nothing is hidden
+    """A motor that holds just behind a reversal holds with a friction that no model knows, in each stop: with nothing hidden
     what follows braking gains far less than what matters."""
     frames = next(drives(calibration, 1001, {}, stops=25, drive=campaign))
     bench = Bench([log_of(frames)], calibration)
