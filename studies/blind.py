@@ -27,9 +27,8 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose import search
 from emb_daemon.diagnose.diagnosis import Diagnosis, diagnose
 from emb_daemon.diagnose.evidence import Averaging
-from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.model import LASTING, Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
-from emb_daemon.diagnose.selection import LASTING
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse

@@ -180,6 +180,11 @@ def test_means_are_of_as_many_samples_as_asked_for():
     np.testing.assert_allclose(means.per_mean**-2, [3, 3, 1, 3, 1])
     column = np.arange(11.0)
     np.testing.assert_allclose((means.of(column[:, None])[:, 0] * means.per_mean), [1.0, 4.0, 6.0, 8.0, 10.0])
+    # Samples that do not tell have no share in them, and where none does there is nothing.
+    told = np.isin(column, (0.0, 3.0, 4.0, 6.0, 7.0, 8.0))
+    some = Averaging(np.repeat([0, 1], [7, 4]), 3, told)
+    np.testing.assert_allclose(some.per_mean[:4] ** -2, [1, 2, 1, 2])
+    np.testing.assert_allclose((some.of(column[:, None])[:, 0] * some.per_mean), [0.0, 3.5, 6.0, 7.5, 0.0])
 
 
 def test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut():

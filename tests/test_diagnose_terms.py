@@ -84,6 +84,19 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
     assert best.form.memory_scale == pytest.approx(7.0, rel=0.4)
 
 
+def test_what_friction_does_as_it_turns_over_makes_no_term(calibration):
+    """A motor that holds just behind a reversal holds with a friction that no model knows, in each stop: with nothing hidden
+    what follows braking gains far less than what matters."""
+    frames = next(drives(calibration, 1001, {}, stops=25, drive=campaign))
+    bench = Bench([log_of(frames)], calibration)
+    start = Model.of(bench)
+    model = start.refined(["torque"])
+    search = Search(model, "torque", grammar._signals(model))
+    braking = [f for f in search.forms if f.port == "gear_friction" and f.signal in ("brake_torque", "time_clamped")]
+    gains = search._find_gains(braking)
+    assert model.rms(gains.max(), "torque") < 0.5 * Screening(bench, start).floor(model, "torque", made=True)
+
+
 def test_two_signals_that_multiply_are_seen_as_both(calibration):
     """A gear whose friction rises for seconds with the force, more on a faster disc: neither explains it alone."""
     of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}

@@ -93,14 +93,16 @@ _BASE = (
 #: Factor by which units, wear and temperature change a parameter at most that was identified; beyond it something else looks
 #: like it. Torque constant: suppliers grant a tenth, and 80 K more take as much from magnets (0.12 %/K). Inertia: masses stay
 #: what they are, datasheets grant 15 %. Friction: greased screws have a coefficient of 0.05 to 0.2, about 0.1, and grease in
-#: the frost drags several times as much. Pads: 0.2 faded, 0.5 new, about 0.35. Disc: it may lose a tenth of its mass, and iron
-#: takes up a tenth more per 100 K.
+#: the frost drags several times as much. Pads: 0.2 faded, 0.5 new, about 0.35; another compound softens half or
+#: twice as much. Disc: it may lose a tenth of its mass, and iron takes up a tenth more per 100 K.
 TOLERATED: dict[str, float] = {
     TORQUE_CONSTANT: 1.1,
     INERTIA: 1.15,
     LOAD_FRICTION: 2.0,
     OFFSET_FRICTION: 4.0,
     "thermal.friction.coefficient": 2.0,
+    "thermal.softening.per_K": 2.0,
+    "thermal.softening.history_per_K": 2.0,
     "thermal.disc.heat_capacity_J_per_K": 1.25,
 }
 #: The same of a torque constant that nobody has measured: a gear's loss takes up to a fifth of it, and suppliers count

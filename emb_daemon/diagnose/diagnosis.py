@@ -19,11 +19,11 @@ from emb_daemon.diagnose.comparison import comparison, errors, whole
 from emb_daemon.diagnose.confirmation import confirm, harm, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
-from emb_daemon.diagnose.model import Model, rms_known
+from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
-from emb_daemon.diagnose.selection import LASTING, Progress, Selection
+from emb_daemon.diagnose.selection import Progress, Selection
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond, least_dependence
 from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect

@@ -17,22 +17,24 @@ class Averaging:
 
     Attributes:
         episode: of each mean.
+        told: one for each sample that counts, else zero, shape (N,).
         per_mean: what makes a weighted mean of a sum, and a plain mean of a weighted one, shape (means,).
     """
 
-    def __init__(self, episode: np.ndarray, samples: int):
-        """``episode`` (N,) ascending; ``samples`` in a run."""
+    def __init__(self, episode: np.ndarray, samples: int, told: np.ndarray | None = None):
+        """``episode`` (N,) ascending; ``samples`` in a run, of which those that are ``told`` (N,) count, or all."""
         index = np.arange(len(episode))
         begins = np.flatnonzero(np.diff(episode, prepend=-1))
         within = index - begins[np.searchsorted(begins, index, side="right") - 1]
         self._starts = np.flatnonzero(within % samples == 0)
-        counts = np.diff(np.append(self._starts, len(episode)))
-        self.per_mean: np.ndarray = 1.0 / np.sqrt(counts)
+        self.told: np.ndarray = np.ones(len(episode)) if told is None else told.astype(float)
+        counts = np.add.reduceat(self.told, self._starts)
+        self.per_mean: np.ndarray = np.divide(1.0, np.sqrt(counts), out=np.zeros_like(counts), where=counts > 0.0)
         self.episode: np.ndarray = episode[self._starts]
 
     def of(self, columns: np.ndarray) -> np.ndarray:
         """Weighted means of columns (N, k)."""
-        return np.add.reduceat(columns, self._starts, axis=0) * self.per_mean[:, None]
+        return np.add.reduceat(columns * self.told[:, None], self._starts, axis=0) * self.per_mean[:, None]
 
 
 @dataclass(frozen=True)

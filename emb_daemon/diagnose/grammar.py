@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LITTLE, TOLERANCE, Model
+from emb_daemon.diagnose.model import LASTING, LITTLE, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -32,7 +32,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, Candidate
-from emb_daemon.diagnose.selection import LASTING, TOO_LARGE, Selection, find_known, one_round, settle_heat
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import MOST, PORTS, SIGNALS

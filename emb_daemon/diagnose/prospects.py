@@ -14,10 +14,10 @@ from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.diagnose.coordinates import Coordinate, Move
 from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
-from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.model import LASTING, Model
 from emb_daemon.diagnose.orders import strongest_orders
 from emb_daemon.diagnose.residuals import SIDE_BY_SIDE, Bench, Probe
-from emb_daemon.diagnose.selection import LASTING, NOT_OF_A_FREE_MOTOR
+from emb_daemon.diagnose.selection import NOT_OF_A_FREE_MOTOR
 from emb_daemon.diagnose.signals import OF_A_BRAKE
 from emb_daemon.diagnose.unexplained import sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
@@ -75,7 +75,7 @@ class Screen:
         self.model = model
         self.channel = channel
         bench = model.bench
-        self.means: Averaging = Averaging(bench.episode[channel], samples)
+        self.means: Averaging = bench.means(channel, samples)
         self._bounds = np.searchsorted(self.means.episode, np.arange(bench.episodes + 1))
         own = model.own(channel)
         penalty = model.penalty(own, channel) + 1e-12
@@ -488,4 +488,6 @@ def description_length(left: Any, numbers: Any, episodes: int) -> Any:
 
 def noise_left(model: Model, channel: str, samples: int) -> float:
     """Squared error that no term explains, of means over ``samples``."""
-    return model.counted(channel) * sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1)) ** 2 / samples
+    residual = model.residual[channel]
+    counted = np.count_nonzero(residual * model.bench.means(channel, samples).told)
+    return counted * sample_noise(residual, SIDE_BY_SIDE.get(channel, 1)) ** 2 / samples

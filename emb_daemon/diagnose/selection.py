@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
-from emb_daemon.diagnose.model import Model, is_shape
+from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
@@ -30,10 +30,6 @@ _UNSURE, _LARGE = 0.05, 0.25
 #: Standard deviations by which amplitudes must be clear of nothing where they gain too little to matter.
 _CARRIED = 2.0
 
-#: Samples over which residuals are averaged before a term is held against them, by channel. What a term of the torque path
-#: does lasts longer than an eighth of a second. What is shorter there is how friction turns over, which the calibration's
-#: noise states (`noise.presliding`); on simulated brakes with nothing hidden it alone brought false terms of 70 to 120 N.
-LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32, "temperature": 1}
 #: Port at which nothing is looked for of a motor that turns free: a constant that falls with the current would explain any
 #: current, friction's above all.
 NOT_OF_A_FREE_MOTOR = "torque_constant"
