@@ -247,6 +247,13 @@ def test_noise_and_what_no_motor_shows_that_stands_are_no_offset():
     assert a["offset"] == 0.0
 
 
+def test_a_speed_that_an_old_angle_does_not_show_yet_is_no_offset():
+    a, rng = np.zeros(1, LATENESS)[0], np.random.default_rng(5)
+    for _ in range(100):
+        _stand(a, np.concatenate((0.3 * rng.standard_normal(100), [4.0, 10.0, 18.0])))
+    assert a["offset"] == 0.0
+
+
 def test_noise_of_the_speed_is_no_filter():
     """Both what is apart and what the speed gains contain it."""
     a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=30.0)

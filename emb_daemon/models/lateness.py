@@ -74,6 +74,10 @@ def stand(a: Record, speed: float, noise: float) -> bool:
     """Take the ``speed`` rad/s of a motor whose angle stays where it is; ``noise`` rad/s of one.
 
     Returns whether the speed's offset is found to be another, which is taken off from the next sample on."""
+    if abs(a.stood * speed - a.standing) > _CERTAIN * noise * sqrt(a.stood * (a.stood + 1.0)):
+        # It has begun to turn, beside an angle that is late, or the offset is another.
+        a.standing = a.stood = 0.0
+        return False
     a.standing += speed
     a.stood += 1.0
     mean = a.standing / a.stood
