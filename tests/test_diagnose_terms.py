@@ -261,7 +261,7 @@ def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_i
     def fitted(each):
         return SimpleNamespace(
             left_out=lambda *_, **__: np.full(40, each), counted=lambda _: 40, residual={channel: np.ones(40)},
-            bench=SimpleNamespace(episodes=40),
+            bench=SimpleNamespace(episodes=40, means=lambda *_: SimpleNamespace(told=np.ones(40))),
         )  # fmt: skip
 
     bare = SimpleNamespace(model=fitted(100.0), screening=SimpleNamespace(floor=lambda *_, **__: 2.0))
