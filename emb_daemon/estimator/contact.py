@@ -79,7 +79,8 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     turned = 0.5 * (m.speed + s.speed) * m.dt
     slip = jump - turned
-    unsure = _SLIP_DELAY_S * abs(m.speed - s.speed) + SLIP_RAD
+    # A speed that was late is as far off as one that went through the filter that is undone in its place.
+    unsure = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed) + SLIP_RAD
     behind = s.behind
     _stay_behind(s, m, jump, turned)
     if s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind)):

@@ -37,6 +37,9 @@ _BEYOND_RAD = 0.1
 #: Least and largest time constant of the speed's filter, s: a speed that is the mean of its cycle is half a cycle old, as it
 #: was at calibration; through more than twelve cycles a stroke is not seen.
 _WORTH_S, SLOWEST_S = 0.5 * CYCLE_S, 12.0 * CYCLE_S
+#: Standard deviation of an age from which a filter is sought, s, and as a share of the age: as a stroke begins, a speed that
+#: is late does not follow at all, as through any filter.
+_CLEAR_S, _CLEAR = 2.5e-4, 0.04
 #: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
 #: offset, and largest offset, rad/s: a motor that went faster for as long would have gone a turn. Samples over which an offset
 #: is refined, to a hundredth of the noise.
@@ -50,10 +53,12 @@ _SS, _SW, _WW, _AS, _AW, _SUMS = 0, 1, 2, 3, 4, 5
 #: leads the speed of late, or lags it if negative, if that is certain, or 0. ``filtered`` s: time constant of the speed's
 #: filter, which is undone; ``reported`` rad/s: the last speed as it came. ``offset`` rad/s of it, which is taken off, a
 #: mean of ``known`` samples, and what a standing motor shows beside: ``standing`` rad/s, the sum over ``stood`` samples.
+#: ``interrupted``: the last sample was not followed.
 LATENESS = np.dtype(
     [
         *((name, "f8", (_SUMS,)) for name in ("sums", "recent")),
         *fields("f8", "apart gained gone age gain ahead filtered reported offset known standing stood"),
+        ("interrupted", "?"),
     ],
     align=True,
 )
@@ -97,6 +102,10 @@ def stand(a: Record, speed: float, noise: float) -> bool:
 def follow(a: Record, travel: float, turned: float, gained: float, noise: float, dt: float) -> None:
     """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s; ``noise``
     rad/s of the speed."""
+    if a.interrupted:
+        # An angle that has caught up has gone further than its speed says.
+        a.interrupted = False
+        return
     keep = exp(-dt / _FOLLOWED_S)
     a.apart = keep * a.apart + travel - turned
     a.gained = keep * a.gained + gained
@@ -114,7 +123,7 @@ def follow(a: Record, travel: float, turned: float, gained: float, noise: float,
     _add(a.recent, min(old, variance / (_PRECISE_S * _PRECISE_S) / max(a.recent[_SS], 1.0)), a.apart, a.gained, a.gone)
     # Of a filter nothing is known before.
     age, age_sigma, _, _ = _solve(a.recent, variance, SLOWEST_S)
-    a.ahead = -age if abs(age) > _WORTH_S + _SURELY * age_sigma else 0.0
+    a.ahead = -age if abs(age) > _WORTH_S and age_sigma < max(_CLEAR_S, _CLEAR * abs(age)) else 0.0
 
 
 @njit
@@ -145,10 +154,9 @@ def find_filter(a: Record) -> bool:
         return False
     # All that was followed so far was beside another speed.
     a.filtered = filtered
-    a.age = a.gain = a.ahead = 0.0
+    a.age = a.gain = a.ahead = a.apart = a.gained = a.gone = 0.0
     for i in range(len(a.sums)):
         a.sums[i] = a.recent[i] = 0.0
-    interrupt(a)
     return True
 
 
@@ -156,3 +164,4 @@ def find_filter(a: Record) -> bool:
 def interrupt(a: Record) -> None:
     """Begin to follow anew after a missing sample or a standstill."""
     a.apart = a.gained = a.gone = 0.0
+    a.interrupted = True
