@@ -384,3 +384,33 @@ def test_an_offset_of_the_speed_is_no_zero_that_wanders(offset, seed):
     assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(as_it_is**2)) + 15.0
     assert np.median(estimates["sigma"][500:]) < 1.2 * np.median(unmoved["sigma"][500:])
     assert not np.any(estimates["reasons"][500:] & OUT_OF_RANGE)
+
+
+def test_an_offset_that_begins_in_a_brake_that_clamps_is_taken_off_once_it_is_released():
+    """Until then it may be an angle that drifts, which is told."""
+
+    def change(rows):
+        rows["speed"][1400:] -= 2.0
+
+    estimates, force = city.changed(change, 0, 40.0)
+    assert np.any(estimates["reasons"][1400:2100] & OUT_OF_RANGE)
+    second = slice(city.SECOND_CLEARANCE, None)
+    assert not np.any(estimates["reasons"][second] & OUT_OF_RANGE)
+    assert np.mean(np.abs(estimates["force"] - force)[second] > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])
+def test_an_angle_that_is_frozen_while_the_motor_closes_slowly_is_no_offset_of_the_speed(parameters, speed):
+    """Else kilonewtons would come of which nothing is said."""
+    p = brake.ideal(parameters)
+    touching = brake.stops(p, 2)
+    clamped = float(p["clearance"]) + 6.0
+    closing = np.concatenate((touching, np.zeros(250), np.linspace(0.0, clamped, 500), np.full(250, clamped)))
+    frozen = len(closing)
+    rows, force = brake.samples(p, np.concatenate((closing, clamped + speed * _DT * np.arange(int(4.0 / speed / _DT)))))
+    rows = brake.noisy(rows, p)
+    rows["angle"][frozen:] = rows["angle"][frozen]
+    estimates = estimate(rows, p.reshape(1))[frozen:]
+    error = np.abs(estimates["force"] - force[frozen:])
+    told = estimates["reasons"] != 0
+    assert np.flatnonzero(told)[0] * _DT < 2.0 and np.max(error[~told]) < 600.0 and error[-1] > 2.0 * np.max(error[~told])

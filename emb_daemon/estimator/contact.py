@@ -107,6 +107,18 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
 
 
 @njit
+def _nobody_brakes(m):
+    return m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
+
+
+@njit
+def at_rest(s: Record, m: Record) -> bool:
+    """Whether nothing asks the motor to turn, so that one whose angle stays does stand: pads apart, and nobody brakes. While
+    it clamps, the motor may turn slowly beside an angle that is frozen."""
+    return _nobody_brakes(m) and s.past_contact < 0.0
+
+
+@njit
 def _stay_behind(s, m, jump, turned):
     """Keep the way (rad) by which an angle that repeats is behind; ``jump`` and ``turned`` rad are what this sample adds to
     the angle and by the speed."""
@@ -129,9 +141,10 @@ def _drift(s, m, slip, turned):
         s.drifted += slip
         s.stood_s += m.dt
     if abs(s.drifted) > _unaccounted(s, s.stood_s):
-        if s.plausibility.held * CYCLE_S < s.stood_s - ONE_CYCLE_S:
+        stays = s.plausibility.held * CYCLE_S >= s.stood_s - ONE_CYCLE_S
+        if not (stays and (s.unknown or at_rest(s, m))):
             return s.drifted
-        # An angle that stays where it is does not drift: the speed has an offset.
+        # An angle that stays where it is does not drift: the speed has an offset. Of an unknown contact nothing is lost.
         s.drifted = s.stood_s = 0.0
         s.strayed = np.nan
     moved = 0.0
@@ -166,7 +179,7 @@ def _unaccounted(s, seconds):
 def seek_release(s: Record, p: Record, m: Record) -> None:
     """Contact is unknown until the brake has been observed released: no brake request, park brake off, the motor standing
     without torque. The clearance counts from there. A latched brake needs no current either."""
-    released = m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
+    released = _nobody_brakes(m)
     s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force

@@ -10,7 +10,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.contact import SPEED_MARGIN, follow_zero, seek_release, watch_contact
+from emb_daemon.estimator.contact import SPEED_MARGIN, at_rest, follow_zero, place_contact, seek_release, watch_contact
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
@@ -50,7 +50,7 @@ from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter
-from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, disbelieve_resolver, frozen, watch
+from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resolver, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.models.wander import STANDING_RAD_PER_S, forget_wander, leave_stretch, watch_wander
@@ -221,10 +221,15 @@ def _follow_noise(s, p, m):
     """How noisy the speed is, and how far it is off: a motor that stands has none."""
     if s.plausibility.held > _HELD and m.angle == s.angle:
         s.speed_square += min(m.dt / _NOISE_S, 1.0) * (s.speed * s.speed - s.speed_square)
-        watched = s.plausibility.verdict == AGREE and p.clearance_sigma > 0.0
-        if watched and stand(s.lateness, m.speed, s.speed_sigma):
+        believed = s.plausibility.verdict == AGREE or s.drifting_s > 0.0
+        if believed and p.clearance_sigma > 0.0 and at_rest(s, m) and stand(s.lateness, m.speed, s.speed_sigma):
             s.strayed = np.nan
             forget_wander(s.wander)
+            if s.drifting_s > 0.0:
+                # The zero has not drifted: the contact counts anew from the released position, in which the motor stands.
+                s.drifting_s = 0.0
+                believe_resolver(s.plausibility)
+                place_contact(s, p, m.angle)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
 
 

@@ -118,8 +118,7 @@ def watch(
         c.frozen_s += m.dt
         if c.alike >= _RETURNED:
             # The sum was the resolver's fault, and must not count against the current.
-            c.contradiction = c.apart = c.frozen_s = 0.0
-            c.verdict = AGREE
+            believe_resolver(c)
         return c.verdict
     patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
     disagree = c.contradiction > (patience * _RAISE if was == AGREE else _CLEAR)
@@ -220,6 +219,13 @@ def due(c: Record, acceleration: float, delay: float, dt: float) -> bool:
     c.due_speed = c.due_speed + lasting * dt if lasting > 0.0 else 0.0
     c.due_angle += c.due_speed * dt
     return c.due_angle - c.due_speed * delay > _DUE_RAD
+
+
+@njit
+def believe_resolver(c: Record) -> None:
+    """Use the resolver again: its fault is over, or was none."""
+    c.contradiction = c.apart = c.frozen_s = 0.0
+    c.verdict = AGREE
 
 
 @njit
