@@ -337,13 +337,15 @@ def test_an_unproven_jump_counts_in_sigma_and_is_said(p, clamped):
     assert out["sigma"] > 0.4 * 0.2 * 3500.0 > before and out["reasons"] & PATHS_DISAGREE
 
 
-def test_model_error_counts_in_sigma_and_is_said(p, clamped):
-    """What consistency cannot explain as noise: 500 N left at every horizon."""
+@pytest.mark.parametrize("share", [0.005, 0.03])
+def test_model_error_counts_in_sigma_and_is_said_where_it_matters(p, clamped, share):
+    """What consistency cannot explain as noise, at every horizon: shares of the largest force."""
     state, row, before = clamped
-    c = state["consistency"]
-    c["seen_s"], c["square"], c["expected"] = 1000.0, 500.0**2, 1.0
+    c, left = state["consistency"], share * p["maximum_force"]
+    c["seen_s"], c["square"], c["expected"] = 1000.0, left**2, 1.0
     out = estimate(row, p, state)[0]
-    assert out["sigma"] == pytest.approx(np.hypot(before, 500.0), rel=0.1) and out["reasons"] & PATHS_DISAGREE
+    assert out["sigma"] == pytest.approx(np.hypot(before, left), rel=0.1)
+    assert (out["reasons"] & PATHS_DISAGREE != 0) == (share > 0.01)
 
 
 @pytest.mark.parametrize("name", ["temperature_sigma", "history_sigma", "sigma"])

@@ -100,6 +100,9 @@ from emb_daemon.models.wheel import TURNING_RAD_PER_S
 _LEAST_GAIN, _OLD_S = 0.3, 0.05
 #: Share of the largest force by which an unproven jump must move the force to be reported.
 _NOTED = 0.003
+#: Share of the largest force from which a model error is reported. Sigma contains a smaller one, and is itself not reported
+#: from less than this.
+_NOTED_ERROR = 0.01
 #: Part of a sample by which current and angle may differ in time, in addition to the angle's delay, which changes friction
 #: with it.
 _LATE = 0.3
@@ -458,7 +461,8 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
     error = model_error(s.consistency) if out.force > 0.0 else 0.0
     if error > 0.0:
         out.sigma = hypot(out.sigma, min(error, out.force))
-        facts |= MODEL_ERROR
+        if error > _NOTED_ERROR * p.maximum_force:
+            facts |= MODEL_ERROR
     if c.verdict == STIFFNESS_WRONG:
         out.force, out.sigma = force, hypot(sigma, latched)
         return facts | RESOLVER_IMPLAUSIBLE | (NO_SOURCE if s.no_current_s > _OLD_S else 0)

@@ -39,7 +39,7 @@ TABLE = {
     "paths_contradict": Fact("the paths contradict each other, and either may be wrong", PATHS_DISAGREE, STIFFNESS_ONLY),
     "torque_old": Fact("the torque path has given no force for some time", 0, STIFFNESS_ONLY),
     "jump_suspected": Fact("contact, stiffness, friction or current offset may have jumped", PATHS_DISAGREE, FUSED),
-    "model_error": Fact("the residual is larger than noise explains", PATHS_DISAGREE, FUSED),
+    "model_error": Fact("over 1 % of the largest force is left that noise does not explain", PATHS_DISAGREE, FUSED),
     "offset_large": Fact("the offset of the motor torque exceeds a healthy current sensor's", PATHS_DISAGREE, FUSED),
     "disc_uneven": Fact("the disc may vary in thickness beyond the calibration", PATHS_DISAGREE, FUSED),
     "angle_late": Fact("motor angle and motor speed of a sample are over two cycles apart", PATHS_DISAGREE, FUSED),
