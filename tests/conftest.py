@@ -25,6 +25,12 @@ _FIRST = (
     "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
 )  # fmt: skip
 
+#: Fixtures that take so long that whoever asks for one is a trial.
+_LONG = {"compiled", "coupled", "identified"}
+
+#: Trials that this process, or its workers, leave out.
+_LEFT_OUT = pytest.StashKey[int]()
+
 #: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
 _COMPILE = """
 import sys
@@ -38,9 +44,31 @@ build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.a
 """
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if _LONG.intersection(item.fixturenames):
+            item.add_marker("trial")
     place = {name: row for row, name in enumerate(_FIRST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_deselected(items):
+    """Notes how many trials are left out; of several processes each collects all tests."""
+    config = items[0].config
+    config.stash[_LEFT_OUT] = config.stash.get(_LEFT_OUT, 0) + sum("trial" in item.keywords for item in items)
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["left_out"] = config.stash[_LEFT_OUT]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    node.config.stash[_LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", 0)
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    if left_out := config.stash.get(_LEFT_OUT, 0):
+        terminalreporter.write_line(f"{left_out} long trials were left out; make trials runs them")
 
 
 @pytest.fixture(scope="session")
