@@ -578,13 +578,7 @@ def test_pads_that_still_relax_do_not_hide_the_clearance():
     assert passed(0.0) and not passed(-2.0)
 
 
-@pytest.mark.parametrize(
-    ("change", "outcome"),
-    [
-        ({"high_rad": 9.0}, r.NOT_COVERED),
-        ({"seconds": 3.0}, r.TOO_FEW),
-    ],
-)
+@pytest.mark.parametrize(("change", "outcome"), [({"high_rad": 9.0}, r.NOT_COVERED), ({"seconds": 3.0}, r.TOO_FEW)])
 def test_poor_training_is_rejected(ideal, change, outcome):
     assert fit(trained_rows(ideal, **change), believed()).outcome == outcome
 

@@ -121,10 +121,7 @@ def test_report_is_one_file_that_fetches_nothing(identified):
         ("dbc: nowhere.dbc\n", "nowhere.dbc: no such file"),
         ("curves: []\n", "curves, random: no usable log; needed: slow clamp"),
         ("random:\n  - {log: gone.log}\n", r"random\[0\].log: .*gone.log: no such file"),
-        (
-            "thermal: {disc_cooling: [{log: gone.log, disc_turns_per_s: 1}]}\n",
-            r"disc_cooling\[0\].log: .*no such file",
-        ),
+        ("thermal: {disc_cooling: [{log: gone.log, disc_turns_per_s: 1}]}\n", r"disc_cooling\[0\].log: .*no such file"),
     ],
 )
 def test_unusable_campaigns_end_with_one_clear_line(rig, tmp_path, capsys, text, expected):
