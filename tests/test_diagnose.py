@@ -153,6 +153,7 @@ def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_
     assert not reasons[0] and reasons[1]
 
 
+@pytest.mark.trial
 def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_path(calibration):
     log = log_of(next(drives(calibration, 41, {"disc_thermal_expansion": {"growth_um_per_K": 0.4}})))
     samples = log.samples.copy()
