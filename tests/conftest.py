@@ -26,7 +26,7 @@ _FIRST = (
 )  # fmt: skip
 
 #: Fixtures that take so long that whoever asks for one is a trial.
-_LONG = {"compiled", "coupled", "identified"}
+_LONG = {"compiled", "coupled", "identified", "viscous"}
 
 #: Trials that this process, or its workers, leave out.
 _LEFT_OUT = pytest.StashKey[int]()

@@ -117,6 +117,7 @@ def test_a_misspelt_log_is_an_error(tmp_path, capsys):
     assert "curves[0].log: " in capsys.readouterr().err
 
 
+@pytest.mark.trial
 def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
     """The commands of the page, on the example that the first of them writes."""
     hour = _PAGE.read_text(encoding="utf-8").partition("## A first hour")[2].partition("\n1. ")[0]
