@@ -501,6 +501,7 @@ def test_a_log_is_known_by_how_it_begins(log, tmp_path, ending):
         assert np.array_equal(read_frames(tmp_path / name)["data"], frames["data"])
 
 
+@pytest.mark.trial
 def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path, monkeypatch):
     """402 s of a standing truck's J1939 bus (extended ids) as its logger wrote them. Nothing on it is a brake: a 16-bit signal
     of 10 Hz, whatever it means, is taken for our motor angle to see it arrive, sample by sample: nothing is invented between
