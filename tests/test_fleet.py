@@ -77,7 +77,7 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
-def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, calibration):
+def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, scheduler, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
     log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
@@ -90,7 +90,7 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, cal
     replay_drive(tmp_path / "fleet", half, calibration)
     assert len([name for name in _content(tmp_path / "fleet") if half.digest in name]) == 3
     log.write_bytes(text)
-    assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--workers", "1"]) == 0
+    assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--scheduler", scheduler]) == 0
     [drive] = dataset.drives(tmp_path / "fleet")
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
@@ -175,6 +175,7 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("lives", [0, 3])
 def test_workers_may_die(tmp_path, monkeypatch, lives):
     """Dask counts a worker's death against every task that lay there: only who kills one alone is given up."""

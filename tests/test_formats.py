@@ -492,7 +492,7 @@ def test_busmaster_logs_are_read_over_midnight_in_either_base(tmp_path, name, ba
         read_log(tmp_path / name)
 
 
-@pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", ".mf4", ".log"])
+@pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", pytest.param(".mf4", marks=pytest.mark.trial), ".log"])
 def test_a_log_is_known_by_how_it_begins(log, tmp_path, ending):
     frames = read_frames(log)[:400]
     write_frames(tmp_path / f"x{ending}", frames)

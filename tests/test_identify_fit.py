@@ -289,6 +289,7 @@ def test_a_loop_of_a_rubber_is_found():
         assert found.values[key] == pytest.approx(value, rel=0.05), key
 
 
+@pytest.mark.trial
 def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
     """As fitted, half of what tells two clamps apart would be in the error, and in sigma."""
     known = _one_curve()
