@@ -431,6 +431,7 @@ def test_a_force_that_must_not_be_left_is_asked_for_and_taught_from(tmp_path):
     assert loop.adaptation.last_outcome("FL") == "accepted"
 
 
+@pytest.mark.trial
 @pytest.mark.xfail(strict=True, reason="105 N on pads worn by 6 mm, 100 promised")
 def test_wear_over_a_thousand_park_cycles():
     """Simulated car; `python -m studies.adaptation wear` does it with more trainings, and the picture."""
