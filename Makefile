@@ -10,14 +10,14 @@ demo: $(READY)
 
 # As many processes as cores: threads of linear algebra beside them would only wait for each other.
 # Byte code is kept whatever the shell says, or a hundred processes would each translate the sources.
-PYTEST = OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4
+PYTEST = OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4 \
+	--dist loadfile --no-loadscope-reorder
 test: $(READY) lint
-	$(PYTEST) --dist loadfile --no-loadscope-reorder -m "not trial"
-	@echo "Left out: the long trials, which make trials runs."
+	$(PYTEST) -m "not trial"
 
-# Kernels compiled anew, and whole drives identified or diagnosed: minutes of one test each on a busy machine.
+# All kernels compiled ahead, whole campaigns identified, whole drives diagnosed. Each has a short form in make test.
 trials: $(READY)
-	$(PYTEST) --dist worksteal -m trial
+	$(PYTEST) -m trial
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)

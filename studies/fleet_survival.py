@@ -26,11 +26,7 @@ from studies.fleet import _calibration, day_drive
 _UNITS, _DAYS, _DAMAGED = 8, 5, 0.1
 _DAY_NS = 86_400_000_000_000
 #: What each stage leaves, and which of it counts its progress.
-_STAGES = {
-    "ingest": ("ingested/*.json",),
-    "replay": ("figures/**/*.json",),
-    "diagnose": ("evidence/**/*.npz",),
-}
+_STAGES = {"ingest": ("ingested/*.json",), "replay": ("figures/**/*.json",), "diagnose": ("evidence/**/*.npz",)}
 
 
 def write_logs(folder: Path, seed: int) -> int:

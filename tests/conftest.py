@@ -16,14 +16,21 @@ settings.load_profile("project")
 
 _ROOT = Path(__file__).parent.parent
 
-#: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache the
-#: first compiles the library, in which nothing of the cache helps, the other the estimator: neither does it twice.
+#: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache one
+#: compiles the estimator, the other the library (a trial), in which nothing of the cache helps, or the simulated car: neither
+#: does it twice.
 _FIRST = (
-    "test_ahead", "test_hypotheses", "test_diagnose_terms", "test_diagnose", "test_effects", "test_adapt", "test_fleet",
-    "test_diagnose_confirmation", "test_plant", "test_rig", "test_diagnose_model", "test_identify_command",
-    "test_foreign_rig_identify", "test_foreign_rig", "test_identify_fit", "test_formats", "test_browser", "test_reload",
-    "test_replay_report", "test_examples", "test_daemon", "test_identify_thermal",
+    "test_ahead", "test_hypotheses", "test_plant", "test_effects", "test_diagnose_terms", "test_blind", "test_diagnose",
+    "test_adapt", "test_fleet", "test_formats", "test_diagnose_confirmation", "test_identify_fit", "test_rig",
+    "test_foreign_rig_identify", "test_foreign_rig", "test_diagnose_model", "test_identify_command", "test_examples",
+    "test_daemon", "test_interface", "test_identify_thermal",
 )  # fmt: skip
+
+#: Fixtures that take so long that whoever asks for one is a trial.
+_LONG = {"compiled", "coupled", "identified", "viscous"}
+
+#: Trials that this process, or its workers, leave out.
+_LEFT_OUT = pytest.StashKey[int]()
 
 #: What ``emb-daemon compile`` does, and then, of what is lowered already, the object for another machine.
 _COMPILE = """
@@ -38,9 +45,31 @@ build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.a
 """
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if _LONG.intersection(item.fixturenames):
+            item.add_marker("trial")
     place = {name: row for row, name in enumerate(_FIRST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_deselected(items):
+    """Notes how many trials are left out; of several processes each collects all tests."""
+    config = items[0].config
+    config.stash[_LEFT_OUT] = config.stash.get(_LEFT_OUT, 0) + sum("trial" in item.keywords for item in items)
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["left_out"] = config.stash[_LEFT_OUT]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    node.config.stash[_LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", 0)
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    if left_out := config.stash.get(_LEFT_OUT, 0):
+        terminalreporter.write_line(f"{left_out} long trials were left out; make trials runs them")
 
 
 @pytest.fixture(scope="session")

@@ -7,14 +7,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 
-from emb_daemon.calibration.parameters import (
-    INERTIA,
-    LOAD_FRICTION,
-    OFFSET_FRICTION,
-    PRESLIDING_ANGLE,
-    TORQUE_CONSTANT,
-    moved,
-)
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, TORQUE_CONSTANT, moved
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator.records import SAMPLE

@@ -27,6 +27,7 @@ from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant.scenarios import city_drive
 from emb_daemon.runtime import bus, daemon
+from emb_daemon.wire.cmac import KEY, new_key
 
 _LIBM = {"exp", "log", "pow", "sin", "sincos"}
 _LIBC = {"memcpy", "memmove", "memset"}
@@ -68,6 +69,40 @@ def _symbols(path: Path) -> tuple[set[str], set[str]]:
     rows = [line.split() for line in listed.splitlines()]
     seen = [(row[6], row[7].partition("@")[0]) for row in rows if len(row) > 7 and row[4] == "GLOBAL"]
     return {name for index, name in seen if index != "UND"}, {name for index, name in seen if index == "UND"}
+
+
+_ONE = """
+import sys
+from pathlib import Path
+import emb_daemon.wire.cmac
+from emb_daemon.ahead.build import build
+from emb_daemon.ahead.library import TARGETS, installed_digest
+from emb_daemon.jit import ENTRIES
+build(list(ENTRIES.values()), installed_digest(), TARGETS[sys.argv[1]], Path(sys.argv[2]))
+print(*ENTRIES)
+"""
+_EXPAND = """
+import sys
+sys.modules["numba"] = None
+from emb_daemon.ahead import library
+assert not library.load() and library.in_use()
+import numpy as np
+from emb_daemon.wire.cmac import KEY, new_key
+keys = np.zeros(1, KEY)
+new_key(bytes(range(16)), keys[0])
+print(keys.tobytes().hex())
+"""
+
+
+def test_one_kernel_alone_gives_the_bytes_of_numba_and_needs_nothing(tmp_path):
+    """In seconds what the trials below show of all, which take minutes to compile."""
+    path, keys = tmp_path / "kernels.so", np.zeros(1, KEY)
+    done = processkit.python("-c", _ONE, platform.machine(), path, NUMBA_OPT="0", NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert done.returncode == 0, done.stderr
+    assert _symbols(path) == ({library.mark(installed_digest()), *done.stdout.split()}, set())
+    done = processkit.python("-c", _EXPAND, EMB_DAEMON_KERNELS=str(path))
+    new_key(bytes(range(16)), keys[0])
+    assert done.stdout == f"{keys.tobytes().hex()}\n", done.stderr
 
 
 def test_nothing_is_needed_beyond_libc_and_libm(compiled):

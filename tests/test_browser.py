@@ -6,6 +6,7 @@ Those of identify and diagnose are opened where their tests make them.
 import re
 
 import numpy as np
+import pytest
 from browserkit import assert_is_drawn, opened, said_by
 
 from emb_daemon.calibration.files import load_calibration
@@ -16,6 +17,7 @@ from emb_daemon.report.replay import replay_page
 from emb_daemon.resources import resource
 
 
+@pytest.mark.trial
 def test_a_seven_minute_replay_opens_without_error(rig, tmp_path):
     replay = Replay(load_calibration(resource("config/calibration.yaml")))
     page = replay_page([replay.run(rig / "integrated" / "val.log.gz")], "FL", "the shipped one")

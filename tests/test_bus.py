@@ -61,10 +61,7 @@ def test_a_frame_of_ours_that_comes_once_more_is_somebody_elses(ends):
 
 @pytest.mark.parametrize(
     ("one", "other"),
-    [
-        pytest.param(_GROUP, "239.74.162.1", id="IPv4"),
-        pytest.param(f"ff15::{os.getpid() % 0xFFFF:x}", "ff15::1:1", id="IPv6"),
-    ],
+    [pytest.param(_GROUP, "239.74.162.1", id="IPv4"), pytest.param(f"ff15::{os.getpid() % 0xFFFF:x}", "ff15::1:1", id="IPv6")],
 )
 def test_two_groups_on_one_machine_are_two_buses(one, other):
     try:

@@ -100,6 +100,7 @@ def test_replay_with_the_written_calibration_gives_the_after_figure_to_the_last_
         assert replayed[path]["rmse"] == pytest.approx(report["paths"][path]["rmse_after_N"], rel=1e-12)
 
 
+@pytest.mark.trial
 def test_nothing_is_invented_and_a_calibration_that_is_off_is_said_to_be_off(calibration):
     plant = plant_from_calibration(calibration, seed=21)
     plant["curve"] *= 1.03
@@ -125,6 +126,7 @@ def test_on_its_own_data_nothing_is_looked_for_where_nothing_is_left(calibration
     assert set(bench.channels) == {"stiffness", "torque"}
 
 
+@pytest.mark.trial
 def test_without_reference_the_paths_judge_each_other(calibration):
     frames = next(drives(calibration, 5, {"viscous_friction": {"viscous_Nms_per_rad": 3e-4}}, reference=False))
     result = diagnose([log_of(frames)], calibration)
@@ -151,6 +153,7 @@ def test_wheel_pulses_of_another_drive_prove_no_uneven_disc(calibration, uneven_
     assert not reasons[0] and reasons[1]
 
 
+@pytest.mark.trial
 def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_path(calibration):
     log = log_of(next(drives(calibration, 41, {"disc_thermal_expansion": {"growth_um_per_K": 0.4}})))
     samples = log.samples.copy()
@@ -164,6 +167,7 @@ def test_without_current_and_validation_left_out_episodes_judge_the_stiffness_pa
     assert page(result)
 
 
+@pytest.mark.trial
 def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monkeypatch):
     """Something periodic in the motor angle is wrong, and the wheel stands: no fit may so much as try to vary the disc."""
     plant = plant_from_calibration(
@@ -187,6 +191,7 @@ def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monke
     assert "disc_thickness_variation" not in result.calibration.effects
 
 
+@pytest.mark.trial
 def test_what_changed_of_a_calibrated_effect_is_named_with_before_and_after(calibration):
     """The pads relax three times as much as they were calibrated to."""
     share = calibration.effects["second_relaxation"]["share"]
@@ -244,6 +249,7 @@ def _first(log, seconds):
     return dataclasses.replace(log, samples=log.samples[:end], time_ns=log.time_ns[:end], force_N=log.force_N[:end])
 
 
+@pytest.mark.trial
 def test_nothing_is_found_on_the_simulated_rig_where_nothing_is_hidden(rig, calibration):
     fit_log, val_log = _undeclared(rig, "case0", 85.0)
     result = diagnose([fit_log], calibration, [val_log])

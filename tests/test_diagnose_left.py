@@ -50,6 +50,7 @@ def test_whether_something_matters_can_be_written_as_json():
     assert limit == pytest.approx(60.0) and json.dumps(limit <= 70.0) == "true"
 
 
+@pytest.mark.trial
 def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibration, monkeypatch):
     """A torque that is off by 15 % in some stops and right in others: the filter would take it for other pads. What this
     unit's gear has of its own is less than the 4.7 % that the calibration grants. It is said although it drowns in the

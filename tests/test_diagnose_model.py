@@ -96,6 +96,7 @@ def _off(calibration, **shares):
     return Model.of(Bench([log], moved(calibration, values)))
 
 
+@pytest.mark.trial
 def test_heat_and_force_are_fitted_in_turn_until_both_are_right(calibration, monkeypatch):
     """Stiffer pads: the force heats them, and their heat softens them. One fit of each leaves both far off."""
 
@@ -115,6 +116,7 @@ def test_heat_and_force_are_fitted_in_turn_until_both_are_right(calibration, mon
     assert np.sqrt(model.noise("stiffness")) < 30.0 and np.sqrt(model.noise("temperature")) < 0.75
 
 
+@pytest.mark.trial
 def test_heat_is_recalibrated_with_the_friction_that_makes_it(calibration):
     """Friction is 5 % off, too little for a word on its own; a heat capacity that is off must not be fitted to its heat."""
     start = _off(calibration, friction=1.0 / 0.95, heat=1.25)

@@ -64,6 +64,7 @@ def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkey
     assert not withdrawn.accepted and "port may bear" in withdrawn.reason
 
 
+@pytest.mark.trial
 def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(calibration):
     """Friction that rises for seconds after each stroke, whichever way: a hidden state driven by a power of the speed."""
     hidden = {"size": 1.5, "signal": PLANT_SIGNALS.index("motor_speed"), "exponent": 1.5, "other": -1.0, "lag_s": 2.5}
@@ -74,6 +75,7 @@ def test_what_follows_slowly_on_a_motor_that_turns_either_way_is_seen_as_that(ca
     assert best.form.memory_scale == pytest.approx(2.5, rel=0.3)
 
 
+@pytest.mark.trial
 def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_follows_it(calibration):
     """A gear whose gain follows the square of the brake torque for seconds beyond each stop."""
     hidden = {"size": 1.0, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 2.3, "other": -1.0, "lag_s": 7.0}
@@ -97,6 +99,7 @@ def test_what_friction_does_as_it_turns_over_makes_no_term(calibration):
     assert model.rms(gains.max(), "torque") < 0.5 * Screening(bench, start).floor(model, "torque", made=True)
 
 
+@pytest.mark.trial
 def test_two_signals_that_multiply_are_seen_as_both(calibration):
     """A gear whose friction rises for seconds with the force, more on a faster disc: neither explains it alone."""
     of = {"signal": PLANT_SIGNALS.index("clamp_force"), "exponent": 0.7, "other": PLANT_SIGNALS.index("disc_speed")}

@@ -89,8 +89,7 @@ def test_nothing_else_knows_an_effect_by_name(effect):
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
-    [({"hook": "gearbox"}, "no hook gearbox"), ({"hook": "current"}, "current does not offer mean_speed")],
+    ("changed", "said"), [({"hook": "gearbox"}, "no hook gearbox"), ({"hook": "current"}, "current does not offer mean_speed")]
 )
 def test_an_effect_that_cannot_be_hooked_in_is_refused(changed, said):
     viscous = next(effect for effect in REGISTRY if effect.name == "viscous_friction")

@@ -142,6 +142,7 @@ def test_example_control_loop_holds_the_force():
     assert estimated == pytest.approx(8000.0, abs=20.0) and true == pytest.approx(8000.0, abs=100.0)
 
 
+@pytest.mark.trial
 def test_example_own_effect(tmp_path):
     """The commands know the effect; at zero it changes nothing, and a wider caliper leaves less force at the same angle."""
     angle, speed = 26.0 * np.clip(np.arange(200) / 80.0, 0.0, 1.0), 81.25 * (np.arange(200) < 80)

@@ -46,6 +46,16 @@ def logs(tmp_path_factory, calibration) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def scheduler() -> str:
+    """Address of a cluster that is there already; its worker is a thread, which has imported everything."""
+    from distributed import LocalCluster
+
+    more = {"protocol": "tcp://", "host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **more) as local:
+        yield local.scheduler_address
+
+
 def _ingested(root: Path, logs: Path) -> list[dict]:
     return [ingest(root, job) for job in jobs(root, log_files([logs]))]
 
@@ -67,7 +77,7 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
-def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, calibration):
+def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, scheduler, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
     log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
@@ -80,7 +90,7 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, cal
     replay_drive(tmp_path / "fleet", half, calibration)
     assert len([name for name in _content(tmp_path / "fleet") if half.digest in name]) == 3
     log.write_bytes(text)
-    assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--workers", "1"]) == 0
+    assert main(["fleet", "ingest", str(source), "--output", str(tmp_path / "fleet"), "--scheduler", scheduler]) == 0
     [drive] = dataset.drives(tmp_path / "fleet")
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
@@ -98,15 +108,15 @@ def test_copies_of_a_log_are_one_drive_of_each_unit(tmp_path, logs):
     assert [drive.unit for drive in dataset.drives(tmp_path / "fleet")] == ["car0", "car1"]
 
 
-def test_a_log_that_was_rotated_is_kept(tmp_path, logs):
+def test_a_log_that_was_rotated_is_kept(tmp_path, logs, scheduler):
     """Its path has another content now, and its content another path."""
     source, command = tmp_path / "car", ["fleet", "ingest", str(tmp_path / "car"), "--output", str(tmp_path / "fleet")]
     source.mkdir()
     shutil.copy(logs / "car0/drive.0.log.gz", source / "day.log.gz")
-    assert main([*command, "--workers", "1"]) == 0
+    assert main([*command, "--scheduler", scheduler]) == 0
     (source / "day.log.gz").rename(source / "day.1.log.gz")
     shutil.copy(logs / "car0/drive.1.log.gz", source / "day.log.gz")
-    assert main([*command, "--workers", "1"]) == 0
+    assert main([*command, "--scheduler", scheduler]) == 0
     drives = dataset.drives(tmp_path / "fleet")
     assert [drive.day for drive in drives] == ["2026-10-01", "2026-10-03"]
     assert all(len(dataset.read_drive(tmp_path / "fleet", drive)[0].samples) == 750 for drive in drives)
@@ -165,6 +175,7 @@ def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
     assert dataset.read_drive(tmp_path, drive)[1].source == str(path)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("lives", [0, 3])
 def test_workers_may_die(tmp_path, monkeypatch, lives):
     """Dask counts a worker's death against every task that lay there: only who kills one alone is given up."""
@@ -208,7 +219,7 @@ def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monke
     assert workers[0] == 2
 
 
-def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, calibration):
+def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, scheduler, calibration):
     for name in ("at_once", "resumed"):
         _ingested(tmp_path / name, logs)
     drives = dataset.drives(tmp_path / "at_once")
@@ -219,7 +230,7 @@ def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, l
     replay_drive(tmp_path / "resumed", drives[1], calibration)
     [figures] = (tmp_path / "resumed/figures").rglob(f"{drives[1].digest}.json")
     figures.unlink()
-    assert main(["fleet", "replay", str(tmp_path / "resumed"), "--resume", "--workers", "1"]) == 0
+    assert main(["fleet", "replay", str(tmp_path / "resumed"), "--resume", "--scheduler", scheduler]) == 0
     assert _content(tmp_path / "resumed") == _content(tmp_path / "at_once")
 
 
@@ -295,6 +306,7 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
 # -- end to end -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.trial
 def test_the_study_of_speed_prints_stages_and_what_a_second_worker_gains(logs, monkeypatch, capsys):
     """On a machine with one core the second gains nothing, and nothing is promised here."""
     for name, least in (("_SCALED_SAMPLES", 1), ("_TIMES", 1), ("_ADDITIONS", 100_000)):

@@ -337,11 +337,7 @@ def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     time_s = 0.015 * np.arange(2000)
     still = 0.0 * time_s
-    columns = {
-        "time_s": time_s,
-        "angle_rad": 0.15 * np.sin(125.6 * time_s),
-        "speed_rad_per_s": 18.84 * np.cos(125.6 * time_s),
-    }
+    columns = {"time_s": time_s, "angle_rad": 0.15 * np.sin(125.6 * time_s), "speed_rad_per_s": 18.84 * np.cos(125.6 * time_s)}
     columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
     load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
     assert "times as fast" not in capsys.readouterr().err

@@ -52,8 +52,8 @@ def _long() -> np.ndarray:
         ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
         ({"curve": foreignkit.slow}, "random: no usable log, so that the fast relaxation keeps what is usual", 400.0, 3),
         ({"curve": _clamp_only}, "random: no usable log", 500.0, 3),
-        ({"curve": _long}, "random: no usable log", 400.0, 3),
-        ({"curve": _low}, "curves: no log clamps harder than 2.15 of 20 kN", 400.0, 3),
+        pytest.param({"curve": _long}, "random: no usable log", 400.0, 3, marks=pytest.mark.trial),
+        pytest.param({"curve": _low}, "curves: no log clamps harder than 2.15 of 20 kN", 400.0, 3, marks=pytest.mark.trial),
         ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0, 3),
     ],
     ids=["both", "random alone", "one slow curve", "apply alone", "long", "little force", "no clearance"],
@@ -117,6 +117,7 @@ def test_a_misspelt_log_is_an_error(tmp_path, capsys):
     assert "curves[0].log: " in capsys.readouterr().err
 
 
+@pytest.mark.trial
 def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
     """The commands of the page, on the example that the first of them writes."""
     hour = _PAGE.read_text(encoding="utf-8").partition("## A first hour")[2].partition("\n1. ")[0]

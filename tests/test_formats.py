@@ -492,7 +492,7 @@ def test_busmaster_logs_are_read_over_midnight_in_either_base(tmp_path, name, ba
         read_log(tmp_path / name)
 
 
-@pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", ".mf4", ".log"])
+@pytest.mark.parametrize("ending", [".asc", ".blf", ".trc", pytest.param(".mf4", marks=pytest.mark.trial), ".log"])
 def test_a_log_is_known_by_how_it_begins(log, tmp_path, ending):
     frames = read_frames(log)[:400]
     write_frames(tmp_path / f"x{ending}", frames)
@@ -501,6 +501,7 @@ def test_a_log_is_known_by_how_it_begins(log, tmp_path, ending):
         assert np.array_equal(read_frames(tmp_path / name)["data"], frames["data"])
 
 
+@pytest.mark.trial
 def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path, monkeypatch):
     """402 s of a standing truck's J1939 bus (extended ids) as its logger wrote them. Nothing on it is a brake: a 16-bit signal
     of 10 Hz, whatever it means, is taken for our motor angle to see it arrive, sample by sample: nothing is invented between

@@ -257,6 +257,7 @@ def _breakaways(seed: int):
     return _drawn(time_s, np.cumsum(speed) * 0.004, speed, torque)
 
 
+@pytest.mark.trial
 def test_a_current_that_does_not_turn_a_free_motor_tells_nothing_of_its_friction(monkeypatch):
     """Friction holds it, whatever the current below that is: friction is not fitted to it, nor the model judged by it."""
     stated = _of_a_joint(offset_Nm=0.2, presliding_angle_rad=0.001)
@@ -276,6 +277,7 @@ def test_a_free_motor_that_never_turns_is_no_diagnosis():
         diagnose(logs, _of_a_joint(offset_Nm=0.2))
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("step", [0.02, 0.2])
 def test_the_inertia_of_a_slow_joint_is_not_diluted_by_the_steps_of_its_speed(monkeypatch, step):
     """Of our message, or coarser ones of the joint's own encoder: five times what the calibration begins with, and friction
@@ -313,6 +315,7 @@ def test_saturation_takes_half_of_the_constant_at_most_at_the_largest_current_of
     assert bench.reach["1/A²"] * largest**2 == pytest.approx(0.5)
 
 
+@pytest.mark.trial
 def test_a_constant_is_not_diluted_where_the_current_turns_the_machine_itself():
     stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
     found = diagnose([fit], stated).calibration.motor.torque_constant_Nm_per_A

@@ -91,6 +91,7 @@ def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_t
     assert fault.startswith("motor.torque_constant_Nm_per_A: identified") and "within 15 %" in fault
 
 
+@pytest.mark.trial
 def test_parameters_of_other_actuators_are_recovered_within_three_sigma():
     deviations = np.abs(np.concatenate([_deviations(1000 + seed) for seed in range(8)]))
     assert np.mean(deviations < 3.0) >= 0.95
@@ -115,6 +116,7 @@ def test_an_effect_that_is_not_there_is_not_clear_of_zero(effect):
     assert fit.value(share) < 3.0 * fit.sigmas[share] or fit.value(share) < 1e-3
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("there", [True, False])
 def test_one_more_relaxation_is_taken_in_where_it_is_and_only_there(there):
     rng = np.random.default_rng(7)
@@ -287,6 +289,7 @@ def test_a_loop_of_a_rubber_is_found():
         assert found.values[key] == pytest.approx(value, rel=0.05), key
 
 
+@pytest.mark.trial
 def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
     """As fitted, half of what tells two clamps apart would be in the error, and in sigma."""
     known = _one_curve()

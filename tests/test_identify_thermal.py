@@ -14,8 +14,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import grammar
 from emb_daemon.diagnose.grammar import search_heat
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.estimator.step import step
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.identify.calibration import nominal
 from emb_daemon.identify.steps import thermal
 from emb_daemon.identify.steps.cooling import cooling_law
@@ -25,7 +24,7 @@ from emb_daemon.identify.steps.softening import fit_softening
 from emb_daemon.identify.steps.thermal import find_terms
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import friction_power
-from emb_daemon.offline import Log
+from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.recording import Recording, simulate
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
@@ -390,10 +389,8 @@ def test_temperatures_are_doubted_where_a_heat_term_is_outside_of_its_range():
     samples["has_thermocouple"] = samples["has_wheel_speed"] = samples["has_status"] = True
 
     def sigma(*terms):
-        state, out = new_state(), np.zeros(1, ESTIMATE)
-        p = np.atleast_1d(to_parameters(_with(*terms)))
-        for m in samples:
-            step(state[0], p[0], m, out[0])
+        state = new_state()
+        estimate(samples, to_parameters(_with(*terms)), state)
         return float(state[0]["temperature_sigma"])
 
     for port, size in (("disc_cooling", 0.5), ("disc_heat", 300.0), ("pad_heat", 300.0)):

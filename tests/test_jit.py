@@ -93,6 +93,7 @@ print(far(3.0, 4.0), _compilations.count)
 """
 
 
+@pytest.mark.trial
 def test_another_kernel_takes_from_the_cache_what_it_calls(tmp_path):
     """The kernel with `hypot` and `sq`; then, changed, the kernel alone; then nothing."""
     for factor, said in ((1.0, "5.0 3"), (2.0, "10.0 1"), (None, "10.0 0")):
@@ -102,6 +103,7 @@ def test_another_kernel_takes_from_the_cache_what_it_calls(tmp_path):
         assert done.stdout == said + "\n", done.stderr
 
 
+@pytest.mark.trial
 def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
     """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
     code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"

@@ -335,8 +335,7 @@ def test_a_current_that_changes_meanwhile_is_of_another_angle(parameters, s):
 
 
 @pytest.mark.parametrize(
-    ("late_s", "filtered_s", "told"),
-    [(0.0079, 0.0, False), (0.0081, 0.0, True), (0.0, 0.047, False), (0.0, SLOWEST_S, True)],
+    ("late_s", "filtered_s", "told"), [(0.0079, 0.0, False), (0.0081, 0.0, True), (0.0, 0.047, False), (0.0, SLOWEST_S, True)]
 )
 def test_an_angle_over_two_cycles_old_is_told_and_a_speed_that_may_be_older_than_is_undone(
     parameters, s, late_s, filtered_s, told

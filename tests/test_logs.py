@@ -289,7 +289,8 @@ def test_a_reader_that_fails_takes_nothing_with_it(tmp_path, monkeypatch, deed, 
     (package / "generic.py").write_text("from can import TextIOMessageReader")
     (tmp_path / "x.blf").write_bytes(bytes(100))
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(apart, "_START_S", 1.0)
+    if "within 1 s" in said:
+        monkeypatch.setattr(apart, "_START_S", 1.0)
     with pytest.raises(InputError, match=said):
         read_frames(tmp_path / "x.blf")
 

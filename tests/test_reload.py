@@ -19,8 +19,8 @@ from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import keys, moved, parameter
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.answer import answer_row
-from emb_daemon.estimator.records import ESTIMATE, new_state
+from emb_daemon.estimator.records import ESTIMATE
+from emb_daemon.offline import estimate
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
@@ -106,9 +106,7 @@ def test_reload_and_restart_give_the_same_estimates_for_every_key(daemon, drive)
         daemon._begin_anew("FL", calibration, daemon._adaptation.read("FL", calibration))
         _, count = pipeline.consume(after)
         reloaded, samples = pipeline.estimates[:count].copy(), pipeline.samples[:count].copy()
-        restarted, state, parameters = np.zeros(count, ESTIMATE), new_state(), to_parameters(calibration)
-        for row in range(count):
-            answer_row(samples[row], state[0], parameters, restarted[row])
+        restarted = estimate(samples, to_parameters(calibration))
         different = [name for name in names if reloaded[name].tobytes() != restarted[name].tobytes()]
         assert count > 300 and not different, key
     assert not refused, "no value but its own"

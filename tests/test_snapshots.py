@@ -54,8 +54,7 @@ def test_a_record_comes_back_to_the_last_bit(angle, count, known, pads):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"angle": "x"}, {"pads": [1.0, 2.0]}, {"wheel": 3.0}, {"wheel": {"phase": 0.0}}, {"more": 1.0}, {"count": None}],
+    "change", [{"angle": "x"}, {"pads": [1.0, 2.0]}, {"wheel": 3.0}, {"wheel": {"phase": 0.0}}, {"more": 1.0}, {"count": None}]
 )
 def test_a_record_of_another_shape_is_named(change):
     with pytest.raises(ValueError, match=r"state"):

@@ -357,12 +357,7 @@ def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsy
 
 @pytest.mark.parametrize(
     ("factor", "said"),
-    [
-        (1.0, ""),
-        (np.sqrt(0.5), "the current is 0.7"),
-        (np.sqrt(2.0), "the current is 1.4"),
-        (0.9, ""),
-    ],
+    [(1.0, ""), (np.sqrt(0.5), "the current is 0.7"), (np.sqrt(2.0), "the current is 1.4"), (0.9, "")],
     ids=["the motor's", "effective", "amplitude of an effective value", "within tolerances"],
 )
 @pytest.mark.parametrize("stiffer", [1.0, 1.4])
@@ -666,11 +661,7 @@ def test_a_unit_in_the_file_that_is_not_the_mappings_is_said(truth, tmp_path, ca
 @pytest.mark.parametrize(
     ("force", "said", "least_N"),
     [
-        (
-            lambda f, _: np.where(np.arange(len(f)) % 90 < 9, -9999.0, f),
-            "values are -9999, which stand for none",
-            -200.0,
-        ),
+        (lambda f, _: np.where(np.arange(len(f)) % 90 < 9, -9999.0, f), "values are -9999, which stand for none", -200.0),
         (lambda f, _: np.where(np.arange(len(f)) == 300, 3.4e38, f), "values are 3.4e+38, which stand for none", -200.0),
         (lambda f, _: np.where(np.arange(len(f)) % 4 == 0, f, 0.0), "values are 0, which stand for none", -200.0),
         (lambda f, _: np.minimum(f, 9999.0), "", -200.0),

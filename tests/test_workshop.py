@@ -27,15 +27,7 @@ from emb_daemon.wire.contract import CURRENT_LOST, DEGRADED, INIT, REASONS, RESO
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS, ESTIMATOR_STATUS
 from emb_daemon.workshop import trouble
-from emb_daemon.workshop.trouble import (
-    CONFIRMED,
-    FAILED_THIS_CYCLE,
-    PENDING,
-    TEST_FAILED,
-    Frame,
-    TroubleMemory,
-    code_of,
-)
+from emb_daemon.workshop.trouble import CONFIRMED, FAILED_THIS_CYCLE, PENDING, TEST_FAILED, Frame, TroubleMemory, code_of
 from emb_daemon.workshop.uds import Server
 
 _ROOT = Path(__file__).parent.parent

@@ -38,8 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         if diagnostics.memory.warning:
             print(diagnostics.memory.warning, file=sys.stderr)
         serve(
-            diagnostics,
-            f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}",
+            diagnostics, f"requests {arguments.request_id:#x}, responses {arguments.response_id:#x}, trouble codes in {state}"
         )
         diagnostics.memory.save()
     finally:

@@ -17,12 +17,7 @@ from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
-from emb_daemon.identify.steps.torque import (
-    UNKNOWN_CURRENT_A,
-    TorqueStep,
-    Unexplained,
-    unexplained_current,
-)
+from emb_daemon.identify.steps.torque import UNKNOWN_CURRENT_A, TorqueStep, Unexplained, unexplained_current
 from emb_daemon.identify.text import with_sigma
 from emb_daemon.jit import njit
 from emb_daemon.models.stiffness import travel_at

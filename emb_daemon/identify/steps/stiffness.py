@@ -110,17 +110,6 @@ def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
     # Slow logs are fitted whole already.
     fit = fit_dynamics(pads, chosen.fit.calibration, chosen.fit.delay_s) if any(own.random for own in pads) else chosen.fit
     separate = [fit_dynamics([own], fit.calibration, fit.delay_s) for own in pads if own.random]
-    return _step(pads, nominal, fit, candidates, chosen, separate)
-
-
-def _step(
-    pads: list[Pads],
-    nominal: Calibration,
-    fit: DynamicsFit,
-    candidates: list[Candidate],
-    chosen: Candidate,
-    separate: list[DynamicsFit],
-) -> StiffnessStep:
     reached = max(float(np.nanmax(log.force_N)) for own in pads for log in own.logs)
     rises = min(rising_force(curve.coefficients) for curve in fit.curves)
     sigmas = {RELAXATION: USUAL_RELAXATION_S} | {key: sigma for key, sigma in fit.sigmas.items() if key != DELAY}

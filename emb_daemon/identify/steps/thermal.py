@@ -121,6 +121,8 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     softened = None
     if "pad_cooling" in recordings:
         softened = _attempt(campaign, fit_softening, logs["pad_cooling"], recordings["pad_cooling"], heated)
+    sigmas = heat.sigmas | ({"thermal.friction.coefficient": rubbed.sigma} if rubbed else {})
+    sigmas |= softened.sigmas if softened else {}
     for found in (rubbed, softened):
         values |= found.values if found else {}
     if dense:
@@ -130,7 +132,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     law = cooling_law([r for name, r in recordings.items() if name.startswith("disc_cooling")], campaign.datasheet.disc)
     return ThermalStep(
         values=values,
-        sigmas=_sigmas(heat, rubbed, softened),
+        sigmas=sigmas,
         notes=_notes(heat, law, rubbed, softened),
         fitted=recordings,
         unseen=unseen,
@@ -251,11 +253,6 @@ def _as_in_a_car(log: Log, calibration: Calibration) -> float:
         for row in range(len(DEPTHS_M)):
             errors.append(np.interp(times, log.time_ns, found["depth"][:, side, row]) - depths[row])
     return rmse(np.concatenate(errors))
-
-
-def _sigmas(heat: HeatFit, rubbed: FrictionFit | None, softened: SofteningFit | None) -> dict[str, float]:
-    friction_sigma = {"thermal.friction.coefficient": rubbed.sigma} if rubbed else {}
-    return heat.sigmas | friction_sigma | (softened.sigmas if softened else {})
 
 
 def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:

@@ -12,14 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import (
-    INERTIA,
-    LOAD_FRICTION,
-    OFFSET_FRICTION,
-    PRESLIDING_ANGLE,
-    TORQUE_CONSTANT,
-    moved,
-)
+from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
 from emb_daemon.identify.campaign_file import Datasheet
