@@ -13,7 +13,7 @@ import pytest
 
 from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
 from emb_daemon.cli.main import main
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
@@ -217,6 +217,16 @@ def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monke
     with cluster(workers=2) as client:
         run(client, end, [1], failed=lambda item, reason: None)
     assert workers[0] == 2
+
+
+def test_work_without_workers_ends_and_says_so(monkeypatch):
+    """All may die and none come back, on a cluster of others or on a machine that is too busy."""
+    from distributed import Client, LocalCluster
+
+    monkeypatch.setattr("emb_daemon.fleet.cluster._PATIENCE_S", 0.1)
+    told = pytest.raises(Unavailable, match="no worker is left; run the same command again")
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as local, Client(local) as client, told:
+        run(client, abs, [1])
 
 
 def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, scheduler, calibration):

@@ -7,7 +7,7 @@ worker dies, and a new client can continue the work of a killed one.
 import contextlib
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from emb_daemon.errors import InputError, Unavailable
@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 _LIVES = 3
 #: Tasks that the scheduler holds per worker: enough that no worker waits for the client, few enough for 10⁷ logs.
 _AHEAD = 20
-#: Time without an answer after which a scheduler counts as missing, s.
-_PATIENCE_S = 10
+#: Time without an answer after which a scheduler counts as missing, s; and how often as long no worker may be there: starting
+#: one again takes some seconds.
+_PATIENCE_S, _WITHOUT_WORKERS = 10, 6
+_AGAIN = "run the same command again, with --resume if it has that option"
 
 
 @contextlib.contextmanager
@@ -79,6 +81,25 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
+def _first_done(client: "Client", futures: Iterable) -> set:
+    """Those of some futures that are done, as soon as one is.
+
+    Raises:
+        Unavailable: the scheduler or all workers are gone.
+    """
+    from distributed import CancelledError, wait
+
+    absent = 0
+    while absent < _WITHOUT_WORKERS:
+        try:
+            return wait(list(futures), timeout=_PATIENCE_S, return_when="FIRST_COMPLETED").done
+        except CancelledError:
+            raise Unavailable(f"the scheduler is gone; when it is back, {_AGAIN}") from None
+        except TimeoutError:
+            absent = 0 if client.scheduler_info(n_workers=-1)["workers"] else absent + 1
+    raise Unavailable(f"no worker is left; {_AGAIN}")
+
+
 def run(
     client: "Client",
     task: Callable[[_Item], _Result],
@@ -95,9 +116,9 @@ def run(
 
     Raises:
         InputError: of a task, where ``failed`` is None.
-        Unavailable: the scheduler is gone.
+        Unavailable: the scheduler or all workers are gone.
     """
-    from distributed import CancelledError, as_completed
+    from distributed import CancelledError
     from distributed.scheduler import KilledWorker
 
     results: list = [None] * len(items)
@@ -125,21 +146,23 @@ def run(
             suspects.append(row)
             return
         except CancelledError:
-            raise Unavailable(
-                "the scheduler is gone; when it is back, run the same command again, with --resume if it has that option"
-            ) from None
+            raise Unavailable(f"the scheduler is gone; when it is back, {_AGAIN}") from None
         finally:
             future.release()
         done += 1
         progress(done, len(items))
 
     ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    running = as_completed([future for future in (submit() for _ in range(min(ahead, len(items)))) if future])
-    for future in running:
-        settle(row_of.pop(future.key), future, (InputError,))
-        if (following := submit()) is not None:
-            running.add(following)
+    running = {future for future in (submit() for _ in range(min(ahead, len(items)))) if future}
+    while running:
+        for future in _first_done(client, running):
+            running.remove(future)
+            settle(row_of.pop(future.key), future, (InputError,))
+            if (following := submit()) is not None:
+                running.add(following)
     # Dask blames a worker's death on every task that was there. Each is repeated alone to find the one that kills a worker.
     for row in suspects:
-        settle(row, client.submit(task, items[row], pure=False), (InputError, KilledWorker))
+        future = client.submit(task, items[row], pure=False)
+        _first_done(client, [future])
+        settle(row, future, (InputError, KilledWorker))
     return results
