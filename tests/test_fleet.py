@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
+from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
-from emb_daemon.fleet.replaying import replay_drive
+from emb_daemon.fleet.replaying import is_replayed, replay_drive
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
@@ -223,6 +223,23 @@ def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, l
     assert _content(tmp_path / "resumed") == _content(tmp_path / "at_once")
 
 
+def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, monkeypatch):
+    """Otherwise an update would look like a change of the fleet on its day."""
+    _ingested(tmp_path, logs)
+    unit = next(iter(dataset.by_unit(dataset.drives(tmp_path)).values()))
+    replay_drive(tmp_path, unit[0], calibration)
+    assert is_replayed(tmp_path, unit[0], dataset.made_by(calibration))
+    scores.score_unit(tmp_path, unit, calibration)
+    path = scores.scores_path(tmp_path, unit[0].unit, unit[0].corner)
+    assert any(scores.read_scores(path, calibration))
+    monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
+    assert not is_replayed(tmp_path, unit[0], dataset.made_by(calibration))
+    assert not any(scores.read_scores(path, calibration))
+    before = path.read_bytes()
+    scores.score_unit(tmp_path, unit, calibration)
+    assert path.read_bytes() != before and any(scores.read_scores(path, calibration))
+
+
 # -- statistics -------------------------------------------------------------------------------------------------------
 
 
@@ -372,7 +389,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
         scores.Scorer(calibration).score(still, drive)
 
 
-def test_a_training_is_learned_once(tmp_path, calibration):
+def test_a_training_is_learned_once(tmp_path, calibration, monkeypatch):
     plant = plant_from_calibration(calibration, 3)
     frames, _ = simulate_log(plant, sc.rest(1.0) + training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
     drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
@@ -381,6 +398,10 @@ def test_a_training_is_learned_once(tmp_path, calibration):
     assert told["trainings"] == 1 and entry["outcome"] == "accepted"
     assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
     assert learning.learn_unit(tmp_path, drives, calibration) == told
+    assert learning.population(tmp_path, calibration)
+    monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
+    assert not learning.population(tmp_path, calibration)
+    assert learning.learn_unit(tmp_path, drives, calibration)["made_by"] != told["made_by"]
 
 
 def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
@@ -392,7 +413,7 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
         entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
         path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps({"calibration": calibration_hash(calibration), "entries": [entry]}))
+        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": [entry]}))
     save_calibration(calibration, tmp_path / "old.yaml")
     command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
     assert main([*command, str(tmp_path / "new.yaml")]) == 0
