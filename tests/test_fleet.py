@@ -271,6 +271,20 @@ def test_what_a_batch_shares_is_found_with_its_cause_and_size():
             assert abs(one.amount - truth) < 5.0 * one.sigma
 
 
+def test_what_a_wrong_shape_leaves_is_no_second_cause():
+    """An effect whose shape lies between those that are tested leaves a rest that many units prove; another cause as large is
+    named."""
+    for seed in range(5):
+        for second, named in ((0.2, {4}), (1.0, {4, 9})):
+            values, prints, groups, factors = _fleet(np.random.default_rng(seed))
+            covariance = np.linalg.inv(_read(values, prints, factors)[1].inverse)
+            # As far from each other, and from others, as causes can be.
+            prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
+            values[groups["batch 1"]] += prints[4] + second * prints[9]
+            found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+            assert {one.cause for one in found} == named and {one.group for one in found} == {"batch 1"}, (seed, second)
+
+
 def test_where_nothing_is_shared_nobody_is_accused():
     """60 fleets of healthy units: of all accusations one in a hundred fleets may be false, and of units one in a hundred."""
     batches = units = 0
@@ -318,14 +332,20 @@ def test_the_study_of_speed_prints_stages_and_what_a_second_worker_gains(logs, m
         monkeypatch.setattr(fleet_speed, name, least)
     monkeypatch.setattr("sys.argv", ["fleet_speed", str(logs / "car0" / "drive.0.log.gz"), "2"])
     fleet_speed.main()
-    title, *rows, last = capsys.readouterr().out.splitlines()
+    title, *rows, _, replayed, projected, gain, memory = capsys.readouterr().out.splitlines()
     assert title.split()[0] == "stage" and [row[:24].strip() for row in rows] == [
         "unpack", "parse", "check and decode", "estimate", "read columns", "project on all causes", "replay from the file",
         "replay from columns",
     ]  # fmt: skip
     assert all(float(cell) > 0.0 for row in rows for cell in row[24:].split())
-    told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", last)
+    told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", gain)
     assert told and all(float(gain) > 0.0 for gain in told.groups())
+    for line, row in ((replayed, rows[-1]), (projected, rows[5])):
+        core_hours, hours = map(float, re.search(r"(\d+\.\d) core-hours; a core-second is (\d+\.\d\d) h", line).groups())
+        times = float(row.split()[-1])
+        assert core_hours == pytest.approx(10_000 / times, rel=0.01, abs=0.06)
+        assert hours == pytest.approx(times / 3600.0, abs=0.006)
+    assert re.fullmatch(r"a worker takes [1-9]\d+ MiB at most", memory)
 
 
 @pytest.fixture(scope="module")
