@@ -375,6 +375,14 @@ def test_what_a_batch_shares_is_named_without_a_force_sensor(fleet):
     assert len(found.units) == 12 and found.drives == 36
 
 
+def test_front_and_rear_differ_by_design(fleet, calibration):
+    """What a batch has would be reported; the same difference between corners is none."""
+    known = scores.read_fleet(fleet[0], calibration)
+    corners = {(unit, ("FL", "RR")[number % 2]): known[unit, corner] for number, (unit, corner) in enumerate(sorted(known))}
+    found = findings.find(corners, scores.Scorer(calibration).causes, "", {}, {})
+    assert fleet[1].groups and not found.groups and not found.outliers
+
+
 def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
     root, found = fleet
     assert main(["fleet", "report", str(root), "--output", str(tmp_path / "fleet.html")]) == 0
