@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -307,6 +308,18 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     # Were its own drives as far apart, it would be none.
     centre, readings = _read(values, prints, factors, noise=20.0)
     assert population.outliers(values - centre, readings) == []
+
+
+def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
+    """However sure it is: of a unit less than 36 N, of a batch, whose mean many units tell, less than 10 N."""
+    own = object.__new__(findings._Study)
+    own.keys, own.masks = [("a", "FL"), ("b", "FL")], {"batch A": np.ones(2, bool)}
+    own.causes, own.directions = [SimpleNamespace(name="", key="", shape="", unit="")], SimpleNamespace(size_N=np.ones(1))
+    found = [population.Outlier(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
+    monkeypatch.setattr(findings, "outliers", lambda *_: found)
+    assert [one.where for one in own._outliers(np.zeros(0), None, lambda _: "")] == ["b FL"]
+    shared = [population.Shared("batch A", 0, size_N, 1.0, 1e-9, 1e-9, ()) for size_N in (9.0, -11.0)]
+    assert [one.size_N for one in own._list_shared(shared, lambda _: "")] == [-11.0]
 
 
 def test_random_effects_take_each_units_own_noise_out():
