@@ -18,6 +18,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
+from emb_daemon.estimator.status import names
 from emb_daemon.logs.mapping import Mapping as Mapping
 from emb_daemon.logs.resample import Series, fill_missing, frames_of
 from emb_daemon.logs.stamps import LATEST_S, in_time
@@ -32,7 +33,7 @@ _NAN = float("nan")
 
 class Answer(NamedTuple):
     """One estimate: force and its standard deviation in N, source and mode, pad temperatures in degC (NaN before they are
-    known), and the reasons not to trust it."""
+    known), the reasons not to trust it, and the facts from which they follow (`estimator.status.TABLE`)."""
 
     force_N: float
     sigma_N: float
@@ -47,6 +48,7 @@ class Answer(NamedTuple):
     outer_surface_C: float
     outer_mean_C: float
     reasons: tuple[str, ...]
+    facts: tuple[str, ...]
 
 
 def shipped_calibration() -> Calibration:
@@ -197,6 +199,7 @@ def _answer_of(e: np.void) -> Answer:
         outer_surface_C=float(e["surface"][1]),
         outer_mean_C=float(e["mean"][1]),
         reasons=contract.reason_words(e["reasons"]),
+        facts=names(e["facts"]),
     )
 
 

@@ -1,6 +1,6 @@
 """Logs through the daemon's pipeline, one after the other as one drive."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.logs.columns import Decoder, References, beyond_range
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import corner_index, estimate
@@ -45,9 +46,11 @@ class Result:
 
     def reasons(self) -> dict[str, float]:
         """Share of the samples with each reason, the most frequent first."""
-        bits = self.estimates["reasons"]
-        shares = {word: float(np.mean(bits >> bit & 1)) for bit, word in enumerate(REASONS)}
-        return dict(sorted(((word, share) for word, share in shares.items() if share), key=lambda item: -item[1]))
+        return _shares(self.estimates["reasons"], REASONS)
+
+    def facts(self) -> dict[str, float]:
+        """The same of what the estimator found, by the names of `estimator.status.TABLE`."""
+        return _shares(self.estimates["facts"], TABLE)
 
     def since(self, time_ns: int) -> "Result":
         """The part from ``time_ns`` on the log's clock on.
@@ -69,10 +72,17 @@ class Result:
             "samples": len(self.estimates),
             "seconds": 1e-9 * float(self.time_ns[-1] - self.time_ns[0]),
             "reasons": self.reasons(),
+            "facts": self.facts(),
             "invalid": float(np.mean(self.estimates["source"] == INVALID)),
             "force_N": force_figures(self.samples, self.estimates, self.force_N),
             "temperature_K": temperature_figures(self.estimates["time_ns"], self.estimates, self.reference),
         }
+
+
+def _shares(bits: np.ndarray, words: Iterable[str]) -> dict[str, float]:
+    """Share of the samples with each bit that occurs, by its word, the most frequent first."""
+    shares = [(word, float(np.mean(bits >> bit & 1))) for bit, word in enumerate(words)]
+    return dict(sorted((share for share in shares if share[1]), key=lambda share: -share[1]))
 
 
 class Replay:

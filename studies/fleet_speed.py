@@ -1,10 +1,11 @@
-"""How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns; and how
-much faster several workers are than one.
+"""How fast one core replays a log, stage by stage: from the file as it was recorded, and from the data set's columns; how
+much faster several workers are than one, what memory each takes, and what a day of a large fleet costs.
 
 ``python -m studies.fleet_speed LOG [WORKERS]``, with the shipped calibration; by default as many workers as cores.
 """
 
 import os
+import resource
 import sys
 import tempfile
 import time
@@ -27,7 +28,7 @@ from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
-from emb_daemon.resources import resource
+from emb_daemon.resources import resource as shipped
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -38,6 +39,8 @@ _TIMES = 3
 _SCALED_SAMPLES = 2_000_000
 #: Additions of a task that only computes: about as long as the replay of a minute.
 _ADDITIONS = 3_000_000
+#: Hours that a fleet of 10 000 cars drives in a day.
+_FLEET_H = 10_000
 
 
 @dataclass(frozen=True)
@@ -82,10 +85,11 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
 @dataclass(frozen=True)
 class Scaling:
     """Speed of several workers over that of one: of a replay from columns that writes its estimates, and of additions, which
-    shows what the machine has left for them."""
+    shows what the machine has left for them; and the most memory that one of them took."""
 
     replay: float
     additions: float
+    memory_MiB: float
 
 
 def scaling(path: Path, calibration: Calibration, workers: int) -> Scaling:
@@ -103,7 +107,8 @@ def scaling(path: Path, calibration: Calibration, workers: int) -> Scaling:
         for drive in drives:
             write_drive(root, drive, about, log.samples, log.force_N)
         replay = partial(replay_drive, root, calibration=calibration)
-        return Scaling(*(_gain(task, drives, one, several) for task in (replay, _add)))
+        gains = [_gain(task, drives, one, several) for task in (replay, _add)]
+        return Scaling(*gains, max(several.run(_peak_MiB).values()))
 
 
 def _gain(task: Callable[[Drive], object], drives: list[Drive], one: "Client", several: "Client") -> float:
@@ -121,6 +126,10 @@ def _add(_drive: Drive) -> int:
     return sum(range(_ADDITIONS))
 
 
+def _peak_MiB() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
 def _time(task: Callable) -> float:
     """Processor time of the fastest run, s."""
     task()
@@ -133,13 +142,19 @@ def _time(task: Callable) -> float:
 
 
 def main() -> None:
-    path, calibration = Path(sys.argv[1]), load_calibration(resource("config/calibration.yaml"))
+    path, calibration = Path(sys.argv[1]), load_calibration(shipped("config/calibration.yaml"))
     workers = int(sys.argv[2]) if len(sys.argv) > 2 else len(os.sched_getaffinity(0))
     print(f"{'stage':<24}µs a sample   × real time")
+    times = {}
     for stage in stages(path, calibration):
+        times[stage.name] = stage.times_real_time
         print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
+    print(f"{_FLEET_H} h a day take:")
+    for name in ("replay from columns", "project on all causes"):
+        print(f"{name:<24}{_FLEET_H / times[name]:.1f} core-hours; a core-second is {times[name] / 3600.0:.2f} h of driving")
     gain = scaling(path, calibration, workers)
     print(f"{workers} workers replay {gain.replay:.2f} times as fast as one, and add {gain.additions:.2f} times as fast")
+    print(f"a worker takes {gain.memory_MiB:.0f} MiB at most")
 
 
 if __name__ == "__main__":

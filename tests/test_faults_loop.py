@@ -21,6 +21,7 @@ from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import Unavailable
+from emb_daemon.estimator.status import WHEEL_CONTRADICTED, ZERO_WANDERS
 from emb_daemon.runtime import rawcan
 from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
@@ -360,10 +361,17 @@ def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(dr
 @pytest.mark.parametrize(("corner", "name"), [(1, "FR"), (3, "RR")])
 def test_a_change_is_logged_as_its_corners(driven, caplog, corner, name):
     estimate = driven.daemon.pipeline.estimates[0]
-    estimate["corner"], estimate["mode"], estimate["reasons"] = corner, r.DEGRADED, r.STUCK
+    estimate["corner"], estimate["mode"], estimate["reasons"], estimate["facts"] = corner, r.DEGRADED, r.STUCK, 0
     for _ in range(2):
         driven.daemon._follow(1, driven.pacer)
-    assert caplog.text.count("corner") == caplog.text.count(f"corner {name}: degraded (signal stuck)") == 1
+    assert caplog.text.count("corner") == caplog.text.count(f"corner {name}: degraded (signal stuck)\n") == 1
+    estimate["reasons"], estimate["facts"] = r.OUT_OF_RANGE, ZERO_WANDERS | WHEEL_CONTRADICTED
+    driven.daemon._follow(1, driven.pacer)
+    assert (
+        f"corner {name}: degraded (signal out of range): the motor angle drifts or loses counts beside the motor speed; "
+        "the wheel speed is zero while pulses or vehicle speed show motion\n"
+    ) in caplog.text
+    assert caplog.records[-1].fields["found"] in caplog.text
 
 
 def test_of_many_changes_the_first_and_the_last_are_logged(driven, caplog):
@@ -372,7 +380,7 @@ def test_of_many_changes_the_first_and_the_last_are_logged(driven, caplog):
     estimate = driven.daemon.pipeline.estimates[0]
 
     def change(corner, reasons, after_s):
-        estimate["corner"], estimate["mode"], estimate["reasons"] = corner, r.DEGRADED, reasons
+        estimate["corner"], estimate["mode"], estimate["reasons"], estimate["facts"] = corner, r.DEGRADED, reasons, 0
         driven.pacer.last_tick_ns = begin_ns + round(1e9 * after_s)
         driven.daemon._follow(1, driven.pacer)
 

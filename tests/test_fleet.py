@@ -7,17 +7,18 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
+from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.ingest import Job, ingest, ingest_frames, jobs, log_files
-from emb_daemon.fleet.replaying import replay_drive
+from emb_daemon.fleet.replaying import is_replayed, replay_drive
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
@@ -244,6 +245,23 @@ def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, l
     assert _content(tmp_path / "resumed") == _content(tmp_path / "at_once")
 
 
+def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, monkeypatch):
+    """Otherwise an update would look like a change of the fleet on its day."""
+    _ingested(tmp_path, logs)
+    unit = next(iter(dataset.by_unit(dataset.drives(tmp_path)).values()))
+    replay_drive(tmp_path, unit[0], calibration)
+    assert is_replayed(tmp_path, unit[0], dataset.made_by(calibration))
+    scores.score_unit(tmp_path, unit, calibration)
+    path = scores.scores_path(tmp_path, unit[0].unit, unit[0].corner)
+    assert any(scores.read_scores(path, calibration))
+    monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
+    assert not is_replayed(tmp_path, unit[0], dataset.made_by(calibration))
+    assert not any(scores.read_scores(path, calibration))
+    before = path.read_bytes()
+    scores.score_unit(tmp_path, unit, calibration)
+    assert path.read_bytes() != before and any(scores.read_scores(path, calibration))
+
+
 # -- statistics -------------------------------------------------------------------------------------------------------
 
 
@@ -275,6 +293,20 @@ def test_what_a_batch_shares_is_found_with_its_cause_and_size():
             assert abs(one.amount - truth) < 5.0 * one.sigma
 
 
+def test_what_a_wrong_shape_leaves_is_no_second_cause():
+    """An effect whose shape lies between those that are tested leaves a rest that many units prove; another cause as large is
+    named."""
+    for seed in range(5):
+        for second, named in ((0.2, {4}), (1.0, {4, 9})):
+            values, prints, groups, factors = _fleet(np.random.default_rng(seed))
+            covariance = np.linalg.inv(_read(values, prints, factors)[1].inverse)
+            # As far from each other, and from others, as causes can be.
+            prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
+            values[groups["batch 1"]] += prints[4] + second * prints[9]
+            found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+            assert {one.cause for one in found} == named and {one.group for one in found} == {"batch 1"}, (seed, second)
+
+
 def test_where_nothing_is_shared_nobody_is_accused():
     """60 fleets of healthy units: of all accusations one in a hundred fleets may be false, and of units one in a hundred."""
     batches = units = 0
@@ -297,6 +329,18 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     # Were its own drives as far apart, it would be none.
     centre, readings = _read(values, prints, factors, noise=20.0)
     assert population.outliers(values - centre, readings) == []
+
+
+def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
+    """However sure it is: of a unit less than 36 N, of a batch, whose mean many units tell, less than 10 N."""
+    own = object.__new__(findings._Study)
+    own.keys, own.masks = [("a", "FL"), ("b", "FL")], {"batch A": np.ones(2, bool)}
+    own.causes, own.directions = [SimpleNamespace(name="", key="", shape="", unit="")], SimpleNamespace(size_N=np.ones(1))
+    found = [population.Outlier(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
+    monkeypatch.setattr(findings, "outliers", lambda *_: found)
+    assert [one.where for one in own._outliers(np.zeros(0), None, lambda _: "")] == ["b FL"]
+    shared = [population.Shared("batch A", 0, size_N, 1.0, 1e-9, 1e-9, ()) for size_N in (9.0, -11.0)]
+    assert [one.size_N for one in own._list_shared(shared, lambda _: "")] == [-11.0]
 
 
 def test_random_effects_take_each_units_own_noise_out():
@@ -323,14 +367,20 @@ def test_the_study_of_speed_prints_stages_and_what_a_second_worker_gains(logs, m
         monkeypatch.setattr(fleet_speed, name, least)
     monkeypatch.setattr("sys.argv", ["fleet_speed", str(logs / "car0" / "drive.0.log.gz"), "2"])
     fleet_speed.main()
-    title, *rows, last = capsys.readouterr().out.splitlines()
+    title, *rows, _, replayed, projected, gain, memory = capsys.readouterr().out.splitlines()
     assert title.split()[0] == "stage" and [row[:24].strip() for row in rows] == [
         "unpack", "parse", "check and decode", "estimate", "read columns", "project on all causes", "replay from the file",
         "replay from columns",
     ]  # fmt: skip
     assert all(float(cell) > 0.0 for row in rows for cell in row[24:].split())
-    told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", last)
+    told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", gain)
     assert told and all(float(gain) > 0.0 for gain in told.groups())
+    for line, row in ((replayed, rows[-1]), (projected, rows[5])):
+        core_hours, hours = map(float, re.search(r"(\d+\.\d) core-hours; a core-second is (\d+\.\d\d) h", line).groups())
+        times = float(row.split()[-1])
+        assert core_hours == pytest.approx(10_000 / times, rel=0.01, abs=0.06)
+        assert hours == pytest.approx(times / 3600.0, abs=0.006)
+    assert re.fullmatch(r"a worker takes [1-9]\d+ MiB at most", memory)
 
 
 @pytest.fixture(scope="module")
@@ -358,6 +408,14 @@ def test_what_a_batch_shares_is_named_without_a_force_sensor(fleet):
     assert 65.0 < one.size_N * (1.0 if one.where == "batch A" else -1.0) < 195.0
     assert not found.outliers and not found.ageing
     assert len(found.units) == 12 and found.drives == 36
+
+
+def test_front_and_rear_differ_by_design(fleet, calibration):
+    """What a batch has would be reported; the same difference between corners is none."""
+    known = scores.read_fleet(fleet[0], calibration)
+    corners = {(unit, ("FL", "RR")[number % 2]): known[unit, corner] for number, (unit, corner) in enumerate(sorted(known))}
+    found = findings.find(corners, scores.Scorer(calibration).causes, "", {}, {})
+    assert fleet[1].groups and not found.groups and not found.outliers
 
 
 def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
@@ -394,7 +452,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
         scores.Scorer(calibration).score(still, drive)
 
 
-def test_a_training_is_learned_once(tmp_path, calibration):
+def test_a_training_is_learned_once(tmp_path, calibration, monkeypatch):
     plant = plant_from_calibration(calibration, 3)
     frames, _ = simulate_log(plant, sc.rest(1.0) + training(plant, 26.0) + sc.park(9e3, 6.0), seed=1, reference=False)
     drives = ingest_frames(tmp_path, frames, "unit", "0" * 16, "simulated")
@@ -403,6 +461,10 @@ def test_a_training_is_learned_once(tmp_path, calibration):
     assert told["trainings"] == 1 and entry["outcome"] == "accepted"
     assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
     assert learning.learn_unit(tmp_path, drives, calibration) == told
+    assert learning.population(tmp_path, calibration)
+    monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
+    assert not learning.population(tmp_path, calibration)
+    assert learning.learn_unit(tmp_path, drives, calibration)["made_by"] != told["made_by"]
 
 
 def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
@@ -414,7 +476,7 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
         entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
         path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps({"calibration": calibration_hash(calibration), "entries": [entry]}))
+        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": [entry]}))
     save_calibration(calibration, tmp_path / "old.yaml")
     command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
     assert main([*command, str(tmp_path / "new.yaml")]) == 0

@@ -100,6 +100,19 @@ def test_reasons_stand_in_words_after_the_source_and_a_car_has_no_reference_colu
     assert np.array_equal(np.array(table["reasons"].to_pylist()) == "", quiet)
 
 
+def test_what_the_estimator_found_is_told_in_words(two_corners, capsys):
+    """A reason on the wire has several causes."""
+    frames = read.read_frames(two_corners / "FL.log")
+    (two_corners / "FL.log").write_text(format_candump(frames[frames["can_id"] != Decoder().can_id("EMB_FL_Thermocouple")]))
+    assert main(["replay", str(two_corners / "FL.log")]) == 0
+    assert "found: pad temperatures are unknown 100 %" in capsys.readouterr().out
+    page = two_corners / "page.html"
+    assert main(["replay", str(two_corners / "FL.log"), "--json", "--report", str(page)]) == 0
+    told = json.loads(capsys.readouterr().out)["logs"][0]
+    assert told["facts"]["temperature_unknown"] == told["reasons"]["pad temperature uncertain"] == 1.0
+    assert "pad temperatures are unknown" in page.read_text()
+
+
 def test_references_stand_beside_the_estimates(rig, tmp_path, capsys):
     log = rig / "static" / "random_0p5mm.log.gz"
     out = tmp_path / "out.parquet"

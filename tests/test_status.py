@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from emb_daemon.estimator import status
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import TABLE, names, tell_status
-from emb_daemon.estimator.step import _look
+from emb_daemon.estimator.step import _look, predict
 from emb_daemon.wire import contract as r
 
 #: Reasons that frames, bus and clock give, outside the estimator. test_faults.py, test_faults_loop.py, test_hostile.py raise
@@ -29,8 +29,9 @@ _BITS = {name: 1 << bit for bit, name in enumerate(TABLE)}
 
 def _told(facts):
     out = np.zeros(1, ESTIMATE)
-    out["reasons"], out["source"] = -1, -1
+    out["reasons"], out["source"], out["facts"] = -1, -1, -1
     tell_status(facts, out[0])
+    assert out["facts"] == facts
     return int(out["reasons"][0]), int(out["source"][0])
 
 
@@ -42,6 +43,12 @@ def test_without_facts_both_paths_hold():
 def test_each_fact_gives_its_reasons_and_source(name):
     assert _told(_BITS[name]) == (TABLE[name].reasons, TABLE[name].source)
     assert names(_BITS[name]) == (name,)
+
+
+def test_a_prediction_finds_nothing(parameters):
+    out = np.full(1, np.array(-1).astype(ESTIMATE))
+    predict(new_state()[0], brake.ideal(parameters), 0.004, out[0])
+    assert out["facts"] == 0
 
 
 @given(st.sets(st.sampled_from(list(TABLE))))

@@ -94,6 +94,15 @@ def test_a_damaged_file_is_set_aside_and_told(tmp_path):
     assert all(entry.status == 0x50 for entry in memory.entries.values())
 
 
+@pytest.mark.parametrize("group", [code_of(FL, 0), 0xFFFFFF])
+def test_a_code_that_was_cleared_fails_again_when_its_reason_stays(tmp_path, group):
+    memory = TroubleMemory(tmp_path)
+    _judge(memory, RESOLVER_LOST)
+    assert memory.clear(group)
+    assert _judge(memory, RESOLVER_LOST, times=2)[0].status == 0x50
+    assert _judge(memory, RESOLVER_LOST, times=1)[0].status & TEST_FAILED
+
+
 @settings(max_examples=25)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 4), st.integers(0, 0xFFFF), st.booleans()), max_size=12))
 def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):

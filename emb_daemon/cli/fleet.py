@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_path(parsers[name], "--calibration", CALIBRATION_HELP)
     for name in ("replay", "learn", "diagnose"):
         parsers[name].add_argument(
-            "--resume", action="store_true", help="continue: keep existing results of the same calibration"
+            "--resume", action="store_true", help="continue: keep existing results of the same calibration and estimator"
         )
     for name in ("ingest", "replay", "learn", "diagnose"):
         parsers[name].add_argument(
@@ -91,12 +91,11 @@ def _ingest(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from emb_daemon.calibration.files import calibration_hash
     from emb_daemon.fleet import dataset, replaying
 
     root, calibration = arguments.data.absolute(), _calibration(arguments)
-    drives, mark = dataset.drives(root), calibration_hash(calibration)
-    left = [d for d in drives if not (arguments.resume and replaying.is_replayed(root, d, mark))]
+    drives, makers = dataset.drives(root), dataset.made_by(calibration)
+    left = [d for d in drives if not (arguments.resume and replaying.is_replayed(root, d, makers))]
     done = _work(arguments, "replaying", partial(replaying.replay_drive, root, calibration=calibration), left, _fault)
     faults = [text for text in done if isinstance(text, str)]
     seconds = sum(figures["seconds"] for figures in done if not isinstance(figures, str))

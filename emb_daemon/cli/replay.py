@@ -7,9 +7,10 @@ from pathlib import Path
 
 from emb_daemon.cli.options import CALIBRATION_HELP, LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
 from emb_daemon.errors import InputError
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.resources import resource
 
-#: Least share of a log's samples for a reason in the summary; tables contain all reasons.
+#: Least share of a log's samples for a reason or fact in the summary; tables contain all reasons.
 _SEEN = 0.001
 EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml --output estimates.csv"
 
@@ -190,9 +191,8 @@ def _write_report(arguments: argparse.Namespace, results: list, corner: str, cal
 def _print(report: dict) -> None:
     print(f"{report['log']}, {report['corner']}: {report['samples']} samples, {report['seconds']:.1f} s")
     shares = report["reasons"] | ({"force invalid": report["invalid"]} if report["invalid"] else {})
-    told = [f"{word} {100.0 * share:.3g} %" for word, share in shares.items() if share >= _SEEN]
-    if told:
-        print(f"  of the samples: {', '.join(told)}")
+    _shares("of the samples", shares)
+    _shares("found", {TABLE[name].sentence: share for name, share in report["facts"].items()})
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
         print("  no clamp force and no temperature reference in this log to judge by")
@@ -203,6 +203,12 @@ def _print(report: dict) -> None:
                 _line(f"  {condition}", part, unit)
     if forces:
         print(f"  inside two sigma: {100 * forces['inside_two_sigma']:.1f} %")
+
+
+def _shares(what: str, shares: dict[str, float]) -> None:
+    told = [f"{word} {100.0 * share:.3g} %" for word, share in shares.items() if share >= _SEEN]
+    if told:
+        print(f"  {what}: {', '.join(told)}")
 
 
 def _line(name: str, figures: dict, unit: str) -> None:

@@ -192,7 +192,7 @@ STATE = np.dtype(
 
 ESTIMATE = np.dtype(
     [
-        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter mode source reasons"),
+        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter mode source reasons facts"),
         ("is_sample", "?"),
         ("engaged", "?"),
         *fields("i8", "adapt_request adapt_progress adapt_result"),

@@ -75,8 +75,8 @@ _SOURCES = np.array([fact.source for fact in TABLE.values()])
 
 @njit
 def tell_status(facts: int, out: Record) -> None:
-    """Reasons and source of an ESTIMATE from its facts: the last in the table that leaves less than both paths decides."""
-    out.reasons = 0
+    """Facts of an ESTIMATE, with reasons and source: the last in the table that leaves less than both paths decides."""
+    out.facts, out.reasons = facts, 0
     out.source = FUSED
     for bit in range(len(_REASONS)):
         if facts >> bit & 1:
@@ -88,3 +88,8 @@ def tell_status(facts: int, out: Record) -> None:
 def names(facts: int) -> tuple[str, ...]:
     """Names of the facts in a bit mask."""
     return tuple(name for bit, name in enumerate(TABLE) if facts >> bit & 1)
+
+
+def sentences(facts: int) -> str:
+    """What the facts in a bit mask say, in words."""
+    return "; ".join(TABLE[name].sentence for name in names(facts))

@@ -286,7 +286,7 @@ def predict(s: Record, p: Record, age: float, out: Record) -> None:
     """
     out.mode = RUNNING if s.started else INIT
     out.source = PREDICTED if s.started and age <= SILENCE_S else INVALID
-    out.reasons = 0
+    out.reasons = out.facts = 0
     # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
     _, steep = steepest(p.gear)
     reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * steep * age, p.curve)

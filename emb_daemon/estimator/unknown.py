@@ -185,11 +185,10 @@ def add_rest(P: Floats, p: Record, elapsed_s: float) -> None:
 @njit
 def _draw_near(x, P, gain, state, distance, reach):
     """Take in that ``state`` is ``distance`` from what the calibration says and cannot be far from it."""
-    s = P[state, state] + reach * reach
-    if s <= 0.0:
-        # A calibration without friction says that there is none to be off.
+    if P[state, state] <= 0.0:
+        # Exactly known: a calibration without friction says that there is none to be off, and only some changes are of growth.
         return
-    innovation = -distance
+    s, innovation = P[state, state] + reach * reach, -distance
     for i in range(len(x)):
         gain[i] = P[i, state] / s
     for i in range(len(x)):

@@ -16,13 +16,17 @@ import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
+from emb_daemon.ahead.library import installed_digest
 from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import References
@@ -64,6 +68,16 @@ class About:
     source: str
     refused: dict[str, int]
     notes: str
+
+
+#: Of the sources that compiled code is made of, as they were when the process began.
+_kernels = cache(installed_digest)
+
+
+def made_by(calibration: Calibration) -> str:
+    """What makes a result from a drive: a calibration and an estimator, by their hashes. Results that others made are made
+    anew, or an update would look like a change of the fleet on its day."""
+    return f"{calibration_hash(calibration)} {_kernels()}"
 
 
 def day_of(time_ns: int) -> str:

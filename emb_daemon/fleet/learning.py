@@ -11,12 +11,11 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, moved, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS, new_state
-from emb_daemon.fleet.dataset import Drive, partition, read_drive, write_json
+from emb_daemon.fleet.dataset import Drive, made_by, partition, read_drive, write_json
 from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
 from emb_daemon.offline import estimate
 
@@ -32,13 +31,13 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
     """Adaptation over one unit's drives in order; each begins with a power-on and the values learned before. Returns every
     training and its outcome.
 
-    ``resume``: keep an existing result of the same drives and calibration.
+    ``resume``: keep an existing result of the same drives, made by the same (`made_by`).
 
     Raises:
         InputError: a drive's file is missing or damaged.
     """
     corner, path = drives[0].corner, learned_path(root, drives[0].unit, drives[0].corner)
-    told = {"calibration": calibration_hash(calibration), "drives": [drive.digest for drive in drives]}
+    told = {"made_by": made_by(calibration), "drives": [drive.digest for drive in drives]}
     if resume and path.exists():
         known = json.loads(path.read_bytes())
         if told.items() <= known.items():
@@ -70,7 +69,7 @@ def population(root: Path, calibration: Calibration) -> dict[str, tuple[RandomEf
     for path in sorted(Path(root, "learned").glob("unit=*/corner=*.json")):
         told = json.loads(path.read_bytes())
         accepted = [entry for entry in told["entries"] if entry["values"]]
-        if told["calibration"] != calibration_hash(calibration) or not accepted:
+        if told.get("made_by") != made_by(calibration) or not accepted:
             continue
         for key, value in accepted[-1]["values"].items():
             # A value without a standard deviation is set together with others, such as the curves next to the mounted pads'

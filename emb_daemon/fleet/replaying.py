@@ -4,9 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.fleet.dataset import Drive, folder_of, read_drive, write_json
+from emb_daemon.fleet.dataset import Drive, folder_of, made_by, read_drive, write_json
 from emb_daemon.logs.write import table_columns, write_table
 from emb_daemon.offline import estimate
 from emb_daemon.replay import Result
@@ -16,10 +15,10 @@ def figures_path(root: Path, drive: Drive) -> Path:
     return Path(root, "figures", drive.partition, f"{drive.digest}.json")
 
 
-def is_replayed(root: Path, drive: Drive, calibration: str) -> bool:
-    """Whether a drive's estimates exist, with the calibration of this hash."""
+def is_replayed(root: Path, drive: Drive, makers: str) -> bool:
+    """Whether a drive's estimates exist, made by these (`dataset.made_by`)."""
     try:
-        return json.loads(figures_path(root, drive).read_bytes())["calibration"] == calibration
+        return json.loads(figures_path(root, drive).read_bytes())["made_by"] == makers
     except (OSError, ValueError, KeyError):
         return False
 
@@ -36,7 +35,7 @@ def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict[str
     folder = folder_of(root, "estimates", drive.partition)
     write_table(folder / f"{drive.digest}.parquet", table_columns(estimates, 1e-9 * log.time_ns))
     figures = result.figures() | {"log": about.source, "refused": about.refused, "notes": about.notes}
-    figures["calibration"] = calibration_hash(calibration)
+    figures["made_by"] = made_by(calibration)
     # Written after the estimates, so that existing figures imply existing estimates.
     write_json(figures_path(root, drive), figures)
     return figures

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.coordinates import base_coordinates, effect_coordinates
@@ -23,7 +22,7 @@ from emb_daemon.diagnose.residuals import Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
 from emb_daemon.errors import InputError
-from emb_daemon.fleet.dataset import Drive, folder_of, partition, read_drive
+from emb_daemon.fleet.dataset import Drive, folder_of, made_by, partition, read_drive
 from emb_daemon.offline import Log
 
 #: Force (N) above which the pads touch; the size of a cause is its RMS over such samples.
@@ -151,7 +150,7 @@ class Scorer:
 def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
     """Compute and store the scores of every drive of one unit's corner; returns why some cannot be used, by digest.
 
-    ``resume``: keep existing scores of the same calibration.
+    ``resume``: keep existing scores made by the same (`made_by`).
     """
     scorer, path = Scorer(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
@@ -175,7 +174,7 @@ def scores_path(root: Path, unit: str, corner: str) -> Path:
 
 def _write(path: Path, calibration: Calibration, causes: Sequence[Cause], scores: list[Score], silent: dict[str, str]) -> None:
     said = {
-        "calibration": calibration_hash(calibration), "causes": [asdict(cause) for cause in causes],
+        "made_by": made_by(calibration), "causes": [asdict(cause) for cause in causes],
         "drives": [asdict(score.drive) for score in scores], "silent": silent,
     }  # fmt: skip
     upper = np.triu_indices(len(causes) + 1)
@@ -191,10 +190,10 @@ def _write(path: Path, calibration: Calibration, causes: Sequence[Cause], scores
 
 
 def read_scores(path: Path, calibration: Calibration) -> tuple[list[Score], dict[str, str]]:
-    """Stored scores of one unit's corner; none if they are of another calibration."""
+    """Stored scores of one unit's corner; none if they were made by others (`made_by`)."""
     with np.load(path) as file:
         said = json.loads(file["said"].tobytes())
-        if said["calibration"] != calibration_hash(calibration):
+        if said.get("made_by") != made_by(calibration):
             return [], {}
         products, loaded, ambient = file["products"], file["loaded"], file["ambient_C"]
     count = len(said["causes"]) + 1

@@ -16,6 +16,7 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.interface.places import Place, places
 from emb_daemon.interface.signals import describe
 from emb_daemon.wire.contract import CYCLE_S, MODES, REASONS, SOURCES
@@ -83,6 +84,7 @@ def header(calibration: Calibration) -> str:
     codes = [f"#define EMB_MODE_{word.upper()} {code}" for code, word in enumerate(MODES)]
     codes += [f"#define EMB_SOURCE_{word.upper()} {code}" for code, word in SOURCES.items()]
     codes += [f"#define EMB_{word.upper().replace(' ', '_')} {1 << bit:#x}" for bit, word in enumerate(REASONS)]
+    codes += [f"#define EMB_FACT_{name.upper()} {1 << bit:#x}" for bit, name in enumerate(TABLE)]
     records = {"emb_sample": SAMPLE, "emb_estimate": ESTIMATE, "emb_parameters": PARAMETERS}
     asserts = [f'_Static_assert(sizeof({name}) == {record.itemsize}, "{name}");' for name, record in records.items()]
     asserts += [
@@ -97,7 +99,7 @@ def header(calibration: Calibration) -> str:
         # The calibration's name must not end the comment, or a file could contain code.
         actuator=calibration.actuator.replace("*/", "* /"),
         cycle=CYCLE_S,
-        codes="/* Codes of mode and source, and bits of reasons. */\n" + "\n".join(codes),
+        codes="/* Codes of mode and source, and bits of reasons and facts. */\n" + "\n".join(codes),
         sample=_struct(SAMPLE, "emb_sample", lambda field: describe(SAMPLE, field)),
         estimate=_struct(ESTIMATE, "emb_estimate", lambda field: describe(ESTIMATE, field)),
         parameters=_struct(PARAMETERS, "emb_parameters"),

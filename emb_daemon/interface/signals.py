@@ -72,6 +72,7 @@ OUTPUTS = (
     Signal("mode", "mode", "", "mode of the estimator: " + ", ".join(f"{code} {word}" for code, word in enumerate(MODES))),
     Signal("source", "source", "", f"source of clamp_force_N: {_SOURCES}"),
     Signal("reasons", "reasons", "", "reasons not to trust the estimate: bits of DegradedReasons"),
+    Signal("facts", "facts", "", "what the estimator found, from which its reasons follow: bits; none in a prediction"),
 )  # fmt: skip
 
 #: Meaning of the fields that identify a SAMPLE.

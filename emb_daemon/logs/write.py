@@ -25,7 +25,7 @@ FRAME_ENDINGS = (".log", ".blf", ".asc", ".trc", ".mf4")
 _COMMENTS = {"reasons": "why not to trust the row, joined by '; '", "corner": "wheel"}
 _UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
 #: Signals without a column.
-_NOT_WRITTEN = ("stiffness_force_sigma_N", "torque_force_sigma_N", "contact_angle_sigma_rad", "reasons")
+_NOT_WRITTEN = ("stiffness_force_sigma_N", "torque_force_sigma_N", "contact_angle_sigma_rad", "reasons", "facts")
 
 
 def ending_of(path: Path) -> str:

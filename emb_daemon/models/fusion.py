@@ -32,7 +32,8 @@ from math import sqrt
 
 from emb_daemon.jit import Floats, njit
 
-#: Number of states, and their places; creep's are two.
+#: Number of states, and their places; creep's are two. Loops over a covariance run to the length of an array: to this number
+#: the compiler would unroll them, not vectorise them, and an update would take three times as long.
 STATES = 16
 (FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(14)
 CREEPS = (14, 15)
@@ -51,9 +52,9 @@ def maximum_likelihood(stiffness: float, stiffness_sigma: float, torque: float, 
 @njit
 def copy_errors(x: Floats, P: Floats, from_x: Floats, from_P: Floats) -> None:
     """Copy into ``x`` and ``P``, by loops: assigning a whole array takes a tenth of a second to compile."""
-    for i in range(STATES):
+    for i in range(len(x)):
         x[i] = from_x[i]
-        for j in range(STATES):
+        for j in range(len(x)):
             P[i, j] = from_P[i, j]
 
 
@@ -79,13 +80,13 @@ def predict_errors(x: Floats, P: Floats, decay: float, noise_decay: float, noise
 def variance_along(P: Floats, h: Floats, gain: Floats) -> float:
     """h P h'; ``gain``, shape (STATES,), becomes P h'."""
     # The loop over columns is outside, because then the sums of all rows are independent, and are vectorised.
-    for i in range(STATES):
+    for i in range(len(h)):
         gain[i] = P[0, i] * h[0]
-    for j in range(1, STATES):
-        for i in range(STATES):
+    for j in range(1, len(h)):
+        for i in range(len(h)):
             gain[i] += P[j, i] * h[j]
     total = 0.0
-    for i in range(STATES):
+    for i in range(len(h)):
         total += h[i] * gain[i]
     return total
 
@@ -94,10 +95,10 @@ def variance_along(P: Floats, h: Floats, gain: Floats) -> float:
 def update_errors(x: Floats, P: Floats, gain: Floats, innovation: float, s: float) -> None:
     """Measurement update with an innovation of variance ``s``; ``gain`` is P h' (`variance_along`)."""
     scale = 1.0 / s
-    for i in range(STATES):
+    for i in range(len(x)):
         x[i] += gain[i] * scale * innovation
         # The product first: it is the same for (i, j) and (j, i), and P stays symmetric to the last bit.
-        for j in range(STATES):
+        for j in range(len(x)):
             P[i, j] -= gain[i] * gain[j] * scale
 
 

@@ -113,7 +113,6 @@ class Web:
         """Events until the browser has gone."""
         request.send_response(200)
         request.send_header("Content-Type", "text/event-stream")
-        request.send_header("Cache-Control", "no-store")
         request.end_headers()
         said = self._everything()
         while True:

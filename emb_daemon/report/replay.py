@@ -9,6 +9,7 @@ import numpy as np
 from emb_daemon import __version__
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.score import PATHS, figures, share_inside
 from emb_daemon.replay import Result
@@ -51,10 +52,11 @@ def _row(time_s: np.ndarray, active: np.ndarray, height: float, style: Style) ->
 
 
 def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]]:
-    """A row for each mode, source and reason that occurs; lowest row first."""
+    """A row for each mode, source, reason and fact that occurs; lowest row first."""
     rows = [(f"mode: {name}", estimates["mode"] == code, _STRETCH) for code, name in enumerate(MODES)]
     rows += [(f"source: {name}", estimates["source"] == code, Style(PALE.colour, 7.0)) for code, name in SOURCES.items()]
     rows += [(word, (estimates["reasons"] >> bit & 1).astype(bool), _REASON) for bit, word in enumerate(REASONS)]
+    rows += [(fact.sentence, (estimates["facts"] >> bit & 1).astype(bool), _REASON) for bit, fact in enumerate(TABLE.values())]
     rows = [row for row in reversed(rows) if row[1].any()]
     traces = [_row(time_s, active, float(height), style) for height, (_, active, style) in enumerate(rows)]
     return Panel("Mode, source and reasons", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]

@@ -8,6 +8,7 @@ import logging
 
 import numpy as np
 
+from emb_daemon.estimator.status import sentences
 from emb_daemon.runtime.journal import log
 from emb_daemon.wire import contract
 from emb_daemon.wire.layout import CORNERS
@@ -21,10 +22,12 @@ class ChangeLog:
 
     Attributes:
         states: mode << 16 | reasons by corner, shape (4,), as they are now; -1 before the first estimate.
+        facts: what the estimator found (`estimator.status`) by corner, shape (4,), as it is now.
     """
 
     def __init__(self):
         self.states: np.ndarray = np.full(len(CORNERS), -1, np.int64)
+        self.facts: np.ndarray = np.zeros(len(CORNERS), np.int64)
         self._from_ns = [-_SPAN_NS] * len(CORNERS)
         self._changes = [0] * len(CORNERS)
 
@@ -51,4 +54,7 @@ class ChangeLog:
         words = ", ".join(contract.reason_words(reasons)) or ("bus or loop" if amiss else "none")
         fields = {"corner": CORNERS[corner], "mode": contract.MODES[mode], "reasons": words}
         level = logging.WARNING if amiss else logging.INFO
+        if found := sentences(self.facts[corner]):
+            fields["found"] = found
+            after += ": %(found)s"
         log.log(level, f"corner %(corner)s: %(mode)s (%(reasons)s){after}", fields, extra={"fields": fields})

@@ -85,17 +85,18 @@ class Pacer:
         return min(together, free + _MARGIN_NS)
 
 
-@entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), returns=3)
-def _scan(estimates, count, states, receptions, arrivals, reported):
+@entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), Array(np.int64), returns=3)
+def _scan(estimates, count, states, receptions, arrivals, reported, facts):
     """What the loop needs to know of new estimates. Sets ``arrivals`` to the time at which each corner's sample was complete
-    (0: none) and ``reported`` to mode and reasons. Returns bit masks of corners: estimated; with a state that is not a number;
-    with changed mode or reasons."""
+    (0: none), ``reported`` to mode and reasons, and ``facts`` to what the estimator found. Returns bit masks of corners:
+    estimated; with a state that is not a number; with changed mode or reasons."""
     estimated, lost, changed = 0, 0, 0
     arrivals[:] = 0
     for row in range(count):
         estimate = estimates[row]
         corner = estimate.corner
         estimated |= 1 << corner
+        facts[corner] = estimate.facts
         if estimate.is_sample:
             base = CORNER_MESSAGES * corner
             arrivals[corner] = max(receptions[base + RESOLVER].time_ns, receptions[base + CURRENT].time_ns)
@@ -204,8 +205,8 @@ class Daemon:
         _, count = scratch.collect(np.zeros(1, FRAME))
         count = scratch.overdue(LATE_CYCLES * CYCLE_NS, count)
         scratch.broadcast(count)
-        arrivals, known = self._arrivals.copy(), self._changes.states.copy()
-        _scan(scratch.estimates, count, scratch.states, scratch.receptions, arrivals, known)
+        noted = self._arrivals.copy(), self._changes.states.copy(), self._changes.facts.copy()
+        _scan(scratch.estimates, count, scratch.states, scratch.receptions, *noted)
         if self._adaptation:
             self._adaptation.warm_up(scratch.states[0], scratch.parameters[0])
         wait()
@@ -279,7 +280,13 @@ class Daemon:
         """Note when the next samples are due; log changes of mode and reasons."""
         pipeline = self.pipeline
         estimated, lost, changed = _scan(
-            pipeline.estimates, count, pipeline.states, pipeline.receptions, self._arrivals, self._changes.states
+            pipeline.estimates,
+            count,
+            pipeline.states,
+            pipeline.receptions,
+            self._arrivals,
+            self._changes.states,
+            self._changes.facts,
         )
         self._estimated |= estimated
         self._lost |= lost

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from emb_daemon import __version__
 from emb_daemon.calibration.parameters import parameter
 from emb_daemon.calibration.types import Calibration
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.interface.places import places
 from emb_daemon.interface.signals import INPUTS, OUTPUTS, Signal
 from emb_daemon.runtime.shared import LAYOUT_DIGEST
@@ -29,6 +30,7 @@ _FLOAT32_MAX, _FLOAT64_MAX, _ULONG_MAX = 3.4e38, 1.79e308, 0xFFFFFFFF
 #: Units in characters that every tool can read.
 _ASCII = str.maketrans({"·": ".", "²": "^2", "³": "^3", "√": "sqrt ", "°": "deg"})
 _CODES = {"mode": dict(enumerate(MODES)), "source": SOURCES}
+_BITS = {"reasons": REASONS, "facts": tuple(TABLE)}
 
 _FRAME = """\
 ASAP2_VERSION 1 61
@@ -98,8 +100,8 @@ def _measurement(corner: int, index: int, signal: Signal, methods: _Methods) -> 
         kind, method = "ULONG", methods.of_words(signal.name, words) if words else methods.of_unit("")
         limits = f"0 {_ULONG_MAX}"
     meaning = signal.meaning
-    if signal.name == "reasons":
-        meaning += ", from the lowest: " + ", ".join(REASONS)
+    if bits := _BITS.get(signal.name):
+        meaning += f", from the lowest: {', '.join(bits)}"
     head = f"{CORNERS[corner]}.{signal.name} {_quote(meaning)} {kind} {method} 0 0 {limits}"
     return _block("MEASUREMENT", head, f"ECU_ADDRESS 0x{address_of(corner, index):X}")
 

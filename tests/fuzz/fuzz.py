@@ -8,21 +8,19 @@ frame believed that nobody authenticated. Kernels run as plain Python, so that t
 import contextlib
 import hashlib
 import os
-import re
 import sys
 import tempfile
-import textwrap
+from functools import partial
 from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"
 import atheris
 
 with atheris.instrument_imports(include=["emb_daemon"]):
+    from files import CALIBRATION, LOG, RECORDS, read_calibration, read_record
+
     from emb_daemon.adapt import files, memory
     from emb_daemon.calibration.configuration import Setup
-    from emb_daemon.calibration.files import dump_calibration
-    from emb_daemon.calibration.strict_yaml import load_yaml
-    from emb_daemon.calibration.types import Calibration
     from emb_daemon.errors import InputError
     from emb_daemon.logs.read import read_frames
     from emb_daemon.pipeline import Pipeline
@@ -32,16 +30,9 @@ with atheris.instrument_imports(include=["emb_daemon"]):
     from emb_daemon.wire.frames import FRAME
     from emb_daemon.wire.secoc import Signer, Verifier, load_links
 
-import msgspec
 import numpy as np
 
 _OURS = (0x100, 0x110, 0x120, 0x180, 0x181, 0x182, 0x200)
-_CALIBRATION = resource("config/calibration.yaml").read_bytes()
-_CALIBRATION = _CALIBRATION[: _CALIBRATION.index(b"provenance:")]
-_LOG = b"".join(
-    b"(%d.%06d) can0 %s\n" % (1, 1000 * number, frame)
-    for number, frame in enumerate((b"100#0102030405060708", b"18FEF100#AA", b"123##311223344", b"7FF#R8", b"20000040#00") * 3)
-)
 _parameters = Setup(resource("config/emb.yaml")).parameters
 _folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
 
@@ -152,35 +143,19 @@ def _file(name: str, data: bytes, read) -> None:
         read(path)
 
 
-#: The calibration's records and their part of it, each read as a file of its own: in a fiftieth of the time.
-_PARTS = [
-    (field.type, textwrap.dedent(part.partition("\n")[2]).encode())
-    for field in msgspec.structs.fields(Calibration)
-    if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct)
-    for part in re.findall(rf"^{field.name}:\n(?: .*\n)+", _CALIBRATION.decode(), re.MULTILINE)
-]
 #: First bytes from which the whole calibration is read.
 _WHOLE = 253
 
 
 def yaml(data: bytes) -> None:
-    """What is read is the same when it is written and read again: no number that is not finite, nothing lost."""
     first = data[0] if data else 0
-    kind, good = (Calibration, _CALIBRATION) if first >= _WHOLE else _PARTS[first % len(_PARTS)]
-
-    def read(path: Path) -> None:
-        value = load_yaml(path, kind)
-        written = msgspec.json.encode(value)
-        assert value == msgspec.json.decode(written, type=kind), written
-        if kind is Calibration:
-            path.write_text(dump_calibration(value))
-            assert load_yaml(path, kind) == value
-
+    kind, good = RECORDS[first % len(RECORDS)]
+    good, read = (CALIBRATION, read_calibration) if first >= _WHOLE else (good, partial(read_record, kind))
     _file("calibration.yaml", _edited(good, data[1:]), read)
 
 
 def candump(data: bytes) -> None:
-    _file("drive.log", _edited(_LOG, data), read_frames)
+    _file("drive.log", _edited(LOG, data), read_frames)
 
 
 if __name__ == "__main__":
