@@ -69,6 +69,7 @@ def _left(left: Left) -> dict:
         "present": left.present,
         "unit": UNITS[left.channel],
         "rms": left.rms,
+        "log": left.log or None,
         "achieved_by_calibration": left.achieved if np.isfinite(left.achieved) else None,
         "share": left.share,
         "dependences": [

@@ -149,11 +149,11 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     left = diagnosis.unexplained
     if left is None:
         return []
-    unit, strongest = UNITS[left.channel], left.strongest
+    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.log}" if left.log else ""
     if left.beyond:
         size = f"{left.achieved:.3g} {unit}"
         known = f"{size} are noise" if diagnosis.bench.own_data else f"the calibration achieved {size} on its own data"
-        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, where {known}"
+        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     if strongest is None:
