@@ -10,8 +10,10 @@ from diagnosekit import drives
 
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.diagnose import confirmation, diagnosis, grammar
+from emb_daemon.diagnose.comparison import episodes_by_log
 from emb_daemon.diagnose.coordinates import TOLERATED
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
+from emb_daemon.diagnose.model import LASTING, rms_known
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
@@ -177,6 +179,51 @@ def test_validation_has_a_veto(nominal, judged, monkeypatch):
     assert page(result)
 
 
+def test_a_recalibration_that_validation_logs_refuse_is_said(calibration, judged, monkeypatch):
+    """By a log of a brake that is as calibrated. The fitted log goes on being as wrong as it was, and that is told, too."""
+    another = log_of(next(drives(_from_which_it_starts(calibration), 54, {}, stops=3)))
+
+    def against_torque(tried, judges):
+        suspect = next((name for name in ("viscous_friction", "torque") if name in tried.suspects), None)
+        return suspect and (suspect, "withdrawn: it is worse there")
+
+    monkeypatch.setattr(confirmation, "_veto", against_torque)
+    result = judged(another)
+    assert result.calibration.motor == result.original.motor
+    [(channel, refused)] = report(result)["not_recalibrated"].items()
+    assert channel == "torque" and refused["gain_N"] > 100.0 and refused["reason"] == "withdrawn: it is worse there"
+    assert "Not recalibrated: the torque path, which would gain" in verdict(result)
+    there = rms_known(result.initial["torque"], result.bench.episode["torque"], LASTING["torque"])
+    assert result.left["torque"].present and result.left["torque"].rms == pytest.approx(there)
+    of_another = rms_known(result.judges.residuals({})["torque"], result.judges.episode["torque"], LASTING["torque"])
+    assert of_another < 0.3 * there
+
+
+def test_logs_on_which_the_force_got_worse_are_said(viscous, judged, monkeypatch):
+    """Though others gain far more than one loses; and what it loses by half takes back what did it."""
+    judge_errors, factors = confirmation.errors, [0.2, 0.2, 1.2]
+
+    def scaled(bench, calibration):
+        found = judge_errors(bench, calibration)
+        if len(bench.trials) == 3 and "viscous_friction" in calibration.effects:
+            return dataclasses.replace(found, sums=found.sums * (np.square(factors) @ episodes_by_log(bench)))
+        return found
+
+    for module in (confirmation, diagnosis):
+        monkeypatch.setattr(module, "errors", scaled)
+    monkeypatch.setattr(confirmation, "is_refuted", lambda *_: False)
+    monkeypatch.setattr(diagnosis, "_with_noise", lambda calibration, selection: calibration)
+    result = judged(*3 * [viscous[2]])
+    assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
+    name = viscous[2].path.name
+    [worse] = report(result)["worse"]
+    assert worse["log"] == name and worse["rmse_after_N"] == pytest.approx(1.2 * worse["rmse_before_N"], rel=0.1)
+    assert f"Worse on {name} (" in verdict(result)
+    factors[2] = 1.8
+    refused = next(f for f in judged(*3 * [viscous[2]]).findings if f.effect.name == "viscous_friction")
+    assert not refused.accepted and f"fused error on {name} goes from" in refused.reason and "validation" in refused.reason
+
+
 @pytest.mark.parametrize(
     ("does_N", "true", "lasting_N", "noise_N", "refuted"),
     [
@@ -259,8 +306,9 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
     trials = [SimpleNamespace(episode=episode, log=SimpleNamespace(path=Path(name))) for name in ("far.log", "near.log")]
     by_sample = np.repeat(np.arange(8), 100)
     bench = SimpleNamespace(
-        trials=trials, calibration=None, residuals=lambda _: {}, own_data=own_data, sample_episode=by_sample
-    )
+        trials=trials, calibration=None, residuals=lambda _: {}, own_data=own_data, sample_episode=by_sample,
+        sources=["far.log", "near.log"],
+    )  # fmt: skip
 
     def of(far_N, near_N):
         return EpisodeErrors.joined([EpisodeErrors.of({"fused": np.full(400, size)}, {}, episode) for size in (far_N, near_N)])

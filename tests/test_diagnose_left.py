@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -12,7 +13,7 @@ from diagnosekit import drives
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.diagnose import diagnosis
 from emb_daemon.diagnose.diagnosis import diagnose
-from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import _left
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.selection import Selection
@@ -50,34 +51,47 @@ def test_whether_something_matters_can_be_written_as_json():
     assert limit == pytest.approx(60.0) and json.dumps(limit <= 70.0) == "true"
 
 
-@pytest.mark.trial
-def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibration, monkeypatch):
-    """A torque that is off by 15 % in some stops and right in others: the filter would take it for other pads. What this
-    unit's gear has of its own is less than the 4.7 % that the calibration grants. It is said although it drowns in the
-    current's noise sample by sample."""
+def _unsearched(bench, progress):
+    start = Model.of(bench)
+    return Selection(start.refined(bench.channels), Screening(bench, start))
 
-    def unsearched(bench, progress):
-        start = Model.of(bench)
-        return Selection(start.refined(bench.channels), Screening(bench, start))
 
-    monkeypatch.setattr(diagnosis, "select", unsearched)
-    log = log_of(next(drives(calibration, 54, {}, stops=8)))
-    result = diagnose([log], calibration)
-    assert result.calibration.noise.torque_lasting == 0.0 and "Some stops" not in verdict(result)
-    assert not result.left["torque"].beyond
+def _some_stops_off(log, calibration, name="frames"):
+    """The same log with a torque that is off by 15 % in some stops."""
     clamped = log.force_N > 500.0
     stop = np.cumsum(np.diff(clamped, prepend=False) & clamped)
     signs = np.random.default_rng(5).choice([0.0, 0.15], stop.max() + 1)
     samples = log.samples.copy()
     factor = calibration.motor.gear_gain_m_per_rad / calibration.motor.torque_constant_Nm_per_A
     samples["current_q"] += np.where(clamped, signs[stop] * factor * log.force_N, 0.0)
-    result = diagnose([dataclasses.replace(log, samples=samples)], calibration)
+    return dataclasses.replace(log, samples=samples, path=Path(name))
+
+
+@pytest.mark.trial
+def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibration, monkeypatch):
+    """A torque that is off by 15 % in some stops and right in others: the filter would take it for other pads. What this
+    unit's gear has of its own is less than the 4.7 % that the calibration grants. It is said although it drowns in the
+    current's noise sample by sample."""
+
+    monkeypatch.setattr(diagnosis, "select", _unsearched)
+    log, another = map(log_of, drives(calibration, 54, {}, stops=8))
+    result = diagnose([log], calibration)
+    assert result.calibration.noise.torque_lasting == 0.0 and "Some stops" not in verdict(result)
+    assert not result.left["torque"].beyond
+    result = diagnose([_some_stops_off(log, calibration)], calibration)
     # Half of it, as a mean is no change, and more where friction helps the brake to open.
     assert 0.05 < result.calibration.noise.torque_lasting < 0.12
     assert "Some stops leave the torque off" in verdict(result)
     assert result.left["torque"].beyond and rmse(result.residual["torque"]) < 1.5 * calibration.provenance.achieved["torque_N"]
     stated = moved(calibration, {"noise.torque_lasting": 0.3})
     assert diagnose([log], stated).calibration.noise.torque_lasting == 0.3
+    # Of one log among others it is said, too.
+    result = diagnose([log], calibration, [another] * 12 + [_some_stops_off(another, calibration, "off.log")])
+    left = result.left["torque"]
+    assert left.beyond and left.log == "off.log" and "torque path on off.log" in verdict(result)
+    parts = (result.judges.by_log(every["torque"]) for every in (result.judges.residuals({}), result.judges.episode))
+    each = [rms_known(*log, LASTING["torque"]) for log in zip(*parts, strict=True)]
+    assert rmse(np.array(each)) < 1.5 * left.achieved < each[-1]
 
 
 def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):

@@ -16,10 +16,11 @@ from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import diagnose
-from emb_daemon.diagnose.forms import harmonic, made_effect
+from emb_daemon.diagnose.evidence import Evidence
+from emb_daemon.diagnose.forms import enumerate_forms, harmonic, made_effect
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
-from emb_daemon.diagnose.prospects import Search
+from emb_daemon.diagnose.prospects import Prospect, Search
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
@@ -217,6 +218,26 @@ def _prospect(port, signals, numbers, gain, columns=()):
     return SimpleNamespace(
         form=form, means=(port, " times ".join(signals)), evidence=SimpleNamespace(gain=gain), columns=columns
     )
+
+
+@pytest.mark.parametrize(
+    ("port", "signal", "shape", "physical"),
+    [
+        ("torque_constant", "winding_heat", "odd_power", (True, False)),
+        ("torque_constant", "housing_heat", "decay", (False, True)),
+        ("torque_constant", "current", "even_power", (True, True)),
+        ("gear_friction", "winding_heat", "odd_power", (True, True)),
+    ],
+)
+def test_the_heat_of_its_own_motor_strengthens_no_magnet(port, signal, shape, physical):
+    """A torque constant that seems to grow with it is something else's shadow: no form of it is taken, nor fitted so."""
+    forms = [form for form in enumerate_forms({signal: (0.0, 1.0)}, (port,)) if form.shape == shape]
+    for form in forms:
+        for sign, allowed in zip((-1.0, 1.0), physical, strict=True):
+            evidence = Evidence(0.0, 1.0, 9.0, np.array([sign * form.step]), np.array([0.0]))
+            assert prospects._stays_in_bounds(Prospect(form, [], evidence)) is allowed
+        assert form.amplitudes == tuple(sign * np.inf if ok else 0.0 for sign, ok in zip((-1.0, 1.0), physical, strict=True))
+    assert forms
 
 
 def test_a_form_that_does_next_to_nothing_gains_nothing():

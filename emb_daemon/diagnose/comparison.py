@@ -36,6 +36,17 @@ def errors(bench: Bench, calibration: Calibration) -> EpisodeErrors:
     return EpisodeErrors.joined([errors_of(bench, trial, bench.on(trial, calibration)) for trial in bench.trials])
 
 
+def by_log(bench: Bench, judged: EpisodeErrors, path: str) -> np.ndarray:
+    """RMSE of a path, N, on each log of the bench whose episodes were ``judged``, shape (logs,); NaN where it has none."""
+    return judged.rmses(path, "total", episodes_by_log(bench))
+
+
+def episodes_by_log(bench: Bench) -> np.ndarray:
+    """One for each episode that is a log's own, else zero, shape (logs, episodes)."""
+    lengths = [int(trial.episode[-1]) + 1 for trial in bench.trials]
+    return (np.repeat(np.arange(len(lengths)), lengths) == np.arange(len(lengths))[:, None]).astype(float)
+
+
 def whole(bench: Bench) -> str:
     """The path by which a diagnosis is judged: the fused force, or the only path there is."""
     if not bench.has_reference:

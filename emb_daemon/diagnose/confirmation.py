@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emb_daemon.diagnose.comparison import errors, errors_of, whole
+from emb_daemon.diagnose.comparison import by_log, episodes_by_log, errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.evidence import Moments, leave_out
 from emb_daemon.diagnose.model import is_shape
@@ -26,7 +26,7 @@ from emb_daemon.offline.score import EpisodeErrors, rmse
 _FOLDS = 4
 #: Factor on the fused error from which it has become worse. Learning of the contact angle and the reference's noise cause
 #: smaller changes, if an effect is real but the fused force rests on the other path.
-_HARM = 1.05
+HARM = 1.05
 #: The same for a single log, whose few episodes scatter more: the factor from which a residual counts as unexplained.
 _LOG_HARM = CLEARLY
 #: Share of the samples with a force before that must have one after: a delay takes some at the edges.
@@ -93,26 +93,22 @@ def _against(
         rest = {suspect: unseen(left_out_errors(selection, suspect), suspect).rmse(main) for suspect in selection.suspects}
         where = "left-out episodes and validation logs" if beside else "left-out episodes"
         return min(rest, key=rest.__getitem__), f"{worse} on {where}"
-    if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[0])):
-        own, told = ruined
+    if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[1])):
+        told, own = ruined
         rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
-        return min(rest, key=rest.__getitem__), told
+        return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
     return None
 
 
-def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[np.ndarray, str] | None:
-    """The log whose ``main`` error rose most, where that is clear: which episodes are its own, and what became of it."""
-    lengths = [int(trial.episode[-1]) + 1 for trial in bench.trials]
-    of = np.repeat(np.arange(len(lengths)), lengths)
-    own = [(of == index).astype(float) for index in range(len(lengths))]
-    pairs = [(before.rmse(main, weights=there), after.rmse(main, weights=there)) for there in own]
-    ratios = [last / first if first > 0.0 else 0.0 for first, last in pairs]
-    worst = int(np.nanargmax(ratios)) if np.isfinite(ratios).any() else 0
-    if not ratios[worst] > _LOG_HARM:
+def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[str, np.ndarray] | None:
+    """What became of the log whose ``main`` error rose most, where that is clear, and which episodes are its own."""
+    first, last = by_log(bench, before, main), by_log(bench, after, main)
+    ratios = np.nan_to_num(np.divide(last, first, out=np.zeros_like(last), where=first > 0.0))
+    worst = int(np.argmax(ratios))
+    if ratios[worst] <= _LOG_HARM:
         return None
-    first, last = pairs[worst]
-    name = bench.trials[worst].log.path.name
-    return own[worst], f"the estimator's {main} error on {name} goes from {first:.4g} to {last:.4g} N on left-out episodes"
+    change = f"goes from {first[worst]:.4g} to {last[worst]:.4g} N"
+    return f"the estimator's {main} error on {bench.sources[worst]} {change}", episodes_by_log(bench)[worst]
 
 
 def _guilty(selection: Selection, there: np.ndarray) -> list[str]:
@@ -231,7 +227,7 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
     }  # fmt: skip
 
 
-def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: float = _HARM) -> str:
+def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: float = HARM) -> str:
     """What got worse in words, or nothing: a path that says less than before, or the ``main`` one's error, which may rise by
     the factor ``tolerated``."""
     for path in before.paths:
@@ -239,6 +235,17 @@ def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: floa
             return f"the estimator's {path} force is no number where it was one"
     first, last = before.rmse(main), after.rmse(main)
     return f"the estimator's {main} error goes from {first:.4g} to {last:.4g} N" if last > tolerated * first else ""
+
+
+def harm_of_logs(
+    judges: Bench, before: EpisodeErrors, after: EpisodeErrors, tolerated: float = HARM
+) -> tuple[str, np.ndarray | None]:
+    """The same of validation logs, where no single one may be ruined for the others' sake, and the episodes that say so as
+    weights, shape (episodes,); None for all of them."""
+    main = whole(judges)
+    if worse := harm(before, after, main, tolerated):
+        return worse, None
+    return _ruined(judges, before, after, main) or ("", None)
 
 
 def validation_gains(selection: Selection, judges: Bench) -> dict[str, float]:
@@ -270,7 +277,7 @@ def is_refuted(there: np.ndarray, bare: np.ndarray, episode: np.ndarray) -> bool
 
     Where it does next to nothing a log is a little better or worse for it by chance, and refutes nothing. What makes its path
     clearly worse goes in any case."""
-    if _gain(there, bare) >= 0.0 or rmse(there) > _HARM * rmse(bare):
+    if _gain(there, bare) >= 0.0 or rmse(there) > HARM * rmse(bare):
         return _gain(there, bare) < 0.0
     moments = Moments.of((bare - there)[:, None], bare, episode, int(episode[-1]) + 1)
     share = leave_out(moments, np.zeros(1))
@@ -289,9 +296,10 @@ def _veto(selection: Selection, judges: Bench) -> tuple[str, str] | None:
     bench, main = selection.model.bench, whole(judges)
     before = errors(judges, bench.calibration)
     # If nothing is clamped there is only this path, and no other hides the effect of a recalibration.
-    tolerated = _HARM if judges.clamps else 1.0
-    worse = harm(before, errors(judges, bench.calibrated(selection.applied())), main, tolerated)
+    tolerated = HARM if judges.clamps else 1.0
+    worse, there = harm_of_logs(judges, before, errors(judges, bench.calibrated(selection.applied())), tolerated)
     if not worse or not spoken:
         return None
-    rest = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))).rmse(main) for suspect in spoken}
+    without = {suspect: errors(judges, bench.calibrated(selection.applied(suspect))) for suspect in spoken}
+    rest = {suspect: its.rmse(main, weights=there) for suspect, its in without.items()}
     return min(rest, key=rest.__getitem__), f"withdrawn: {worse} on the validation logs"

@@ -15,8 +15,8 @@ from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.files import date_of_today
 from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
-from emb_daemon.diagnose.comparison import comparison, errors, whole
-from emb_daemon.diagnose.confirmation import confirm, harm, validation_gains
+from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
+from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
@@ -115,6 +115,18 @@ class Diagnosis:
         return max(present, key=lambda left: (left.beyond, np.nan_to_num(left.rms / left.achieved)), default=None)
 
     @property
+    def worse(self) -> list[tuple[str, float, float]]:
+        """Logs on which the error was judged and has risen, with the error (N) before and after."""
+        pairs = (by_log(self.judges, judged, self.whole).tolist() for judged in (self.before, self.after))
+        every = zip(self.judges.sources, *pairs, strict=True)
+        return [(name, first, last) for name, first, last in every if last > HARM * first]
+
+    @property
+    def refused(self) -> dict[str, tuple[float, str]]:
+        """Channels whose recalibration these logs prove and which is not applied, with what it gains there and why."""
+        return {c: told for c, told in self.selection.refused.items() if c not in self.selection.touched}
+
+    @property
     def whole(self) -> str:
         return whole(self.judges)
 
@@ -176,7 +188,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     judging = judges or bench
     before = errors(judging, calibration)
     after = errors(judging, augmented) if judges else left_out
-    if judges and harm(before, after, whole(judges)):
+    if judges and harm_of_logs(judges, before, after)[0]:
         # What was found the validation logs have not refused; then it is how the noise, stated anew, weighs the paths.
         augmented, after = found, errors(judges, found)
     final = judging.under(augmented).residuals({}) if judges else selection.model.residual
@@ -344,13 +356,11 @@ def _left(
     judging: Bench,
     augmented: Calibration,
 ) -> dict[str, Left]:
-    """What is left in each channel: its size where the error is judged, its dependences where effects were looked for.
+    """What is left in each channel: its size where the error is judged, and its dependences where effects were looked for.
 
     ``chosen``: the selection before confirmation, which may have taken out what these logs prove."""
     model, screening, result = selection.model, selection.screening, {}
-    force = np.concatenate([np.nan_to_num(trial.force_N) for trial in judging.trials])
-    if not judging.has_reference:
-        force = screening.signals["clamp_force"]
+    force = _force_of(judging) if judging.has_reference else screening.signals["clamp_force"]
     rise = np.concatenate([(t.temperature_C - t.temperature_C[:1]).ravel() for t in judging.trials])
     for channel in model.bench.channels:
         if channel not in after:
@@ -366,7 +376,13 @@ def _left(
                 least = max(least, least_dependence(model.residual[channel], samples))
             found = dependences(channel, gains, model.counted(channel), least)
         first, last = (rms_known(residual[channel], judging.episode[channel], samples) for residual in (before, after))
-        known = screening.achieved(model, channel, force, rise, samples)
+        known, log = screening.achieved(model, channel, force, rise, samples), ""
+        if channel in FORCE_CHANNELS and not is_beyond(last, known):
+            each = _by_log(selection, channel, judging, before[channel], after[channel])
+            if channel in selection.refused and channel not in selection.touched:
+                each += _by_log(selection, channel, model.bench, *2 * [screening.initial[channel]])
+            if beyond := [one for one in each if is_beyond(*one[1:3])]:
+                first, last, known, log = max(beyond, key=lambda one: one[1] / one[2])
         if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):
             # Where the brake torque is measured the pads' friction has no share in it.
             first, last = (rms_known(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
@@ -376,8 +392,33 @@ def _left(
         found = [*withdrawn, *(d for d in found if d.signal not in {w.signal for w in withdrawn})]
         found.sort(key=lambda dependence: -dependence.share)
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, known, share, tuple(found))
+        result[channel] = Left(channel, last, known, share, tuple(found), log)
     return result
+
+
+def _by_log(
+    selection: Selection, channel: str, bench: Bench, before: np.ndarray, after: np.ndarray
+) -> list[tuple[float, float, float, str]]:
+    """What lasts of a channel before and after, RMS, what the calibration achieved, and the log: of each with episodes enough
+    to tell it from chance. It would drown in that of logs that are right."""
+    if not bench.has_reference or bench.own_data:
+        return []
+    samples, episode = LASTING[channel], bench.episode[channel]
+    parts = zip(*map(bench.by_log, (before, after, episode, _force_of(bench))), bench.sources, strict=True)
+    return [
+        (
+            *(rms_known(residual, own, samples) for residual in (first, last)),
+            selection.screening.achieved(selection.model, channel, force, np.zeros(0), samples),
+            log,
+        )
+        for first, last, own, force, log in parts
+        if np.ptp(own) + 1 >= EPISODES
+    ]
+
+
+def _force_of(bench: Bench) -> np.ndarray:
+    """Reference force (N) at every sample, nothing where it is not known."""
+    return np.concatenate([np.nan_to_num(trial.force_N) for trial in bench.trials])
 
 
 def _withdrawn(selection: Selection, chosen: Selection, channel: str) -> list[Dependence]:

@@ -17,6 +17,7 @@ from emb_daemon.effects.terms import PORTS, SIGNALS
 
 #: Temperature (degC) at which a term that follows one is nothing.
 _COLD_C = 20.0
+_MOTOR_HEAT = ("winding_heat", "housing_heat")
 _TEMPERATURES = ("surface_temperature", "pad_temperature", "disc_temperature", "caliper_temperature")
 _SLOW = (
     *_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "energy", "time_clamped", "time_since_last_clamp"
@@ -27,9 +28,9 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "motor_angle": ("motor_angle", "current"),
     "stiffness": (*_SLOW, "travel", "clamp_force"),
     "force": ("clamp_force",),
-    "torque_constant": ("current", "winding_heat", "housing_heat", *_TEMPERATURES),
+    "torque_constant": ("current", *_MOTOR_HEAT, *_TEMPERATURES),
     "torque": ("motor_speed", "motor_angle"),
-    "current": ("energy", "winding_heat", "housing_heat", *_TEMPERATURES),
+    "current": ("energy", *_MOTOR_HEAT, *_TEMPERATURES),
     "relaxation_time": (*_TEMPERATURES, "clamp_force", "disc_speed", "brake_torque"),
     "pad_friction": (
         "surface_temperature",
@@ -41,7 +42,7 @@ _TYPED: dict[str, tuple[str, ...]] = {
         "energy",
     ),
     "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
-    "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", "winding_heat", "housing_heat", *_SLOW),
+    "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", *_MOTOR_HEAT, *_SLOW),
     "heat_share": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "friction_power", "energy"),
     "contact_conductance": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "energy"),
     "gap_conductance": ("disc_speed", "disc_temperature", "surface_temperature", "time_since_last_clamp"),
@@ -124,6 +125,11 @@ class Form:
         """How many numbers it takes to state it: coefficients, sizes, and those beside them."""
         return 1 + (self.shape == "harmonic") + len(self.fitted) + further_numbers(self)
 
+    def is_physical(self, coefficient: float) -> bool:
+        """Whether physics allows the coefficient its sign: the heat of its own motor strengthens no magnet."""
+        strengthens = coefficient > 0.0 if self.shape != "decay" else coefficient < 0.0
+        return not (strengthens and self.port == "torque_constant" and {*self.signals} <= {*_MOTOR_HEAT})
+
     @property
     def step(self) -> float:
         """A small coefficient, in the port's unit."""
@@ -134,7 +140,7 @@ class Form:
         """Bounds of the coefficient. A heat balance has them while it is fitted: next to nothing times very much would be as
         good a conductance as what it is times a little."""
         if HOOKS[self.port].channel != "temperature":
-            return -np.inf, np.inf
+            return (-np.inf if self.is_physical(-1.0) else 0.0), (np.inf if self.is_physical(1.0) else 0.0)
         tried = self.term(coefficient=self.step)
         shaped = tried.reach[1] / self.step
         return -tried.limit / shaped, tried.growth / shaped

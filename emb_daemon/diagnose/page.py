@@ -7,6 +7,7 @@ from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
+from emb_daemon.diagnose.unexplained import Left
 from emb_daemon.effects.terms import CLAMPED_N
 from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, xy_figure
 from emb_daemon.report.page import Page
@@ -136,7 +137,7 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
     section.table(
         ["", "left, RMS", least, "unit", "share of before", ""],
         [
-            [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}", UNITS[c], f"{p.share:.2f}", "not explained" if p.present else ""]
+            [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}", UNITS[c], f"{p.share:.2f}", _where(p)]
             for c, p in diagnosis.left.items()
         ],
         "Residual with the contact angle held. No effect of the catalogue explains what is marked; none was invented.",
@@ -164,6 +165,10 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
             ],
             f"{NAMES[channel]}: share of the residual's mean square that a smooth function explains on left-out episodes.",
         )
+
+
+def _where(left: Left) -> str:
+    return f"not explained on {left.log}" if left.log else "not explained" if left.present else ""
 
 
 def _candidates(report: Page, diagnosis: Diagnosis) -> None:

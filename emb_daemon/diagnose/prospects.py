@@ -466,10 +466,9 @@ def _term_of(prospect: Prospect) -> Term:
 
 def _stays_in_bounds(prospect: Prospect) -> bool:
     try:
-        _term_of(prospect)
+        return prospect.form.is_physical(_term_of(prospect).coefficient)
     except InvalidValue:
         return False
-    return True
 
 
 def _length(prospect: Prospect, alone: float, episodes: int) -> float:

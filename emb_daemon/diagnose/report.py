@@ -35,6 +35,10 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
             for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
             if getattr(diagnosis.original.noise, name) != getattr(diagnosis.calibration.noise, name)
         },
+        "not_recalibrated": {
+            channel: _gain(gain, channel) | {"reason": reason} for channel, (gain, reason) in diagnosis.refused.items()
+        },
+        "worse": [{"log": log, "rmse_before_N": first, "rmse_after_N": last} for log, first, last in diagnosis.worse],
         "unexplained": _unexplained(diagnosis),
         "judged_residual": {
             channel: {"unit": UNITS[channel], "rms_before": before, "rms_after": after}
@@ -65,6 +69,7 @@ def _left(left: Left) -> dict:
         "present": left.present,
         "unit": UNITS[left.channel],
         "rms": left.rms,
+        "log": left.log or None,
         "achieved_by_calibration": left.achieved if np.isfinite(left.achieved) else None,
         "share": left.share,
         "dependences": [

@@ -46,6 +46,7 @@ class Selection:
     Attributes:
         candidates: what became of each effect that was off, by name; the accepted ones are those in the model.
         recalibrated: channels whose base parameters were off, with the RMS that refitting them gains on left-out episodes.
+        refused: channels whose recalibration was taken out again, with what it gained and why.
         dropped: effects that were accepted and are not to be tried again.
         at_first: what the residual depended on before any effect was accepted, by channel.
     """
@@ -54,6 +55,7 @@ class Selection:
     screening: Screening
     candidates: dict[str, Candidate] = field(default_factory=dict)
     recalibrated: dict[str, float] = field(default_factory=dict)
+    refused: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     dropped: frozenset[str] = frozenset()
     at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
 
@@ -97,7 +99,9 @@ class Selection:
     def without(self, suspect: str, reason: str) -> "Selection":
         """An accepted effect, or the recalibration of a channel, taken out; what remains of its channel refitted."""
         if suspect in self.recalibrated:
-            return replace(self, recalibrated={c: gain for c, gain in self.recalibrated.items() if c != suspect})
+            left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}
+            refused = {**self.refused, suspect: (self.recalibrated[suspect], reason)}
+            return replace(self, recalibrated=left, refused=refused)
         candidate, own = self.candidates[suspect], self.model.of_effect(suspect)
         if self._is_of_heat(suspect):
             together = [name for name in self.accepted if self._is_of_heat(name)]

@@ -95,9 +95,22 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    return " ".join(
-        [text, *_recalibration(diagnosis), *_no_tolerance(diagnosis), *_unexplained(diagnosis), *_stated(diagnosis)]
-    )
+    parts = (_worse, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
+
+
+def _worse(diagnosis: Diagnosis) -> list[str]:
+    """Logs that have lost by what was found, whatever the others gain."""
+    logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
+    return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _refused(diagnosis: Diagnosis) -> list[str]:
+    """Recalibrations that these logs prove and that are not applied."""
+    return [
+        f"Not recalibrated: the {NAMES[channel]}, which would gain {gain:.3g} {UNITS[channel]} on these logs ({reason})."
+        for channel, (gain, reason) in diagnosis.refused.items()
+    ]
 
 
 def _recalibration(diagnosis: Diagnosis) -> list[str]:
@@ -136,11 +149,11 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     left = diagnosis.unexplained
     if left is None:
         return []
-    unit, strongest = UNITS[left.channel], left.strongest
+    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.log}" if left.log else ""
     if left.beyond:
         size = f"{left.achieved:.3g} {unit}"
         known = f"{size} are noise" if diagnosis.bench.own_data else f"the calibration achieved {size} on its own data"
-        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}, where {known}"
+        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     if strongest is None:

@@ -70,6 +70,7 @@ class Left:
             not say.
         share: of the mean square there was before, that is left.
         dependences: on signals, strongest first.
+        log: the only one on which so much is left, if it is not all.
     """
 
     channel: str
@@ -77,6 +78,7 @@ class Left:
     achieved: float
     share: float
     dependences: tuple[Dependence, ...]
+    log: str = ""
 
     @property
     def beyond(self) -> bool:
