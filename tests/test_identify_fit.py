@@ -29,11 +29,12 @@ from emb_daemon.identify.dynamics import (
     Pads,
     errors_unseen,
     fit_dynamics,
+    powers,
     regress_free,
     simulate,
     starting_point,
 )
-from emb_daemon.identify.steps import attribution, noise, stiffness, torque
+from emb_daemon.identify.steps import attribution, contact, noise, stiffness, torque
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import log_of
@@ -276,6 +277,38 @@ def test_what_a_jaw_drags_on_its_way_is_no_contact(zero_N, drag_N, apart):
     assert found.curves[0].clearances_rad == pytest.approx(30.0, abs=apart)
     assert found.curves[0].rises and rising_force(found.curves[0].coefficients) > 0.9 * force_N.max()
     assert found.rms < 0.08 * force_N.max()
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A slow press on what rises with the square of its travel, a minute and a half, half of it open again."""
+    known = _one_curve()
+    time_s = 0.05 * np.arange(1800)
+    angle = 50.0 * np.clip(1.0 - np.abs(time_s / 20.0 - 1.0), 0.0, None)
+    force_N = 9.0 * np.maximum(angle - 30.0, 0.0) ** 2 + np.random.default_rng(3).normal(0.0, 5.0, len(angle))
+    log = emb_daemon.log_of_arrays(time_s, angle, force_N=0.0 * angle)
+    log = dataclasses.replace(log, force_N=np.interp(log.time_s, time_s, force_N))
+    return stiffness.identify([Pads(known.pad_thickness_mm, (log,))], replace(known, effects={}))
+
+
+def test_contact_is_as_sure_as_a_bound_that_holds_the_first_slope(pressed):
+    """Slope at contact and contact make up for each other: with the slope free it was 30 rad and 400 of standard deviation."""
+    curve = pressed.fit.curves[0]
+    assert curve.clearances_rad == pytest.approx(30.0, abs=0.3) and curve.clearance_sigmas_rad < 0.3
+    assert pressed.fit.rms < 8.0
+
+
+def test_a_slow_log_is_searched_from_a_curve_that_fits_it(pressed):
+    """A regression over the sample before is one over noise there, and the search ended at another contact."""
+    (log,) = pressed.pads[0].logs
+    start = starting_point(pressed.pads, _one_curve(), ())
+    x = log.samples["angle"] - log.samples["angle"][0] - pressed.fit.curves[0].clearances_rad
+    assert rmse(powers(x) @ start.stiffness.curves[0].coefficients - log.force_N) < 0.05 * log.force_N.max()
+
+
+def test_what_dies_away_after_a_release_is_no_walk_of_the_contact(pressed):
+    """Of half a minute with the pads apart the force says nothing of their contact."""
+    assert contact.identify(pressed, 1e-4, 30.0).values["contact.walk_rad_per_sqrt_s"] < 0.05
 
 
 def test_a_loop_of_a_rubber_is_found():

@@ -298,8 +298,12 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
             values[f"effects.{effect.name}.{p.name}"] = float(np.clip(start, p.low, p.high))
     for pads in groups:
         log = pads.logs[-1]
-        coefficients = regress_free(log, _past_contact(log, calibration))[0]
-        if coefficients[0] <= 0.0:
+        x = _past_contact(log, calibration)
+        if is_slow(log):
+            # From sample to sample its force hardly changes, and a regression over the last one is of noise.
+            known, span = np.isfinite(log.force_N), float(x.max()) ** np.arange(1, TERMS + 1)
+            coefficients = nnls(powers(x[known]) / span, log.force_N[known])[0] / span
+        elif (coefficients := regress_free(log, x)[0])[0] <= 0.0:
             coefficients = np.nanmax(log.force_N) / TERMS / _scale(pads, calibration)
         values |= dict(zip(curve_keys(calibration, pads.thickness_mm), coefficients, strict=True))
     return moved(structs.replace(calibration, effects={}), values)
