@@ -61,7 +61,8 @@ def _walk(stiffness: StiffnessStep) -> float:
             slope, error = (moved - at) / _STEP, at - log.force_N
             parts = [slice(start, start + _ROWS) for start in range(0, len(error) - _ROWS + 1, _ROWS)]
             weights = np.array([slope[part] @ slope[part] for part in parts])
-            told = (weights > _TELLS * np.max(weights, initial=0.0)) & [np.isfinite(error[part]).all() for part in parts]
+            whole = np.array([np.isfinite(error[part]).all() for part in parts], bool)
+            told = whole & (weights > _TELLS * np.max(weights, initial=0.0))
             shifts = [-float(slope[parts[n]] @ error[parts[n]]) / weights[n] for n in np.flatnonzero(told)]
             squares += float(np.sum(np.diff(shifts) ** 2))
             seconds += _ROWS * CYCLE_S * max(len(shifts) - 1, 0)
