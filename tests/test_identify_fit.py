@@ -27,13 +27,15 @@ from emb_daemon.identify.dynamics import (
     CurveFit,
     DynamicsFit,
     Pads,
+    clearance_guess,
     errors_unseen,
     fit_dynamics,
+    powers,
     regress_free,
     simulate,
     starting_point,
 )
-from emb_daemon.identify.steps import attribution, noise, stiffness, torque
+from emb_daemon.identify.steps import attribution, contact, noise, stiffness, torque
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import log_of
@@ -278,6 +280,43 @@ def test_what_a_jaw_drags_on_its_way_is_no_contact(zero_N, drag_N, apart):
     assert found.curves[0].clearances_rad == pytest.approx(30.0, abs=apart)
     assert found.curves[0].rises and rising_force(found.curves[0].coefficients) > 0.9 * force_N.max()
     assert found.rms < 0.08 * force_N.max()
+
+
+def _press_log(way_s, ripple_N=0.0):
+    """A slow press, ``way_s`` each way, on what rises with the square of its travel, and half as long open again."""
+    time_s = 0.05 * np.arange(round(50.0 * way_s))
+    angle = 50.0 * np.clip(1.0 - np.abs(time_s / way_s - 1.0), 0.0, None)
+    log = emb_daemon.log_of_arrays(time_s, angle, force_N=0.0 * angle)
+    force_N = 9.0 * np.maximum(log.samples["angle"] - 30.0, 0.0) ** 2
+    force_N += np.sign(force_N) * ripple_N * np.sin(0.2 * np.pi * log.time_s)
+    return dataclasses.replace(log, force_N=force_N + np.random.default_rng(3).normal(0.0, 1.0, len(force_N)))
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    known = _one_curve()
+    return stiffness.identify([Pads(known.pad_thickness_mm, (_press_log(20.0),))], replace(known, effects={}))
+
+
+def test_contact_is_as_sure_as_a_bound_that_holds_the_first_slope(pressed):
+    """Slope at contact and contact make up for each other: with the slope free it was 30 rad and 400 of standard deviation."""
+    curve = pressed.fit.curves[0]
+    assert curve.clearances_rad == pytest.approx(30.0, abs=0.3) and curve.clearance_sigmas_rad < 0.3
+    assert pressed.fit.rms < 4.0
+
+
+def test_a_slow_log_is_searched_from_a_curve_that_fits_it():
+    """What a load cell's error over a screw's turn is from sample to sample, a regression over the last sample takes for a lag
+    of seconds, and the search began at a third of the force and ended at another contact."""
+    log, known = _press_log(200.0, ripple_N=60.0), _one_curve()
+    start = starting_point([Pads(known.pad_thickness_mm, (log,))], known, ()).stiffness.curves[0].coefficients
+    past = 50.0 - clearance_guess(log, log.samples["angle"] - log.samples["angle"][0])
+    assert powers(np.array([past])) @ start == pytest.approx(log.force_N.max(), rel=0.1)
+
+
+def test_what_dies_away_after_a_release_is_no_walk_of_the_contact(pressed):
+    """Of half a minute with the pads apart the force says nothing of their contact."""
+    assert contact.identify(pressed, 1e-4, 30.0).values["contact.walk_rad_per_sqrt_s"] < 0.05
 
 
 def test_a_loop_of_a_rubber_is_found():

@@ -773,7 +773,8 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
         (0.01, 0, "CurrentQ comes 10 ms after the load that it belongs to: a `mean_ms` longer by 20"),
         (0.01, 20, ""),
         (-0.001, 0, ""),
-        (0.05, 0, ""),
+        (0.05, 0, "CurrentQ comes 50 ms after the load"),
+        (-0.08, 0, "CurrentQ comes 80 ms before the load that it belongs to: is ClampForceRef late? Then `mean_ms: 160`"),
     ],
 )
 def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_s, mean_ms, said):

@@ -298,8 +298,12 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
             values[f"effects.{effect.name}.{p.name}"] = float(np.clip(start, p.low, p.high))
     for pads in groups:
         log = pads.logs[-1]
-        coefficients = regress_free(log, _past_contact(log, calibration))[0]
-        if coefficients[0] <= 0.0:
+        x = _past_contact(log, calibration)
+        if is_slow(log):
+            # From sample to sample its force hardly changes, and a regression over the last one is of noise.
+            known, span = np.isfinite(log.force_N), float(x.max()) ** np.arange(1, TERMS + 1)
+            coefficients = nnls(powers(x[known]) / span, log.force_N[known])[0] / span
+        elif (coefficients := regress_free(log, x)[0])[0] <= 0.0:
             coefficients = np.nanmax(log.force_N) / TERMS / _scale(pads, calibration)
         values |= dict(zip(curve_keys(calibration, pads.thickness_mm), coefficients, strict=True))
     return moved(structs.replace(calibration, effects={}), values)
@@ -327,8 +331,9 @@ class _Model:
     def __init__(self, groups: list[Pads], start: Calibration, delay_s: float, fraction: float, shared: tuple[str, ...]):
         self.groups, self.start, self.delay_s, self.fraction, self.shared = groups, start, delay_s, fraction, shared
         self.curves = [curve_keys(start, pads.thickness_mm) for pads in groups]
+        self.free = self._free()
 
-    def free(self) -> dict:
+    def _free(self) -> dict:
         free = {key: _free(self.start, key) for key in self.shared if key != DELAY}
         if DELAY in self.shared:
             free[DELAY] = Free(self.delay_s, 1e-7, -0.01, 0.01)
@@ -385,13 +390,17 @@ class _Model:
         for g, (pads, own) in enumerate(zip(self.groups, self.curves, strict=True)):
             contacts = [(g, number) for number in range(len(pads.logs))]
             clearances = np.array([found.values[key] for key in contacts])
+            covariance = found.block([*own, *contacts])
+            if found.values[own[0]] < 1.01 * self.free[own[0]].low and 0.0 < covariance[0, 0] < np.inf:
+                # Where a force rises is as sure as the bound that holds its first slope: the two would make up for each other.
+                covariance -= np.outer(covariance[0], covariance[0]) / covariance[0, 0]
             curves.append(
                 CurveFit(
                     pads.thickness_mm,
                     np.array([found.values[key] for key in own]),
-                    found.block(own),
+                    covariance[:TERMS, :TERMS],
                     clearances,
-                    np.array([found.sigmas[key] for key in contacts]),
+                    np.sqrt(np.maximum(np.diag(covariance)[TERMS:], 0.0)),
                     float(max(_travel(log, self.start).max() - c for log, c in zip(pads.logs, clearances, strict=True))),
                 )
             )
@@ -428,7 +437,7 @@ def fit_dynamics(
             left out.
     """
     model = _Model(groups, start, delay_s, fraction, (*dynamics(start), DELAY) if shared is None else shared)
-    blocks, first = model.blocks(), model.free()
+    blocks, first = model.blocks(), model.free
     angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]
     if search and angles:
         # A loop's width and its turning length compensate each other: another turning length may lead to another minimum.
@@ -441,4 +450,4 @@ def fit_dynamics(
     found = model.result(fit(blocks, first, tolerance=1e-6))
     if all(curve.rises for curve in found.curves):
         return found
-    return model.result(fit([*blocks, *model.rising()], model.free(), tolerance=1e-6))
+    return model.result(fit([*blocks, *model.rising()], model.free, tolerance=1e-6))

@@ -51,10 +51,11 @@ _PASSES, _PLACES = 1.5, 400
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
-#: Least delay of a current that is said, half a cycle of ours, and longest that is looked for, ms; how many times less of the
-#: current the load and the motion must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose
-#: current is not 5.7.
-_LEAST_CURRENT_MS, _LONGEST_CURRENT_MS, _CURRENT_BETTER = 2, 30, 1.5
+#: Least delay of a current that is said, half a cycle of ours, and longest that is looked for beside an acceleration, which a
+#: longer part of a motion that repeats itself resembles, and beside a load, whose sensor may have a slow filter, ms; how many
+#: times less of the current they must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose
+#: current is not 5.7; number of samples that are compared.
+_LEAST_CURRENT_MS, _BESIDE_MOTION_MS, _BESIDE_LOAD_MS, _CURRENT_BETTER, _COMPARED = 2, 30, 150, 1.5, 10_000
 #: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
 #: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
 #: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
@@ -317,10 +318,7 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     left = np.array([left_N(lag) for lag in lags])
     if not np.isfinite(left).any():
         return []
-    # Of a motion that repeats itself the least of the lags counts that fit, and none with which the force falls.
-    around = np.pad(left, 1, constant_values=np.inf)
-    near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]
-    lag_s = float(near[np.argmin(np.abs(near))])
+    lag_s = float(_least_lag(lags, left))
     gain = left_N(0.0) / max(np.min(left), 1.0)
     if lag_s > _LATE_S and gain > _LATE_BETTER:
         return [
@@ -335,32 +333,39 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     return []
 
 
+def _least_lag(lags: np.ndarray, left: np.ndarray) -> float:
+    """The least of the lags with which as little is ``left`` as with any: a motion that repeats itself has several."""
+    around = np.pad(left, 1, constant_values=np.inf)
+    near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]
+    return near[np.argmin(np.abs(near))]
+
+
 def _find_late_current(speed: Series, current: Series, force: Series | None) -> list[str]:
     """A line on a current of another time than the load and the acceleration that it explains."""
     times = current.time_ns[:_JUDGED]
     at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
     columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
-    known = np.all(np.isfinite(columns), axis=1)
-
-    def left_A(lag_ms: int) -> float:
-        values = current.sampled(times + 1_000_000 * lag_ms)
-        mine = known & np.isfinite(values)
-        if np.sum(mine) < _LEAST:
-            return np.inf
-        return float(np.std(values[mine] - columns[mine] @ np.linalg.lstsq(columns[mine], values[mine])[0]))
-
-    left = {lag_ms: left_A(lag_ms) for lag_ms in range(-_LONGEST_CURRENT_MS, _LONGEST_CURRENT_MS + 1)}
-    late_ms = min(left, key=left.__getitem__)
+    longest_ms = _BESIDE_MOTION_MS if force is None else _BESIDE_LOAD_MS
+    lags_ms = np.arange(-longest_ms, longest_ms + 1)
+    every = len(times) // _COMPARED + 1
+    times, columns = times[::every], columns[::every]
+    values = np.stack([current.sampled(times + 1_000_000 * lag_ms) for lag_ms in lags_ms.tolist()], axis=1)
+    known = np.isfinite(columns).all(axis=1) & np.isfinite(values).all(axis=1)
+    if np.sum(known) < _LEAST:
+        return []
+    explained, values = np.linalg.qr(columns[known])[0], values[known]
+    left_A = np.std(values - explained @ (explained.T @ values), axis=0)
+    late_ms, now_A = int(_least_lag(lags_ms, left_A)), left_A[longest_ms]
     # At the end of the search it is no delay but a slow motion, in which all is alike.
-    if not _LEAST_CURRENT_MS <= abs(late_ms) < _LONGEST_CURRENT_MS or not left[0] > _CURRENT_BETTER * left[late_ms]:
+    if not _LEAST_CURRENT_MS <= abs(late_ms) < longest_ms or not now_A > _CURRENT_BETTER * np.min(left_A):
         return []
     what, other = ("the acceleration", "are angle and speed") if force is None else ("the load", "is ClampForceRef")
     if late_ms > 0.0:
         return [f"CurrentQ comes {late_ms} ms after {what} that it belongs to: a `mean_ms` longer by {2 * late_ms}?"]
-    return [
-        f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: is it a value of the moment? Then `mean_ms: 0`; "
-        f"or {other} late? Then `mean_ms: {-2 * late_ms}` there"
-    ]
+    # A value of the moment that is taken for a mean since the last one comes half a period too early.
+    moment = "is it a value of the moment? Then `mean_ms: 0`; or " if -late_ms * 1e6 < current.period_ns else ""
+    told = f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: {moment}{other} late?"
+    return [f"{told} Then `mean_ms: {-2 * late_ms}` there"]
 
 
 def _find_too_fast(angle: Series) -> list[str]:

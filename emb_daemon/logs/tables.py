@@ -422,6 +422,12 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         )
 
     table = read(".")
+    reached = odd[0].actual_columns if len(odd) > table.num_rows else len(cells)
+    if reached < len(cells) and {*names} <= {*cells[:reached]} | {f"column {n + 1}" for n in range(reached)}:
+        more = ", ".join(filter(None, cells[reached:]))
+        print(f"{path}: rows have {reached} cells, the header {len(cells)}; its last name nothing: {more}", file=sys.stderr)
+        cells = cells[:reached]
+        table = read(".")
     wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
     texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
     # A comma that does not separate is decimal; it may occur for the first time after many rows.
@@ -435,7 +441,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         )
     if odd:
         print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
-    stated = [next(filter(None, map(known_as, column)), "") for column in zip(*rows[:units], strict=False)]
+    stated = [next(filter(None, map(known_as, column)), "") for column in itertools.zip_longest(*rows[:units], fillvalue="")]
     marks = {_DECIMAL: b","} if commas else {}
     fields = [
         field.with_metadata(marks | ({_UNIT: unit} if unit else {}))
@@ -528,7 +534,9 @@ def _without_header(lines: list[str], words: bool) -> tuple[int, str] | None:
             continue
         # Of separators other than blanks the comma last, because it may be decimal.
         mark = next((mark for mark in (";", "\t", "|", ",", " ") if len(_cells(line, mark)) > 1), ",")
-        if all(map(_is_number, filter(None, _cells(line, mark)))):
+        # A number by itself above a table is none of its rows.
+        alone = len(_cells(line, mark)) == 1 < max(len(_cells(below, " ")) for below in lines[row + 1 : row + 3] or [""])
+        if not alone and all(map(_is_number, filter(None, _cells(line, mark)))):
             return row - 1, mark
         if not words:
             return None

@@ -10,6 +10,9 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Samples over which one contact angle is estimated: ten seconds, in which it hardly moves.
 _ROWS = 2500
+#: Share of the information of a log's best ten seconds that others have at least: with less their contact angle is ten times
+#: as unsure, and of pads that have just parted there is nothing but a force that dies away.
+_TELLS = 0.01
 #: Step of the derivative by the clearance, rad.
 _STEP = 1e-3
 
@@ -56,12 +59,11 @@ def _walk(stiffness: StiffnessStep) -> float:
                 simulate(log, fit.calibration, pads.thickness_mm, clearance + step, fit.delay_s) for step in (0.0, _STEP)
             )
             slope, error = (moved - at) / _STEP, at - log.force_N
-            shifts = []
-            for start in range(0, len(error) - _ROWS + 1, _ROWS):
-                part = slice(start, start + _ROWS)
-                weight = float(slope[part] @ slope[part])
-                if weight > 0.0 and np.isfinite(error[part]).all():
-                    shifts.append(-float(slope[part] @ error[part]) / weight)
+            parts = [slice(start, start + _ROWS) for start in range(0, len(error) - _ROWS + 1, _ROWS)]
+            weights = np.array([slope[part] @ slope[part] for part in parts])
+            whole = np.array([np.isfinite(error[part]).all() for part in parts], bool)
+            told = whole & (weights > _TELLS * np.max(weights, initial=0.0))
+            shifts = [-float(slope[parts[n]] @ error[parts[n]]) / weights[n] for n in np.flatnonzero(told)]
             squares += float(np.sum(np.diff(shifts) ** 2))
             seconds += _ROWS * CYCLE_S * max(len(shifts) - 1, 0)
     return float(np.sqrt(squares / seconds)) if seconds else 0.0
