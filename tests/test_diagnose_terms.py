@@ -25,8 +25,8 @@ from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection, revise
-from emb_daemon.diagnose.signals import MANOEUVRES
-from emb_daemon.diagnose.text import verdict
+from emb_daemon.diagnose.signals import MANOEUVRES, outside_range
+from emb_daemon.diagnose.text import _outside, verdict
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline import log_of
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
@@ -163,6 +163,29 @@ def test_terms_that_logs_cannot_tell_apart_are_named_together(calibration, coupl
     told = verdict(result)
     assert f"as likely it is of disc speed at the contact; what would tell: {MANOEUVRES['brake_torque']}" in told
     assert "brake torque at the stiffness" in told
+
+
+def test_where_a_log_leaves_the_range_of_a_term_is_said(calibration):
+    """What a term adds there is a guess."""
+    bench = Bench([log_of(next(drives(calibration, 31, {})))], calibration)
+    known = {"shape": "odd_power", "coefficient": 1e-4, "port": "stiffness", "signal": "brake_torque"}
+    most = float(np.max(bench.trials[0].brake_torque_Nm))
+    wide, narrow, product = (
+        Term(name=f"term:{name}", **known, **more)
+        for name, more in {
+            "wide": {"low": -1.0, "high": 1.01 * most},
+            "narrow": {"low": -1.0, "high": 0.5 * most},
+            "product": {"low": -1.0, "high": 1.01 * most, "other": "pad_temperature", "other_high": 21.0},
+        }.items()
+    )
+    assert outside_range(bench, [wide]) == []
+    [torque] = outside_range(bench, [wide, narrow])
+    assert (torque.term, torque.signal, torque.found) == ("term:narrow", "brake_torque", (-1.0, 0.5 * most))
+    assert torque.share > 0.05 and torque.reached[1] == pytest.approx(most, rel=0.01)
+    [warm] = outside_range(bench, [product])
+    assert warm.signal == "pad_temperature" and warm.found == (None, 21.0) and warm.reached[1] > 25.0
+    [told] = _outside(SimpleNamespace(outside=[warm]))
+    assert "pad temperature is outside the range in which term:product was found" in told and "the range 21 °C" in told
 
 
 def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves_as_much(coupled, monkeypatch):

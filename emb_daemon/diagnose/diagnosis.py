@@ -24,6 +24,7 @@ from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Progress, Selection
+from emb_daemon.diagnose.signals import Outside, outside_range
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond, least_dependence
 from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect
@@ -81,6 +82,7 @@ class Diagnosis:
         judged_residual: (before, after) RMS of each channel's residual on the validation logs.
         left: what is left, by channel; ``left_before``: dependences before anything was accepted.
         withdrawn: names of what the fit logs prove and confirmation took out again.
+        outside: where the validation logs leave the range in which a term was found.
     """
 
     original: Calibration
@@ -101,6 +103,7 @@ class Diagnosis:
     left: Mapping[str, Left]
     left_before: Mapping[str, list[Dependence]]
     withdrawn: tuple[str, ...]
+    outside: Sequence[Outside]
     seconds: float
 
     @property
@@ -213,6 +216,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         left=_left(selection, chosen, judged_before, final, judging, augmented),
         left_before=selection.at_first,
         withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
+        outside=outside_range(judges, (t for t in augmented.terms if t.name in selection.accepted)) if judges else (),
         seconds=time.monotonic() - begin,
     )
     progress("done", 1.0)

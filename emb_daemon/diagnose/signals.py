@@ -1,9 +1,14 @@
 """Signals that a residual may depend on, and smooth functions of them: what is left is judged without a model."""
 
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import numpy as np
 
+from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, Bench
+from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import CLAMPED_N
 from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline.run import estimate, held
@@ -12,6 +17,8 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
+#: Share of the samples outside of a term's range that is said: of those that showed it the range holds all but a few.
+_TELLS = 0.05
 
 #: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not, in words for
 #: any machine where one without a brake has the signal.
@@ -81,6 +88,35 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
             there = bench.clamps or name not in OF_A_BRAKE
             columns.setdefault(name, []).append(column if there else np.zeros(len(time)))
     return {name: np.concatenate(parts) for name, parts in columns.items()}
+
+
+class Outside(NamedTuple):
+    """A signal that leaves the range in which a term was ``found`` (None: no low end), and what it reaches, in its unit."""
+
+    term: str
+    signal: str
+    share: float
+    found: tuple[float | None, float]
+    reached: tuple[float, float]
+
+
+def outside_range(bench: Bench, terms: Iterable[Term]) -> list[Outside]:
+    """Where the logs of the bench leave the terms' ranges for more than some samples in which the terms matter."""
+    terms = tuple(terms)
+    there, result = signals(bench) if terms else {}, []
+    for term in terms:
+        always = HOOKS[term.port].channel == CHANNEL_OF_HEAT or not bench.clamps
+        ranges = [(term.signal, term.low, term.high)]
+        if term.other:
+            ranges.append((term.other, -np.inf if term.other_from else -term.other_high, term.other_high))
+        for name, low, high in ranges:
+            signal = there.get(name, np.zeros(0))
+            signal = signal if always or not len(signal) else signal[there["clamp_force"] > CLAMPED_N]
+            share = float(np.mean((signal < low) | (signal > high))) if len(signal) else 0.0
+            if share > _TELLS:
+                found = low if np.isfinite(low) else None, high
+                result.append(Outside(term.name, name, share, found, (float(signal.min()), float(signal.max()))))
+    return result
 
 
 def _around(signal: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.effects.terms import SIGNALS
 
 #: Where a term acts, for people.
 _PORTS = {
@@ -95,7 +96,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -103,6 +104,19 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
     """Logs that have lost by what was found, whatever the others gain."""
     logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
     return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _outside(diagnosis: Diagnosis) -> list[str]:
+    """Where a term holds the value of its range's edge, which is no more than a guess there."""
+    told = []
+    for name, signal, share, (low, high), reached in diagnosis.outside:
+        unit, least = SIGNALS[signal], "" if low is None else f"{low:.3g} to "
+        told.append(
+            f"In {100.0 * share:.0f} % of the validation logs' samples {in_words(signal)} is outside the range in which "
+            f"{name} was found (there {reached[0]:.3g} to {reached[1]:.3g} {unit}, the range {least}{high:.3g} {unit}): "
+            "the term keeps the value of its edge."
+        )
+    return told
 
 
 def _refused(diagnosis: Diagnosis) -> list[str]:
