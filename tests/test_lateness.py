@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, restart, step
+from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
 from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, stand, unfilter
@@ -367,6 +368,24 @@ def test_what_a_filtered_speed_hides_is_not_taken_for_another_brake(parameters, 
     assert resumed["lateness"]["filtered"] == snapshot["filtered"] == pytest.approx(filter_s, rel=0.15, abs=_DT / 2)
     snapshot["filtered"] = 0.05
     assert restart.why_implausible(snapshot, p) == "filtered"
+
+
+def test_what_was_seen_beside_another_speed_is_forgotten_with_it(parameters):
+    """In the sample in which the speed becomes another: an acceleration between both is none, and what they said of the brake
+    and of the angle is void."""
+    samples, _ = city.drive(0, 20.0)
+    samples, state = samples.copy(), new_state()
+    samples["speed"] = _filtered(samples["speed"], 0.012)
+    out = None
+    for row in range(len(samples)):
+        before, out = out, estimate(samples[row : row + 1], parameters, state)[0]
+        if state["lateness"]["filtered"][0] > 0.0:
+            break
+    opened = state.copy()
+    open_all(opened[0], parameters[0])
+    assert 0 < row < len(samples) - 1 and np.isfinite(before["innovation"]) and np.isnan(out["innovation"])
+    assert state["plausibility"]["apart"][0] == 0.0 and np.isnan(state["strayed"][0])
+    assert state["alternatives"]["log_odds"].tolist() == opened["alternatives"]["log_odds"].tolist()
 
 
 @pytest.mark.parametrize("offset", [-2.0, 0.2])
