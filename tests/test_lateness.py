@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, restart, step
+from emb_daemon.estimator.contact import follow_zero
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
@@ -278,6 +279,15 @@ def _turning(p):
     m = brake.samples(p, np.zeros(2))[0][1]
     m["angle"], m["speed"] = -0.3, 100.0
     return m
+
+
+@pytest.mark.parametrize(("filtered_s", "moved"), [(0.0, True), (0.03, False)])
+def test_what_a_late_speed_leaves_where_a_filter_is_undone_moves_no_zero(parameters, s, filtered_s, moved):
+    """An angle that is 0.8 rad ahead of a speed that gains 40 rad/s in a sample."""
+    m = _turning(parameters[0])
+    s["speed"], s["lateness"]["filtered"] = 60.0, filtered_s
+    m["angle"] = 0.5 * (100.0 + 60.0) * _DT + 0.8
+    assert follow_zero(s, parameters[0], m) == moved
 
 
 @pytest.mark.parametrize("what", ["nothing", "zero moved", "no time", "a sample missing", "drifting", "frozen"])
