@@ -19,6 +19,7 @@ from emb_daemon.logs import apart, read
 from emb_daemon.logs.candump import format_candump, parse_candump
 from emb_daemon.logs.columns import Decoder, References
 from emb_daemon.logs.read import read_frames, read_log
+from emb_daemon.offline import log_of
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 
 _messages = st.builds(
@@ -335,3 +336,10 @@ def test_a_log_takes_memory_for_its_frames_and_not_for_its_lines(tmp_path):
     tracemalloc.stop()
     assert peak < 3 * path.stat().st_size
     assert set(recorded.channels) == {"can0"}
+
+
+@pytest.mark.parametrize("corner", ["fl", "XX", ""])
+def test_what_is_no_corner_is_refused(corner):
+    frames = np.zeros(1, FRAME)
+    with pytest.raises(InputError, match=f"corner {corner}: expected one of FL, FR, RL, RR"):
+        log_of(frames, corner)

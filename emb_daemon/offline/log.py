@@ -71,7 +71,7 @@ def load_log(path: str | Path, corner: str = "FL", read: Callable[[Path], np.nda
     """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
 
     Raises:
-        InputError: unreadable, or no resolver sample of that corner in it.
+        InputError: unreadable, not a corner, or no resolver sample of it.
     """
     return log_of(read(Path(path)), corner, Path(path))
 
@@ -80,9 +80,9 @@ def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) 
     """A FRAME array as samples; ``path`` is what messages call it.
 
     Raises:
-        InputError: no resolver sample of that corner in it.
+        InputError: not a corner, or no resolver sample of it.
     """
-    return make_log(samples_in(frames, (corner,))[0], frames, corner, path)
+    return make_log(samples_in(frames, (CORNERS[corner_index(corner)],))[0], frames, corner, path)
 
 
 def samples_in(frames: np.ndarray, corners: tuple[str, ...]) -> tuple[np.ndarray, Pipeline]:
