@@ -12,6 +12,7 @@ from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
 from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, stand, unfilter
+from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import OUT_OF_RANGE, PATHS_DISAGREE
 
@@ -378,6 +379,17 @@ def test_what_a_filtered_speed_hides_is_not_taken_for_another_brake(parameters, 
     assert resumed["lateness"]["filtered"] == snapshot["filtered"] == pytest.approx(filter_s, rel=0.15, abs=_DT / 2)
     snapshot["filtered"] = 0.05
     assert restart.why_implausible(snapshot, p) == "filtered"
+
+
+def test_a_resolver_that_passed_for_drifting_beside_an_offset_is_believed_again_where_the_motor_stands(parameters, s):
+    """Half a second of rest shows the offset; that the angle follows the speed again would take a stroke."""
+    p, m = parameters[0], _turning(parameters[0])
+    m["angle"], m["speed"], m["has_status"], m["park_brake"], m["brake_request"] = 0.0, 2.0, True, 0.0, 0.0
+    s["past_contact"], s["drifting_s"] = -1.0, 30.0
+    s["plausibility"]["held"], s["plausibility"]["verdict"] = 100, STIFFNESS_WRONG
+    for _ in range(125):
+        step._follow_noise(s, p, m)
+    assert s["drifting_s"] == 0.0 and s["plausibility"]["verdict"] == AGREE
 
 
 def test_what_was_seen_beside_another_speed_is_forgotten_with_it(parameters):
