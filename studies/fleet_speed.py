@@ -5,7 +5,6 @@ much faster several workers are than one, what memory each takes, and what a day
 """
 
 import os
-import resource
 import sys
 import tempfile
 import time
@@ -28,7 +27,7 @@ from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
-from emb_daemon.resources import resource as shipped
+from emb_daemon.resources import resource
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -127,7 +126,9 @@ def _add(_drive: Drive) -> int:
 
 
 def _peak_MiB() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    # Not getrusage, whose peak a process inherits from the one that started it.
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024.0
 
 
 def _time(task: Callable) -> float:
@@ -142,7 +143,7 @@ def _time(task: Callable) -> float:
 
 
 def main() -> None:
-    path, calibration = Path(sys.argv[1]), load_calibration(shipped("config/calibration.yaml"))
+    path, calibration = Path(sys.argv[1]), load_calibration(resource("config/calibration.yaml"))
     workers = int(sys.argv[2]) if len(sys.argv) > 2 else len(os.sched_getaffinity(0))
     print(f"{'stage':<24}µs a sample   × real time")
     times = {}

@@ -15,7 +15,7 @@ from emb_daemon.diagnose import confirmation, diagnosis, grammar, prospects, sea
 from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
-from emb_daemon.diagnose.diagnosis import diagnose
+from emb_daemon.diagnose.diagnosis import diagnose, with_terms
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.forms import enumerate_forms, harmonic, made_effect
 from emb_daemon.diagnose.model import Model
@@ -160,6 +160,7 @@ def test_terms_that_logs_cannot_tell_apart_are_named_together(calibration, coupl
     result = diagnose(logs[:1], calibration, logs[1:])
     [entry] = [e for e in report(result)["effects"] if e["accepted"]]
     assert entry["alike"] == [{"port": "thickness", "signals": ["disc_speed"]}]
+    assert result.outside == [] and report(result)["outside_range"] == []
     told = verdict(result)
     assert f"as likely it is of disc speed at the contact; what would tell: {MANOEUVRES['brake_torque']}" in told
     assert "brake torque at the stiffness" in told
@@ -186,6 +187,23 @@ def test_where_a_log_leaves_the_range_of_a_term_is_said(calibration):
     assert warm.signal == "pad_temperature" and warm.found == (None, 21.0) and warm.reached[1] > 25.0
     [told] = _outside(SimpleNamespace(outside=[warm]))
     assert "pad temperature is outside the range in which term:product was found" in told and "the range 21 °C" in told
+
+
+def test_a_validation_log_that_leaves_the_range_of_a_term_is_said(calibration, coupled, monkeypatch):
+    """A harder stop than any that showed the term: what it does there was never seen."""
+    selection, log, another = coupled
+    [name] = selection.accepted
+    monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
+    monkeypatch.setattr(diagnosis, "with_terms", lambda *given: _narrowed(with_terms(*given), name))
+    result = diagnose([log], calibration, [another])
+    [place] = report(result)["outside_range"]
+    assert place["term"] == name and place["signal"] == "brake_torque" and place["reached"][1] > place["found"][1]
+    assert f"brake torque is outside the range in which {name} was found" in verdict(result)
+
+
+def _narrowed(calibration, name):
+    terms = [msgspec.structs.replace(t, high=0.5 * t.high) if t.name == name else t for t in calibration.terms]
+    return msgspec.structs.replace(calibration, terms=tuple(terms))
 
 
 def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves_as_much(coupled, monkeypatch):

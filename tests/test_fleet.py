@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -228,6 +229,17 @@ def test_work_without_workers_ends_and_says_so(monkeypatch):
     told = pytest.raises(Unavailable, match="no worker is left; run the same command again")
     with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as local, Client(local) as client, told:
         run(client, abs, [1])
+
+
+def test_work_whose_scheduler_is_gone_ends_and_says_so():
+    from distributed import Client, LocalCluster
+
+    local = LocalCluster(n_workers=0, processes=False, dashboard_address=None)
+    closing = threading.Timer(0.5, local.close)
+    with Client(local) as client, pytest.raises(Unavailable, match="the scheduler is gone; when it is back, run the same"):
+        closing.start()
+        run(client, abs, [1])
+    closing.join()
 
 
 def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, scheduler, calibration):

@@ -197,6 +197,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     final = judging.under(augmented).residuals({}) if judges else selection.model.residual
     judged_before = judging.residuals({})
     logs = [trial.log for trial in bench.trials]
+    made = [term for term in augmented.terms if term.name in selection.accepted]
     result = Diagnosis(
         original=calibration,
         calibration=_with_provenance(augmented, selection, after, judged_on, logs),
@@ -216,7 +217,7 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         left=_left(selection, chosen, judged_before, final, judging, augmented),
         left_before=selection.at_first,
         withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
-        outside=outside_range(judges, (t for t in augmented.terms if t.name in selection.accepted)) if judges else (),
+        outside=outside_range(judges.under(augmented), made) if judges else (),
         seconds=time.monotonic() - begin,
     )
     progress("done", 1.0)

@@ -38,8 +38,8 @@ _BEYOND_RAD = 0.1
 #: was at calibration; through more than twelve cycles a stroke is not seen.
 _WORTH_S, SLOWEST_S = 0.5 * CYCLE_S, 12.0 * CYCLE_S
 #: Standard deviation of an age from which a filter is sought, s, and as a share of the age: as a stroke begins, a speed that
-#: is late does not follow at all, as through any filter. Chosen on our own plant: without
-#: it a speed two cycles late passed for a filter of twelve, and without the share one of 25 ms was found a stroke too late.
+#: is late does not follow at all, as through any filter. Chosen on our own plant: without it a speed two cycles late passed
+#: for a filter of twelve, and without the share one of 25 ms was found a stroke too late.
 _CLEAR_S, _CLEAR = 2.5e-4, 0.04
 #: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
 #: offset, and largest offset, rad/s: a motor that went faster for as long would have gone a turn. Samples over which an offset

@@ -59,7 +59,7 @@ def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]
     rows += [(fact.sentence, (estimates["facts"] >> bit & 1).astype(bool), _REASON) for bit, fact in enumerate(TABLE.values())]
     rows = [row for row in reversed(rows) if row[1].any()]
     traces = [_row(time_s, active, float(height), style) for height, (_, active, style) in enumerate(rows)]
-    return Panel("Mode, source and reasons", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
+    return Panel("Mode, source, reasons and facts", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
 
 
 def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> list[Panel]:
