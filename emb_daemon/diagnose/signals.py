@@ -17,8 +17,9 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Knots of a smooth function of one signal.
 _KNOTS = 7
-#: Share of the samples outside of a term's range that is said: of those that showed it the range holds all but a few.
-_TELLS = 0.05
+#: Share of the samples outside of a term's range that is said, and least distance from it, in widths of the range: noise about
+#: its end is none, and so far away a twentieth of the term is unsure (`effects.terms`).
+_OFTEN, _FAR = 0.05, 0.05
 
 #: What tells whether something follows a signal: a manoeuvre in which that moves and what resembles it does not, in words for
 #: any machine where one without a brake has the signal.
@@ -101,7 +102,7 @@ class Outside(NamedTuple):
 
 
 def outside_range(bench: Bench, terms: Iterable[Term]) -> list[Outside]:
-    """Where the logs of the bench leave the terms' ranges for more than some samples in which the terms matter."""
+    """Where the logs of the bench leave the terms' ranges by more than noise, in many samples in which these matter."""
     terms = tuple(terms)
     there, result = signals(bench) if terms else {}, []
     for term in terms:
@@ -112,8 +113,9 @@ def outside_range(bench: Bench, terms: Iterable[Term]) -> list[Outside]:
         for name, low, high in ranges:
             signal = there.get(name, np.zeros(0))
             signal = signal if always or not len(signal) else signal[there["clamp_force"] > CLAMPED_N]
-            share = float(np.mean((signal < low) | (signal > high))) if len(signal) else 0.0
-            if share > _TELLS:
+            far = _FAR * (high - (low if np.isfinite(low) else term.other_from))
+            share = float(np.mean((signal < low - far) | (signal > high + far))) if len(signal) else 0.0
+            if share > _OFTEN:
                 found = low if np.isfinite(low) else None, high
                 result.append(Outside(term.name, name, share, found, (float(signal.min()), float(signal.max()))))
     return result
