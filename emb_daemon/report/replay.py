@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emb_daemon import __version__
-from emb_daemon.calibration.parameters import moved, parameter
+from emb_daemon.calibration.parameters import in_words, moved, parameter
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.status import TABLE
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -56,7 +56,8 @@ def _events(time_s: np.ndarray, estimates: np.ndarray) -> tuple[Panel, list[str]
     rows = [(f"mode: {name}", estimates["mode"] == code, _STRETCH) for code, name in enumerate(MODES)]
     rows += [(f"source: {name}", estimates["source"] == code, Style(PALE.colour, 7.0)) for code, name in SOURCES.items()]
     rows += [(word, (estimates["reasons"] >> bit & 1).astype(bool), _REASON) for bit, word in enumerate(REASONS)]
-    rows += [(fact.sentence, (estimates["facts"] >> bit & 1).astype(bool), _REASON) for bit, fact in enumerate(TABLE.values())]
+    # Their sentences would take half of the page from the plots.
+    rows += [(in_words(name), (estimates["facts"] >> bit & 1).astype(bool), _REASON) for bit, name in enumerate(TABLE)]
     rows = [row for row in reversed(rows) if row[1].any()]
     traces = [_row(time_s, active, float(height), style) for height, (_, active, style) in enumerate(rows)]
     return Panel("Mode, source, reasons and facts", "", traces, height=max(90, 24 * len(rows))), [row[0] for row in rows]
