@@ -217,7 +217,7 @@ def _succeed(s, p, kind, released):
     """Open a jump of ``kind`` anew. The one before is kept if it is clearly likelier than the kept one; after a release only
     if there is evidence for it, because evidence that is missing while closing may come while opening."""
     a, kept = s.alternatives[kind], s.alternatives[KEPT_JUMP]
-    if a.log_odds > kept.log_odds + _KEPT and (not released or a.log_odds > a.prior + _KEPT):
+    if a.log_odds > kept.log_odds + _KEPT and (not released or a.log_odds > _first_odds(s, kind) + _KEPT):
         _keep(s, a)
     _open(s, p, kind)
 
@@ -497,8 +497,8 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     if (undecided and stiffness.age_s > _AMBIGUOUS_S) or (not waited_for and (released or stiffness.age_s > _OPENED_S)):
         _succeed(s, p, STIFFNESS_JUMP, released)
         _succeed(s, p, TORQUE_JUMP, released)
-    refuted = released and kept.log_odds <= kept.prior
-    if refuted or (undecided and kept.age_s > _AMBIGUOUS_S):
+    refuted = released and kept.log_odds <= kept.least
+    if refuted or (undecided and kept.age_s > _AMBIGUOUS_S and kept.prior == kept.least):
         _forget_kept(s)
     return False
 
