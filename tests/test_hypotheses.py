@@ -181,6 +181,20 @@ def _longest(mask):
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
+@pytest.mark.parametrize("seed", [2, 3, 5])
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_pads_that_a_poor_torque_cannot_tell_from_the_calibrations_stay_possible(p, factor, seed):
+    """A torque that is known to a fifteenth of the force refutes no other pads within a stop: they are not forgotten with the
+    first release."""
+    p["torque_lasting_sigma"] = 1.0 / 15.0
+    true = p.copy()
+    true["curve"] = factor * true["curve"]
+    rows, force = brake.samples(true, brake.stops(p, 8, seed))
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    clamped = force > 1000.0
+    assert np.mean(np.abs(estimates["force"] - force)[clamped] > 3.0 * estimates["sigma"][clamped]) < 0.01
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_offset_that_closes_is_the_currents_too(p, seed):
     rows, force = _drive(p, seed=seed, stops=14, current=_shifted(1.0))

@@ -250,6 +250,41 @@ def test_sigma_grows_outside_of_the_range(calibration):
     assert sigma[1] < 1.1 * sigma[0] and sigma[2] > 3.0 * sigma[0]
 
 
+@pytest.mark.parametrize("heard", ["pulses", "vehicle", None])
+@pytest.mark.parametrize("wheel_speed", [None, 0.0])
+def test_a_term_over_a_disc_speed_that_is_lost_or_contradicted_is_told_by_others_or_doubted(calibration, heard, wheel_speed):
+    """Pulses or the vehicle's speed tell the disc's to some hundredths; without any the term may be all that it can be."""
+    if heard is None and wheel_speed is not None:
+        return
+    term = Term(
+        name="term:x",
+        port="stiffness",
+        signal="disc_speed",
+        shape="odd_power",
+        coefficient=0.3,
+        scale=40.0,
+        low=0.0,
+        high=40.0,
+    )
+    p = held(to_parameters(msgspec.structs.replace(calibration, terms=(term,))))
+    samples = drive()
+    samples["has_wheel_speed"], samples["wheel_speed"] = True, 30.0
+    healthy = estimate(samples, p)
+    samples["has_wheel_speed"], samples["wheel_speed"] = wheel_speed is not None, wheel_speed or 0.0
+    if heard == "pulses":
+        samples["has_wheel_pulse"] = True
+        samples["wheel_pulse"] = np.floor(np.cumsum(samples["dt"]) * 30.0 * 96 / (2.0 * np.pi)) % 4096
+    elif heard == "vehicle":
+        samples["has_status"], samples["vehicle_speed"] = True, 30.0 * 0.32
+    found = estimate(samples, p)
+    clamped = (np.cumsum(samples["dt"]) > 2.0) & (healthy["force"] > 3000.0)
+    off = (found["stiffness_force"] - healthy["stiffness_force"])[clamped]
+    assert np.all(np.abs(off) < 2.0 * found["stiffness_sigma"][clamped])
+    if heard:
+        assert np.all(np.abs(off) < 0.03 * healthy["force"][clamped])
+        assert np.all(found["stiffness_sigma"][clamped] < 0.05 * healthy["force"][clamped])
+
+
 @pytest.mark.parametrize(
     ("port", "coefficient"),
     [("torque", 0.05), ("gear_gain", 0.2), ("gear_friction", 0.8), ("torque_constant", 0.2), ("current", 2.0)],

@@ -169,6 +169,8 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
         row["limit"], row["growth"] = (term.limit, term.growth) if term.is_held else (np.inf, np.inf)
+        least, most = term.reach
+        row["most"] = max(min(-least, row["limit"]), min(most, row["growth"]))
 
 
 def faults_of(terms: tuple[Term, ...]) -> list[str]:

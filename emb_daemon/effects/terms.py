@@ -65,11 +65,13 @@ CLAMPED_N = 150.0
 TERM = np.dtype(
     [
         *fields("i8", "port signal memory shape gate other"),
-        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high limit growth other_from other_high"),
+        *fields(
+            "f8", "coefficient sine sigma scale centre exponent memory_scale low high limit growth most other_from other_high"
+        ),
     ],
     align=True,
 )
-#: ``other``: the signal that multiplies; negative for none.
+#: ``other``: the signal that multiplies; negative for none. ``most``: what the term adds or subtracts at most in its range.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
 #: ``added`` and its standard deviation ``outside`` of the terms' range, by port in its unit; ``sigma`` and ``torque_sigma``:
 #: what the latter makes of the static force (N) and of the torque (N m).
@@ -98,20 +100,20 @@ def _follow(signal, s, m):
     signal[_PADS] = 0.5 * (s.mean[0] + s.mean[1]) if s.temperature_known else np.nan
     signal[_DISC] = s.disc if s.temperature_known else np.nan
     signal[_CALIPER] = m.caliper if m.has_thermocouple else np.nan
-    wheel = m.wheel_speed if m.has_wheel_speed else 0.0
+    wheel = m.wheel_speed if m.has_wheel_speed and not s.wheel.contradicted else s.wheel.instead
     signal[_WHEEL] = wheel
     if wheel > TURNING_RAD_PER_S:
         signal[_BRAKE] = s.power / wheel
     elif not wheel > 0.0:
         # Until the disc stands the pads go on braking it, though too slowly for a power.
-        signal[_BRAKE] = 0.0
+        signal[_BRAKE] = 0.0 if wheel <= 0.0 else np.nan
     signal[_ENERGY] += s.power * m.dt
     clamped = force > CLAMPED_N
     signal[_CLAMPED] = signal[_CLAMPED] + m.dt if clamped else 0.0
     signal[_RELEASED] = 0.0 if clamped else signal[_RELEASED] + m.dt
     signal[_WINDING], signal[_HOUSING] = s.winding, s.housing
     signal[_SURFACE] = 0.5 * (s.pads[0, 0] + s.pads[1, 0]) if s.temperature_known else np.nan
-    signal[_POWER] = s.power
+    signal[_POWER] = s.power if np.isfinite(wheel) else np.nan
 
 
 @njit
@@ -193,13 +195,19 @@ def _value(q, t, k, dt, maximum_force):
 
 
 @njit
-def _outside_sigma(q, signal, added):
+def _outside_sigma(q, signal, added, unsure):
     """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of its
-    signals from their range, in widths of the range."""
+    signals from their range, in widths of the range; all that the term can be if a signal is not known. ``unsure``: how far
+    the disc's speed may be off, share."""
     x = signal[q.signal]
+    told = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
+    if not (told and np.isfinite(x) and (q.other < 0 or np.isfinite(signal[q.other]))):
+        return q.most
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
     if q.other >= 0:
         outside += max(_of_other(q, signal) - 1.0, 0.0)
+    if unsure > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
+        outside += unsure * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
     if not outside > 0.0:
         return 0.0
     return hypot(q.sigma, outside * max(abs(added), q.sigma))
@@ -235,11 +243,12 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
     for port in range(len(t.added)):
         t.added[port] = t.outside[port] = 0.0
     of_force = of_torque = 0.0
+    unsure = s.wheel.instead_unsure if s.wheel.contradicted or not m.has_wheel_speed else 0.0
     for k in range(e.count):
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
-        sigma = _outside_sigma(q, t.signal, value)
+        sigma = _outside_sigma(q, t.signal, value, unsure)
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:

@@ -92,6 +92,10 @@ CERTAIN_ODDS = 100.0
 #: Time after which an unproven jump is opened anew, s, and log odds over its successor from which the old one is kept too:
 #: more than noise causes.
 _OPENED_S, _KEPT = 1.0, 1.0
+#: Fall of the log odds by which a change that was likely from the start is refuted: evidence of seven to one (between positive
+#: and strong: Kass and Raftery, Bayes factors, JASA 90, 1995). A torque that is known to a few per cent takes them by more in
+#: the first stop, one that is known to a fifteenth by less.
+_REFUTED = 2.0
 #: Time, without that in the clearance, after which the stronger of two similar proven alternatives is accepted, and a merely
 #: suspected one given up at the next release, s: some stops of ordinary driving.
 _AMBIGUOUS_S = 20.0
@@ -217,7 +221,11 @@ def _succeed(s, p, kind, released):
     """Open a jump of ``kind`` anew. The one before is kept if it is clearly likelier than the kept one; after a release only
     if there is evidence for it, because evidence that is missing while closing may come while opening."""
     a, kept = s.alternatives[kind], s.alternatives[KEPT_JUMP]
-    if a.log_odds > kept.log_odds + _KEPT and (not released or a.log_odds > _first_odds(s, kind) + _KEPT):
+    # Of changes without evidence that of the stiffness path is kept, because the other leaves the force as it is.
+    unshown = kind == STIFFNESS_JUMP and kept.kind == TORQUE_JUMP and not kept.log_odds > kept.prior + _KEPT
+    yields = kind == TORQUE_JUMP and kept.kind == STIFFNESS_JUMP and not a.log_odds > a.prior + _KEPT
+    likelier = a.log_odds > kept.log_odds + _KEPT and not (yields and exists(kept))
+    if (likelier or unshown) and (not released or a.log_odds > max(_first_odds(s, kind) + _KEPT, a.prior - _REFUTED)):
         _keep(s, a)
     _open(s, p, kind)
 
@@ -497,7 +505,7 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     if (undecided and stiffness.age_s > _AMBIGUOUS_S) or (not waited_for and (released or stiffness.age_s > _OPENED_S)):
         _succeed(s, p, STIFFNESS_JUMP, released)
         _succeed(s, p, TORQUE_JUMP, released)
-    refuted = released and kept.log_odds <= kept.least
+    refuted = released and kept.log_odds <= max(kept.least, kept.prior - _REFUTED)
     if refuted or (undecided and kept.age_s > _AMBIGUOUS_S and kept.prior == kept.least):
         _forget_kept(s)
     return False

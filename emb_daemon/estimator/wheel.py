@@ -4,7 +4,7 @@ from math import exp, pi
 
 import numpy as np
 
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, fields, njit
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
@@ -12,6 +12,8 @@ from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 _MOVING_M_PER_S = 0.5
 #: Time over which pulses are counted into a speed, s.
 _COUNTED_S = 0.25
+#: Spread of a speed from so few pulses, share.
+_PULSES_SHARE = 0.05
 #: Number of pulses that a wheel with speed zero may still give while it comes to rest.
 _TURNED_PULSES = 12.0
 #: Time for which a wheel of a moving vehicle may stand, s: blocked, before anti-lock control releases it.
@@ -28,6 +30,9 @@ WHEEL = np.dtype(
         ("turned", "f8"),
         ("contradicted_s", "f8"),
         ("contradicted", "?"),
+        # Speed, rad/s, in place of a wheel speed that is lost or contradicted, NaN if nothing shows it, and how far
+        # it may be off, share.
+        *fields("f8", "instead instead_unsure"),
     ],
     align=True,
 )
@@ -56,7 +61,7 @@ def disc_speed(w: Record, m: Record) -> tuple[float, float]:
     by_vehicle = m.vehicle_speed / w.radius if m.has_status else np.nan
     if not m.has_wheel_speed:
         w.contradicted, w.contradicted_s = False, 0.0
-        return _without(by_pulses, by_vehicle)
+        return _without(w, by_pulses, by_vehicle)
     turning = m.wheel_speed > TURNING_RAD_PER_S
     if m.has_status and turning and m.vehicle_speed > 10.0 * _MOVING_M_PER_S:
         seen = m.vehicle_speed / m.wheel_speed
@@ -67,14 +72,16 @@ def disc_speed(w: Record, m: Record) -> tuple[float, float]:
     w.turned = 0.0 if turning or w.pulse_speed < TURNING_RAD_PER_S else w.turned + steps
     w.contradicted = w.contradicted_s > _BLOCKED_S or w.turned > _TURNED_PULSES
     if w.contradicted:
-        return _without(by_pulses, by_vehicle)
+        return _without(w, by_pulses, by_vehicle)
     return m.wheel_speed, 0.0
 
 
 @njit
-def _without(by_pulses, by_vehicle):
+def _without(w, by_pulses, by_vehicle):
     if np.isfinite(by_pulses):
-        return by_pulses, 0.05 * by_pulses
-    if np.isfinite(by_vehicle):
-        return by_vehicle, _RADIUS_SHARE * by_vehicle
+        w.instead, w.instead_unsure = by_pulses, _PULSES_SHARE
+    else:
+        w.instead, w.instead_unsure = by_vehicle, _RADIUS_SHARE
+    if np.isfinite(w.instead):
+        return w.instead, w.instead_unsure * w.instead
     return np.nan, np.inf
