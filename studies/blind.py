@@ -26,8 +26,7 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose import search
 from emb_daemon.diagnose.diagnosis import Diagnosis, diagnose
-from emb_daemon.diagnose.evidence import Averaging
-from emb_daemon.diagnose.model import LASTING, Model
+from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
@@ -411,8 +410,7 @@ def what_is_left(result: Diagnosis, plant: np.void, schedule: Schedule, seed: in
 
 
 def _lasting(bench: Bench, residual: Mapping[str, np.ndarray], path: str) -> float:
-    means = Averaging(bench.episode[path], LASTING[path])
-    return rmse(means.of(residual[path][:, None])[:, 0] * means.per_mean)
+    return rms_known(residual[path], bench.means(path, LASTING[path]))
 
 
 def parameter_error(trial: Trial) -> float:

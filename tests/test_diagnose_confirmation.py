@@ -193,9 +193,9 @@ def test_a_recalibration_that_validation_logs_refuse_is_said(calibration, judged
     [(channel, refused)] = report(result)["not_recalibrated"].items()
     assert channel == "torque" and refused["gain_N"] > 100.0 and refused["reason"] == "withdrawn: it is worse there"
     assert "Not recalibrated: the torque path, which would gain" in verdict(result)
-    there = rms_known(result.initial["torque"], result.bench.episode["torque"], LASTING["torque"])
+    there = rms_known(result.initial["torque"], result.bench.means("torque", LASTING["torque"]))
     assert result.left["torque"].present and result.left["torque"].rms == pytest.approx(there)
-    of_another = rms_known(result.judges.residuals({})["torque"], result.judges.episode["torque"], LASTING["torque"])
+    of_another = rms_known(result.judges.residuals({})["torque"], result.judges.means("torque", LASTING["torque"]))
     assert of_another < 0.3 * there
 
 

@@ -15,6 +15,7 @@ from emb_daemon.diagnose import diagnosis
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import _left
+from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
@@ -89,9 +90,19 @@ def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibrati
     result = diagnose([log], calibration, [another] * 12 + [_some_stops_off(another, calibration, "off.log")])
     left = result.left["torque"]
     assert left.beyond and left.log == "off.log" and "torque path on off.log" in verdict(result)
-    parts = (result.judges.by_log(every["torque"]) for every in (result.judges.residuals({}), result.judges.episode))
-    each = [rms_known(*log, LASTING["torque"]) for log in zip(*parts, strict=True)]
+    residual, means = result.judges.residuals({})["torque"], result.judges.means("torque", LASTING["torque"])
+    number = np.concatenate([np.full(len(trial.episode), trial.index) for trial in result.judges.trials])
+    each = [rms_known(np.where(number == own, residual, 0.0), means) for own in range(number[-1] + 1)]
     assert rmse(np.array(each)) < 1.5 * left.achieved < each[-1]
+
+
+def test_what_lasts_of_a_torque_is_that_of_sliding_friction(calibration):
+    """How friction turns over the calibration's noise states; what is off while it slides is seen in full."""
+    bench = Bench([log_of(next(drives(calibration, 54, {}, stops=3)))], calibration)
+    [trial], means = bench.trials, bench.means("torque", LASTING["torque"])
+    assert 0.01 < np.mean(~trial.slides) < 0.2
+    assert rms_known(np.where(trial.slides, 0.0, 900.0), means) == 0.0
+    assert rms_known(np.where(trial.slides, 100.0, 900.0), means) == pytest.approx(100.0)
 
 
 def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):

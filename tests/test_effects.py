@@ -188,7 +188,8 @@ def test_acts_on_its_own_path(effect):
     stiffness = np.abs(changed["stiffness_force"] - plain["stiffness_force"]).max()
     torque = np.nanmax(np.abs(changed["torque_force"] - plain["torque_force"]))
     if effect.path == "stiffness":
-        assert stiffness > 5.0 and torque == 0.0
+        # Friction turns over with the motor, of which a late angle tells too late.
+        assert stiffness > 5.0 and (torque > 0.0) == (effect.name == "signal_delay")
     elif effect.path == "torque":
         assert torque > 5.0
         # What the torque path says reaches the stiffness path only through the heat of the fused force.

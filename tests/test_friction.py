@@ -10,6 +10,8 @@ from emb_daemon.estimator import paths
 from emb_daemon.estimator.records import new_state
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, turned_back
 from emb_daemon.offline import estimate
+from emb_daemon.offline.run import run_paths
+from emb_daemon.offline.score import rmse
 
 _PRESLIDING = 0.028
 
@@ -54,6 +56,21 @@ def test_standstill_forgets_and_sliding_knows():
         assert mean == state == 1.0
     assert np.all(np.diff(standing) > 0.0)
     assert standing[-1] == pytest.approx(0.3, rel=0.01)
+
+
+def test_friction_turns_over_with_the_motor_and_not_with_an_angle_that_is_known_to_be_late(parameters):
+    """To and fro within half a second; at rest the noise of the speed turns nothing over."""
+    p, time = brake.ideal(parameters), 0.004 * np.arange(2000)
+    stroke = np.clip(time, 0.0, 5.0) * 4.0 * np.pi
+    rows, _ = brake.samples(p, 8.0 - 3.0 * np.cos(stroke))
+    expected = run_paths(rows, p)["friction_mean"]
+    rows["angle"] = np.interp(time - 0.004, time, rows["angle"])
+    rows["speed"] += np.random.default_rng(0).normal(0.0, 0.3, len(rows))
+    unknown = run_paths(rows, p)["friction_mean"] - expected
+    p["effects"]["signal_delay"]["delay_s"] = 0.004
+    left = run_paths(rows, p)["friction_mean"] - expected
+    assert rmse(left) < 0.5 * rmse(unknown)
+    assert np.abs(left[time > 5.0]).max() < 0.05
 
 
 def test_the_torque_balance_claims_little_at_standstill(parameters):

@@ -83,3 +83,14 @@ def test_a_speed_that_repeats_with_the_angle_tells_of_no_way(p):
     # As it came, sample by sample, the same way is missing.
     speeds[1:12] += np.arange(11)
     assert any(_zeros_moved(p, angles, speeds))
+
+
+def test_an_angle_that_repeats_as_each_motion_begins_is_late_and_has_lost_nothing(p):
+    """Older than its speed by a cycle, to and fro without a longer rest: what it lacks as a stroke begins at once comes at its
+    end, and the way back begins slowly."""
+    there = np.concatenate([np.linspace(0.0, 150.0, 7), np.linspace(150.0, 0.0, 7), np.zeros(10)])
+    back = np.concatenate([[0.0, 4.0], np.linspace(10.0, 150.0, 7), np.linspace(150.0, 0.0, 7), np.zeros(8)])
+    speeds = np.concatenate([*[there, -back] * 20, np.zeros(60)])
+    angles = np.cumsum(0.5 * (speeds + np.roll(speeds, 1))) * 0.004
+    angles[1:] = angles[:-1].copy()
+    assert not any(_zeros_moved(p, angles, speeds + 0.1 * (-1.0) ** np.arange(len(speeds))))

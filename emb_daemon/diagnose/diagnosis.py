@@ -380,7 +380,8 @@ def _left(
             if not model.bench.own_data:
                 least = max(least, least_dependence(model.residual[channel], samples))
             found = dependences(channel, gains, model.counted(channel), least)
-        first, last = (rms_known(residual[channel], judging.episode[channel], samples) for residual in (before, after))
+        means = None if model.bench.own_data else judging.means(channel, samples)
+        first, last = (rms_known(residual[channel], means) for residual in (before, after))
         known, log = screening.achieved(model, channel, force, rise, samples), ""
         if channel in FORCE_CHANNELS and not is_beyond(last, known):
             each = _by_log(selection, channel, judging, before[channel], after[channel])
@@ -408,17 +409,15 @@ def _by_log(
     to tell it from chance. It would drown in that of logs that are right."""
     if not bench.has_reference or bench.own_data:
         return []
-    samples, episode = LASTING[channel], bench.episode[channel]
-    parts = zip(*map(bench.by_log, (before, after, episode, _force_of(bench))), bench.sources, strict=True)
-    return [
-        (
-            *(rms_known(residual, own, samples) for residual in (first, last)),
-            selection.screening.achieved(selection.model, channel, force, np.zeros(0), samples),
-            log,
-        )
-        for first, last, own, force, log in parts
-        if np.ptp(own) + 1 >= EPISODES
-    ]
+    samples, force, result = LASTING[channel], _force_of(bench), []
+    means, index = bench.means(channel, samples), np.repeat(range(len(bench.trials)), [len(t.episode) for t in bench.trials])
+    for number, trial in enumerate(bench.trials):
+        if trial.episode[-1] + 1 >= EPISODES:
+            own = index == number
+            known = selection.screening.achieved(selection.model, channel, force[own], np.zeros(0), samples)
+            pair = (rms_known(np.where(own, residual, 0.0), means) for residual in (before, after))
+            result.append((*pair, known, bench.sources[number]))
+    return result
 
 
 def _force_of(bench: Bench) -> np.ndarray:

@@ -28,11 +28,12 @@ _TURNS, _RIGHT_K, LITTLE = 5, 0.75, 0.98
 LASTING = {"stiffness": 4, "torque": 32, "innovation": 32, "brake_torque": 32, "temperature": 1}
 
 
-def rms_known(residual: np.ndarray, episode: np.ndarray | None = None, samples: int = 1) -> float:
-    """RMS of a channel's residual where there is one: it is zero where nothing was measured; of its means over so many
-    ``samples`` of an ``episode`` each (`Averaging`)."""
-    means = residual if episode is None else Averaging(episode, samples).of(residual[:, None])
-    return float(np.sqrt(np.square(means).sum() / max(np.count_nonzero(residual), 1)))
+def rms_known(residual: np.ndarray, means: Averaging | None = None) -> float:
+    """RMS of a channel's residual where there is one: it is zero where nothing was measured; of its ``means`` if they are
+    given, which are what lasts."""
+    told = residual if means is None else residual * means.told
+    averaged = told if means is None else means.of(residual[:, None])
+    return float(np.sqrt(np.square(averaged).sum() / max(np.count_nonzero(told), 1)))
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Model:
 
     def lasting(self, channel: str, samples: int) -> float:
         """Mean square of what lasts over so many samples of the residual."""
-        return rms_known(self.residual[channel], self.bench.episode[channel], samples) ** 2
+        return rms_known(self.residual[channel], self.bench.means(channel, samples)) ** 2
 
     def inflation(self, channel: str) -> float:
         """How many samples of the residual are worth one: the design effect of its episodes (Kish 1965)."""

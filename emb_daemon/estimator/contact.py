@@ -83,14 +83,14 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     unsure = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed) + SLIP_RAD
     behind = s.behind
     _stay_behind(s, m, jump, turned)
-    if s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind)):
-        # A loose contact repeats an angle, which is right again when it has made up for the way.
-        pass
-    elif abs(behind) > unsure and s.plausibility.still == 0:
+    # A loose contact repeats an angle, which is right again when it has made up for the way; one that is late by a cycle
+    # repeats whenever a motion begins. What it lacks then counts as what it makes up for: it has strayed by neither.
+    repeats = s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind))
+    if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
-    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN:
+    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
         moved, sigma = jump, reach
-    elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure:
+    elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
         moved, sigma = slip, _ZERO_RAD
     elif seen:
         moved = _drift(s, m, slip, turned)

@@ -10,6 +10,7 @@ from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
+from emb_daemon.models.wander import STANDING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Time between two samples up to which none is missing, s.
@@ -169,7 +170,9 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     the torque is NaN where it says nothing.
     """
     travel = m.angle - s.angle
-    slid = _slid(s, p, m.angle, travel, m.dt)
+    # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion.
+    turning = m.speed - min(max(m.speed, -STANDING_RAD_PER_S), STANDING_RAD_PER_S)
+    slid = _slid(s, p, m.angle + effects.known_delay(p.effects) * turning, travel, m.dt)
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
