@@ -9,7 +9,7 @@ import numpy as np
 from emb_daemon.calibration.types import Motor
 from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
-from emb_daemon.logs.resample import Series, Signals, is_unresolved, turns_free
+from emb_daemon.logs.resample import Series, Signals, is_bare, is_unresolved, turns_free
 
 #: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
@@ -91,9 +91,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
     lines = [*_find_other_wheel(corner, messages), *_find_impossible_temperatures(corner, messages)]
-    # A motor with constant load clamps nothing.
-    is_free = turns_free(corner, messages)
-    bare = is_free or (force is not None and _is_of_either_sign(force))
+    is_free, bare = turns_free(corner, messages), is_bare(corner, messages)
     own = {name: s for name, s in (("MotorAngle", angle), ("CurrentQ", current), ("ClampForceRef", force)) if s is not None}
     for name, found in own.items():
         if not np.ptp(found.values):
@@ -107,7 +105,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         lines += _find_too_fast(angle)
         lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
-    moves = not (speed is None or current is None or is_unresolved(angle or speed.integral(), is_free))
+    moves = not (speed is None or current is None or is_unresolved(corner, messages))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
         # What relaxes in pads looks like a delay.
@@ -496,12 +494,6 @@ def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.nda
         return None
     columns = np.stack([np.ones(len(load)), load, acceleration], axis=1)
     return current - np.linalg.lstsq(columns, current)[0][2] * acceleration
-
-
-def _is_of_either_sign(force: Series) -> bool:
-    """Whether a load pulls as it pushes: no clamp force does, whichever way its sensor counts."""
-    low, high = np.quantile(force.values, (0.01, 0.99))
-    return bool(min(-low, high) > _FOLLOWS * max(-low, high))
 
 
 def _find_turned_current(angle: Series, current: Series) -> list[str]:

@@ -32,7 +32,7 @@ from emb_daemon.logs.resample import (
     is_unresolved,
     our_messages,
     standing,
-    turns_free,
+    way_of,
 )
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.logs.tables import read_table
@@ -587,13 +587,8 @@ def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bo
 
 def _too_slow(corner: str, messages: dict) -> list[str]:
     """A line on a motor that moves too fast for its samples."""
-    resolver = messages.get(f"EMB_{corner}_Resolver", {})
-    angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
-    if angle is None and isinstance(speed, Series):
-        angle = speed.integral()
-    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or starts_anew(angle):
-        return []
-    if not is_unresolved(angle, turns_free(corner, messages)):
+    angle = way_of(corner, messages)
+    if angle is None or len(angle.time_ns) < 3 or starts_anew(angle) or not is_unresolved(corner, messages):
         return []
     return [
         f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "
