@@ -27,6 +27,9 @@ _FOLLOWS = 0.2
 #: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
 #: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
+#: How many times more of a current the load must leave than its power, or it is the motor's: of 120 drawn machines, and of
+#: nine recordings, the motor's leaves up to 1.01 times as much, a supply's mostly 1.3 and more.
+_BY_POWER = 1.25
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
 #: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
@@ -108,6 +111,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
     if moves and (force is not None or is_free):
         lines += _find_driving_friction(speed, current, force)
+        lines += _find_supply(speed, current, force) if force is not None else []
         # What relaxes in pads looks like a delay.
         lines += _find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
@@ -458,6 +462,31 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | None)
     return [
         f"CurrentQ is less in the direction of motion than against it (correlation {correlation:.2f}), as if friction drove "
         "the motor: `scale: -1` of MotorAngle and MotorSpeed?"
+    ]
+
+
+def _find_supply(speed: Series, current: Series, force: Series) -> list[str]:
+    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does."""
+    times = current.time_ns[:_JUDGED]
+    at, load = speed.sampled(times), force.sampled(times)
+    torques = np.stack([load, np.gradient(at, 1e-9 * times)], axis=1)
+    # The load of a propeller or a pump is one of the speed, and tells nothing then.
+    rest = np.stack([np.ones(len(times)), np.sign(at), at, at * np.abs(at)], axis=1)
+    known = np.isfinite(torques).all(axis=1) & np.isfinite(at)
+    if np.sum(known) < _LEAST:
+        return []
+    values = current.values[: len(times)][known]
+
+    def left_A(explaining: np.ndarray) -> float:
+        columns = np.hstack([rest, explaining])[known]
+        return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
+
+    by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
+    if not by_load_A > _BY_POWER * by_power_A:
+        return []
+    return [
+        f"CurrentQ goes with the load times the speed, of which it leaves {by_power_A:.2g} A, and not with the load, which "
+        f"leaves {by_load_A:.2g} A: a drive takes such a current from its supply, and the motor's own is another"
     ]
 
 

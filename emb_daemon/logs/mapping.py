@@ -177,6 +177,8 @@ class Source:
     def questioned(self, stated: str) -> str:
         """A question if the unit that the rig states makes other values of the signal; a scale of that same unit is meant."""
         own = known_as(stated)
+        if own and (UNITS[own][0], self.target) == ("Nm", "N") and UNITS[own][1] != 1.0:
+            return f"{self.name} says {own}, and an N·m is {1.0 / UNITS[own][1]:.4g} of it: is that in `scale`?"
         if not own or UNITS[own][0] != UNITS[self.target][0]:
             return ""
         factor, zero = conversion(own, self.target)
