@@ -49,7 +49,7 @@ _LEAST = 1e-4
 EPISODE = 250
 
 
-#: (error of the stiffness path, force that it tells) in N on one log, where there is a reference: sigma grows with that force.
+#: (error of the stiffness path, reference force) in N on one log, where there is a reference.
 Errors = tuple[np.ndarray, np.ndarray]
 
 
@@ -166,9 +166,9 @@ def simulate(log: Log, calibration: Calibration, thickness_mm: float, clearance:
 def path_errors(log: Log, calibration: Calibration, thickness_mm: float, clearance: float, delay_s: float = 0.0) -> Errors:
     """Errors of the stiffness path on a log. With ``delay_s`` 0 they are the daemon's, which knows nothing of the reference's
     delay."""
-    told = simulate(log, calibration, thickness_mm, clearance, delay_s)
-    known = np.isfinite(told - log.force_N)
-    return (told - log.force_N)[known], told[known]
+    error = simulate(log, calibration, thickness_mm, clearance, delay_s) - log.force_N
+    known = np.isfinite(error)
+    return error[known], log.force_N[known]
 
 
 def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, slow: bool = True) -> list[Errors]:

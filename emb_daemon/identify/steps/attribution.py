@@ -163,9 +163,8 @@ def section(page: Page, step: AttributionStep) -> None:
 
 
 def _errors(bench: Bench, residual: np.ndarray, index: int) -> Errors:
-    """What is left of one log's stiffness path, of the ``residual``, reference minus path, of all logs."""
+    """What is left of one log's stiffness path, of the ``residual`` of all logs."""
     trials = bench.trials
     first = sum(len(trial.log.samples) for trial in trials[:index])
-    force_N = trials[index].force_N
-    known, error = np.isfinite(force_N), residual[first : first + len(force_N)]
-    return error[known], (force_N - error)[known]
+    known = np.isfinite(trials[index].force_N)
+    return residual[first : first + len(trials[index].log.samples)][known], trials[index].force_N[known]

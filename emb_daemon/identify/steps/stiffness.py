@@ -54,7 +54,7 @@ class Candidate:
     """One combination of effects in the choice of structure, fitted on the first halves of the random logs.
 
     Attributes:
-        held_out: (error of the stiffness path, force that it tells) in N on what was not fitted, one pair per log; without a
+        held_out: (error of the stiffness path, reference force) in N on what was not fitted, one pair per log; without a
             random log, on each slow log of a fit to the others of its pads, and to all where it is the only one.
         clear: every amplitude is significant.
     """
