@@ -32,8 +32,6 @@ NOTHING: Mapping[str, float] = MappingProxyType({})
 _SLID = 0.1
 #: Relative error of an extrapolated curve from which a note is written: the usual relative noise of the path.
 _TOLD = 0.01
-#: Share of the largest force from which one that the curve knows nothing of is no drag: a jaw's is up to 0.07.
-_TOUCHES = 0.1
 #: Length of the stretches, in samples, from which noise is identified, if there are any that long.
 _LONG = 50
 #: Resolver movement that still counts as standing, rad.
@@ -84,11 +82,6 @@ def identify(
     # What a relative error explains by the reference's force the daemon does not know where the path tells of none.
     none = np.abs(force + error) < floor
     floor = max(floor, rmse(error[none])) if none.any() else floor
-    if floor > _TOUCHES * stiffness.reached_N:
-        campaign.fault(
-            f"curves: there is more than {100.0 * _TOUCHES:.0f} % of the largest force (RMS) where the curve tells of none: does "
-            "the force give way before it rises for good? Sigma holds it"
-        )
     more = [(error, force) for error, force in hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
     if more:
         errors = [*errors, *more]
