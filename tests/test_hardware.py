@@ -355,7 +355,7 @@ def test_a_dynamometer_that_writes_forty_rows_a_second_is_judged(turns_on):
     stated, constant, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
     time_s = 0.024 * np.arange(1500)
     stroke = 30.0 * np.sin(2.0 * np.pi * time_s / 2.0)
-    speed = (120.0 if turns_on else 0.0) + np.gradient(stroke, time_s)
+    speed = 100.0 * (1.0 - np.cos(np.pi * time_s)) if turns_on else np.gradient(stroke, time_s)
     force = 5000.0 * np.sin(0.7 * time_s) + (5000.0 if turns_on else 0.0)
     torque = stated.motor.gear_gain_m_per_rad * force + stated.friction.offset_Nm * np.sign(speed)
     current = (torque + stated.motor.inertia_kg_m2 * np.gradient(speed, time_s)) / constant

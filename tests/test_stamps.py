@@ -13,7 +13,6 @@ from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import (
     _find_late_force,
-    _find_supply,
     contradictions,
     other_current,
     other_motor,
@@ -816,8 +815,12 @@ def test_what_a_drive_takes_from_its_supply_is_no_current_of_the_motor(load, see
     motor_A = 10.0 * (torque + rng.uniform(0.02, 0.15) + rng.uniform(0.0, 0.3) * acceleration / np.max(np.abs(acceleration)))
     supply_A = 0.7 * motor_A * speed / np.max(speed) + 0.01 * motor_A**2
     for current, said in ((motor_A, False), (supply_A, load != "a propeller")):
-        noisy = (values + rng.normal(0.0, 0.02 * np.max(np.abs(values)), 6000) for values in (speed, current, torque))
-        lines = _find_supply(*(Series((1e9 * time_s).astype(np.int64), values) for values in noisy))
+        messages = {}
+        for name, values in (("EMB_FL_Resolver", speed), ("EMB_FL_Current", current), ("RIG_FL_Force", torque)):
+            noisy = values + rng.normal(0.0, 0.02 * np.max(np.abs(values)), 6000)
+            messages[name] = Series((1e9 * time_s).astype(np.int64), noisy)
+        signals = ("MotorSpeed", "CurrentQ", "ClampForceRef")
+        lines = contradictions("FL", {name: {signal: messages[name]} for name, signal in zip(messages, signals, strict=True)})
         assert any("takes such a current from its supply" in line for line in lines) == said
 
 
