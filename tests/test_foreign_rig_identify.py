@@ -7,6 +7,7 @@ from pathlib import Path
 import foreignkit
 import numpy as np
 import pytest
+from scipy.interpolate import pchip_interpolate
 
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
@@ -88,6 +89,48 @@ def test_angle_and_force_alone_give_the_curve(tmp_path, capsys):
     assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][100:]) > 0.9
 
 
+def _overconfident(monkeypatch):
+    """Judge with a tenth of the sigma, as where something is hidden that noise levels do not hold."""
+    honest = validation.estimate
+
+    def overconfident(samples, parameters):
+        estimates = honest(samples, parameters)
+        estimates["sigma"] *= 0.1
+        return estimates
+
+    monkeypatch.setattr(validation, "estimate", overconfident)
+
+
+def test_a_force_that_gives_way_is_no_curve_and_has_a_sigma_for_that(tmp_path, capsys, monkeypatch):
+    """A dome that collapses and is then pressed flat: the contact is found where it rises for good, and the force before it
+    is in sigma, though a force of nothing has no relative error."""
+    campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow())
+    time_s = 0.01 * np.arange(4000)
+    angle = 4.0 * (1.0 - np.cos(np.pi * time_s / 10.0)) * (time_s < 20.0)
+    given = [0.0, 3.8, 5.0, 4.6, 2.4, 1.9, 2.7, 12.0]
+    force = 1000.0 * pchip_interpolate([0.0, 1.0, 2.0, 3.2, 5.0, 6.0, 7.2, 8.0], given, angle)
+    foreignkit.write_table(
+        tmp_path / "curve.parquet", {"time_s": time_s, "angle_rad": angle, "force_N": force, "plate_C": 22.0 + 0.0 * time_s}
+    )
+    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
+    lines = mapping.read_text().splitlines(keepends=True)
+    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
+    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    assert "worse than it says" not in capsys.readouterr().err
+    log = emb_daemon.load_log(tmp_path / "curve.parquet", read=Mapping(mapping).read)
+    found = load_calibration(output)
+    estimates = emb_daemon.run(log, found)
+    error = (estimates["force"] - log.force_N)[1:]
+    assert (
+        np.sqrt(np.nanmean(error**2)) > 1000.0
+        and found.noise.stiffness_N > 400.0
+        and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9
+    )
+    _overconfident(monkeypatch)
+    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    assert "curve.parquet, which was fitted: " in (told := capsys.readouterr().err) and "worse than it says" in told
+
+
 def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):
     campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(seconds=8.0))
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=8.0)), 500.0)
@@ -157,15 +200,7 @@ def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
     error = emb_daemon.run(log, found)["force"] - log.force_N
     assert np.sqrt(np.nanmean(error**2)) < 400.0
 
-    # Judged with a tenth of the sigma, as where something is hidden that noise levels do not hold.
-    honest = validation.estimate
-
-    def overconfident(samples, parameters):
-        estimates = honest(samples, parameters)
-        estimates["sigma"] *= 0.1
-        return estimates
-
-    monkeypatch.setattr(validation, "estimate", overconfident)
+    _overconfident(monkeypatch)
     monkeypatch.setattr(attribution, "identify", lambda _, hot, known, progress: attribution._unsearched(hot, known))
     main(["identify", str(tmp_path / "campaign.yaml"), "--output", str(output)])
     assert re.search(r"judge: \d+ % of the errors inside two sigma, .* worse than it says", capsys.readouterr().err)

@@ -348,10 +348,28 @@ def test_replay_of_a_machine_without_pads_says_what_a_clamp_force_is_not(tmp_pat
     assert f"{calibration}: contact.clearance_rad is 10000 rad, so there is nothing to clamp" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("turns_on", [True, False])
+def test_a_dynamometer_that_writes_forty_rows_a_second_is_judged(turns_on):
+    """No force of it belongs to an angle: what counts is that its samples follow its speed. A clamp that moves as fast does
+    not follow its angle."""
+    stated, constant, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+    time_s = 0.024 * np.arange(1500)
+    stroke = 30.0 * np.sin(2.0 * np.pi * time_s / 2.0)
+    speed = 100.0 * (1.0 - np.cos(np.pi * time_s)) if turns_on else np.gradient(stroke, time_s)
+    force = 5000.0 * np.sin(0.7 * time_s) + (5000.0 if turns_on else 0.0)
+    torque = stated.motor.gear_gain_m_per_rad * force + stated.friction.offset_Nm * np.sign(speed)
+    current = (torque + stated.motor.inertia_kg_m2 * np.gradient(speed, time_s)) / constant
+    columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.024, "current_A": current, "force_N": force}
+    found = diagnose([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], stated)
+    assert found.after.rmse("torque") < 0.25 * found.before.rmse("torque")
+    with pytest.raises(InputError, match="no sample of it can be judged"):
+        diagnose([_log(columns | {"angle_rad": stroke, "force_N": np.abs(force)})], stated)
+
+
 def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():
     stated, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
     time_s = 0.1 * np.arange(2000)
-    angle, force = 20.0 * np.sin(3.0 * time_s), 2000.0 * np.sin(0.7 * time_s)
+    angle, force = 20.0 * np.sin(12.0 * time_s), 2000.0 * np.sin(0.7 * time_s)
     log = _log({"time_s": time_s, "angle_rad": angle, "current_A": force / 1000.0, "force_N": force}, current_mean_s=0.0)
     with pytest.raises(InputError, match=r"no sample of it can be judged.* its samples are 100 ms apart"):
         diagnose([log], stated)

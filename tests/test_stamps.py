@@ -5,12 +5,19 @@ import re
 import foreignkit
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import _find_late_force, contradictions, other_current, other_motor, starts_anew
+from emb_daemon.logs.contradictions import (
+    _find_late_force,
+    contradictions,
+    other_current,
+    other_motor,
+    starts_anew,
+)
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
@@ -560,7 +567,7 @@ def test_a_joint_stated_at_its_motor_is_sampled_as_often_as_it_was(tmp_path, cap
         "speed_rad_per_s": np.gradient(angle, time_s),
         "current_A": np.sign(still + 1),
     }
-    log = _read(tmp_path, columns | {"plate_C": 22.0 + still, "force_N": 100.0 * np.sin(time_s)}, mapping)
+    log = _read(tmp_path, columns | {"plate_C": 22.0 + still, "force_N": 100.0 * np.abs(np.sin(time_s))}, mapping)
     told = "too rare for this motion" in capsys.readouterr().err
     assert told == ("value" not in load) and (len(log.samples) > 4000) == ("value" in load)
 
@@ -630,7 +637,10 @@ _ROW = {"angle_rad": "rad", "speed_rad_per_s": "rad/s", "current_A": "A", "plate
         ({"angle_rad": "mm", "plate_C": "V", "current_A": "?"}, ""),
         ({"force_N": "[kgf]"}, "RIG_FL_Force.ClampForceRef: force_N says kgf and is taken in N: which is right?"),
         ({"plate_C": "°F"}, "InnerBackplateTemp: plate_C says °F and is taken in degC"),
+        ({"plate_C": "ºF"}, "InnerBackplateTemp: plate_C says degF and is taken in degC"),
         ({"plate_C": "K"}, "InnerBackplateTemp: plate_C says K and is taken in degC"),
+        ({"force_N": "N.m"}, ""),
+        ({"force_N": "oz-in"}, "ClampForceRef: force_N says ozf in, and an N·m is 141.6 of it: is that in `scale`?"),
         ({"time_s": "ms"}, "time_s says ms and is taken in s"),
     ],
 )
@@ -655,7 +665,7 @@ def test_a_unit_in_the_file_that_is_not_the_mappings_is_said(truth, tmp_path, ca
         file.save(path)
     Mapping(tmp_path / "mapping.yaml").read(path)
     told = capsys.readouterr().err
-    assert said in told and told.count("which is right?") == bool(said)
+    assert said in told and told.count("is right?") + told.count("`scale`?") == bool(said)
 
 
 @pytest.mark.parametrize(
@@ -791,6 +801,27 @@ def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_
     _read(tmp_path, columns | {"plate_C": 22.0 + 0.0 * time_s}, foreignkit.COLUMNS.replace("unit: A", f"unit: A{mapped}"))
     told = capsys.readouterr().err
     assert said in told and ("that it belongs to" in told) == bool(said)
+
+
+@pytest.mark.parametrize("load", ["another motor", "a brake", "a propeller"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_drive_takes_from_its_supply_is_no_current_of_the_motor(load, seed):
+    """It is power over the supply's voltage. Where the load is one of the speed, neither is told from the other."""
+    rng, time_s = np.random.default_rng(seed), 0.01 * np.arange(6000)
+    speed = lfilter([0.05], [1.0, -0.95], np.repeat(rng.uniform(0.1, 1.0, 60), 100) * rng.uniform(20.0, 300.0))
+    torque = np.repeat(rng.uniform(0.0 if load == "a brake" else -1.0, 1.0, 30), 200)
+    torque = (speed / np.max(speed)) ** 2 if load == "a propeller" else torque
+    acceleration = np.gradient(speed, time_s)
+    motor_A = 10.0 * (torque + rng.uniform(0.02, 0.15) + rng.uniform(0.0, 0.3) * acceleration / np.max(np.abs(acceleration)))
+    supply_A = 0.7 * motor_A * speed / np.max(speed) + 0.01 * motor_A**2
+    for current, said in ((motor_A, False), (supply_A, load != "a propeller")):
+        messages = {}
+        for name, values in (("EMB_FL_Resolver", speed), ("EMB_FL_Current", current), ("RIG_FL_Force", torque)):
+            noisy = values + rng.normal(0.0, 0.02 * np.max(np.abs(values)), 6000)
+            messages[name] = Series((1e9 * time_s).astype(np.int64), noisy)
+        signals = ("MotorSpeed", "CurrentQ", "ClampForceRef")
+        lines = contradictions("FL", {name: {signal: messages[name]} for name, signal in zip(messages, signals, strict=True)})
+        assert any("takes such a current from its supply" in line for line in lines) == said
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,10 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
     offset = diagnosis.recalibrated.get(OFFSET_FRICTION)
     # Searched down to zero, which no machine has.
     none = offset is not None and offset.value < _NO_FRICTION * offset.before
-    turned = ["No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing?"]
+    turned = [
+        "No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing, or is the "
+        "current another than the motor's?"
+    ]
     return [f"Recalibrated: {', '.join(told)}.", *(turned if none else [])]
 
 

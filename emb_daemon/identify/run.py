@@ -12,7 +12,7 @@ from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
-from emb_daemon.identify.validation import Validation, validate, validate_others, why_worse
+from emb_daemon.identify.validation import Validation, at_thickness, validate, validate_others, why_worse
 
 Progress = Callable[[float, str], None]
 
@@ -85,7 +85,13 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
         there = moved(found.without(fold), mine.values)
         validations += [validate(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
-    for fault in why_worse(validations):
+    # Where nothing was left out, what was fitted must at least be inside its sigma.
+    judged = validations or [
+        validate(f"{log.path.name}, which was fitted", "fitted", log, at_thickness(calibration, thick, own.thickness_mm))
+        for own in pads
+        for log in own.logs
+    ]
+    for fault in why_worse(judged):
         campaign.fault(fault)
     steps = (stiff, motor, heat, found)
     calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat))

@@ -32,7 +32,7 @@ from emb_daemon.logs.resample import (
     is_unresolved,
     our_messages,
     standing,
-    turns_free,
+    way_of,
 )
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.logs.tables import read_table
@@ -177,6 +177,8 @@ class Source:
     def questioned(self, stated: str) -> str:
         """A question if the unit that the rig states makes other values of the signal; a scale of that same unit is meant."""
         own = known_as(stated)
+        if own and (UNITS[own][0], self.target) == ("Nm", "N") and UNITS[own][1] != 1.0:
+            return f"{self.name} says {own}, and an N·m is {1.0 / UNITS[own][1]:.4g} of it: is that in `scale`?"
         if not own or UNITS[own][0] != UNITS[self.target][0]:
             return ""
         factor, zero = conversion(own, self.target)
@@ -587,13 +589,8 @@ def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bo
 
 def _too_slow(corner: str, messages: dict) -> list[str]:
     """A line on a motor that moves too fast for its samples."""
-    resolver = messages.get(f"EMB_{corner}_Resolver", {})
-    angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
-    if angle is None and isinstance(speed, Series):
-        angle = speed.integral()
-    if not isinstance(angle, Series) or len(angle.time_ns) < 3 or starts_anew(angle):
-        return []
-    if not is_unresolved(angle, turns_free(corner, messages)):
+    angle = way_of(corner, messages)
+    if angle is None or len(angle.time_ns) < 3 or starts_anew(angle) or not is_unresolved(corner, messages):
         return []
     return [
         f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "

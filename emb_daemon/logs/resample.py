@@ -31,9 +31,10 @@ _SPARSE_CYCLES = 5
 #: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
 #: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
 _LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
-#: Share of the way between two samples that the straight line may miss of a machine without a load: its current tells of
-#: speed and acceleration, and no force of its angle.
-_UNKNOWN_SHARE = 0.1
+#: Share of the way between two samples that the straight line may miss of a machine that clamps nothing: its current tells of
+#: load, speed and acceleration, and no force of its angle. Least share of a load that the other sign's is where it pulls as it
+#: pushes; what our message of the angle carries, more than the travel of anything that clamps, rad.
+_UNKNOWN_SHARE, _OTHER_SIGN, _CLAMPS_RAD = 0.1, 0.2, 3355.0
 #: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Share of values outside our message's range that is too large for faults of an instrument; what a flag may be off by.
@@ -136,7 +137,7 @@ class Series:
 
     @property
     def course_is_unknown(self) -> bool:
-        """The same of a machine without a load."""
+        """The same of a machine that clamps nothing."""
         return self._misses > max(_UNKNOWN_WAY_RAD, self._step, _UNKNOWN_SHARE * self._goes)
 
     @cached_property
@@ -367,7 +368,7 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     for corner in CORNERS:
         if resolver := messages.get(f"EMB_{corner}_Resolver"):
             angle = next(source for source in resolver.values() if isinstance(source, Series))
-            ticks[corner] = _clock(angle, is_unresolved(angle, turns_free(corner, messages)))
+            ticks[corner] = _clock(angle, is_unresolved(corner, messages))
     if not any(len(times) for times, _ in ticks.values()):
         return np.zeros(0, FRAME)
     stretches = _stretches(np.unique(np.concatenate([times for times, _ in ticks.values()])), _SILENT_NS)
@@ -552,9 +553,29 @@ def turns_free(corner: str, messages: Mapping[str, Signals]) -> bool:
     return isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
 
 
-def is_unresolved(angle: Series, free: bool) -> bool:
-    """Whether a motor moves too fast for its samples."""
-    return angle.course_is_unknown if free else angle.way_is_unknown
+def is_bare(corner: str, messages: Mapping[str, Signals]) -> bool:
+    """Whether a machine clamps nothing: its load is constant, or pulls as it pushes, whichever way its sensor counts, or its
+    motor turns on and on."""
+    force, angle = messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), way_of(corner, messages)
+    low, high = np.quantile(force.values, (0.01, 0.99)) if isinstance(force, Series) and len(force.values) else (0.0, 0.0)
+    of_either_sign = min(-low, high) > _OTHER_SIGN * max(-low, high)
+    turns_on = angle is not None and len(angle.values) and np.ptp(angle.values) > _CLAMPS_RAD
+    return turns_free(corner, messages) or bool(of_either_sign or turns_on)
+
+
+def way_of(corner: str, messages: Mapping[str, Signals]) -> Series | None:
+    """A corner's measured motor angle, or else its speed added up."""
+    resolver = messages.get(f"EMB_{corner}_Resolver", {})
+    angle, speed = resolver.get("MotorAngle"), resolver.get("MotorSpeed")
+    if angle is None and isinstance(speed, Series):
+        return speed.integral()
+    return angle if isinstance(angle, Series) else None
+
+
+def is_unresolved(corner: str, messages: Mapping[str, Signals]) -> bool:
+    """Whether a corner's motor moves too fast for its samples."""
+    angle = way_of(corner, messages)
+    return angle is not None and (angle.course_is_unknown if is_bare(corner, messages) else angle.way_is_unknown)
 
 
 @njit

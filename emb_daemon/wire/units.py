@@ -6,8 +6,8 @@ import re
 from emb_daemon.errors import InputError
 
 _DEGREE = math.pi / 180.0
-#: Standard gravity, m/s2; weight of a pound, N.
-_GRAVITY, _POUND = 9.80665, 4.4482216152605
+#: Standard gravity, m/s2; weight of a pound, N; inch, m.
+_GRAVITY, _POUND, _INCH = 9.80665, 4.4482216152605, 0.0254
 #: Unit: (unit of the same quantity that others are converted over, factor, offset); that = factor * this + offset.
 UNITS = {
     "rad": ("rad", 1.0, 0.0), "deg": ("rad", _DEGREE, 0.0), "°": ("rad", _DEGREE, 0.0), "mrad": ("rad", 1e-3, 0.0),
@@ -22,8 +22,9 @@ UNITS = {
     "N": ("N", 1.0, 0.0), "kN": ("N", 1e3, 0.0), "daN": ("N", 10.0, 0.0), "lbf": ("N", _POUND, 0.0), "lb": ("N", _POUND, 0.0),
     # Load cells state a force as the mass of that weight.
     "kgf": ("N", _GRAVITY, 0.0), "kg": ("N", _GRAVITY, 0.0), "g": ("N", 1e-3 * _GRAVITY, 0.0),
-    "Nm": ("Nm", 1.0, 0.0), "N m": ("Nm", 1.0, 0.0), "N·m": ("Nm", 1.0, 0.0), "N.m": ("Nm", 1.0, 0.0),
-    "kNm": ("Nm", 1e3, 0.0), "mNm": ("Nm", 1e-3, 0.0), "Nmm": ("Nm", 1e-3, 0.0), "N mm": ("Nm", 1e-3, 0.0),
+    "Nm": ("Nm", 1.0, 0.0), "kNm": ("Nm", 1e3, 0.0), "mNm": ("Nm", 1e-3, 0.0), "Nmm": ("Nm", 1e-3, 0.0),
+    "Ncm": ("Nm", 1e-2, 0.0), "kgf cm": ("Nm", 1e-2 * _GRAVITY, 0.0), "lbf ft": ("Nm", 12.0 * _INCH * _POUND, 0.0),
+    "lbf in": ("Nm", _INCH * _POUND, 0.0), "ozf in": ("Nm", _INCH * _POUND / 16.0, 0.0),
     "Hz": ("Hz", 1.0, 0.0),
     "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "us": ("s", 1e-6, 0.0), "µs": ("s", 1e-6, 0.0), "ns": ("s", 1e-9, 0.0),
     "min": ("s", 60.0, 0.0), "h": ("s", 3600.0, 0.0), "d": ("s", 86400.0, 0.0),
@@ -38,7 +39,10 @@ _SPELLINGS = {
     "revolutions": "rev", "turns": "rev", "u": "rev", "rev/min": "rpm", "amp": "A", "amps": "A", "ampere": "A",
     "volt": "V", "volts": "V", "celsius": "degC", "deg c": "degC", "degc": "degC", "ºc": "degC", "° c": "degC", "kelvin": "K",
     "deg f": "degF", "km/hr": "km/h", "kmh": "km/h", "kmph": "km/h", "km/h": "km/h", "kph": "km/h", "newton": "N",
-    "newtons": "N", "n*m": "Nm", "newton meter": "Nm", "percent": "%",
+    "newtons": "N", "newton meter": "Nm", "percent": "%", "f": "degF", "ºf": "degF", "° f": "degF", "fahrenheit": "degF",
+    "ft lbf": "lbf ft", "lb ft": "lbf ft", "ft lb": "lbf ft", "in lbf": "lbf in", "lb in": "lbf in", "in lb": "lbf in",
+    "oz in": "ozf in", "in oz": "ozf in", "kg cm": "kgf cm", "n m": "Nm", "nm": "Nm", "kn m": "kNm",
+    "mn m": "mNm", "n mm": "Nmm", "n cm": "Ncm",
 }  # fmt: skip
 #: A unit at the end of a column's name.
 _IN_NAME = re.compile(r"\[\s*([^][]+?)\s*\]\s*$|\(\s*([^()]+?)\s*\)\s*$")
@@ -55,7 +59,14 @@ def stated_in(name: str) -> str:
 def known_as(unit: str) -> str:
     """A unit as `UNITS` spells it, also from brackets or parentheses; empty if it is none of them."""
     unit = unit.strip(" []()")
-    return unit if unit in UNITS else _SPELLINGS.get(unit.lower(), "")
+    return known if (known := _spelt(unit)) in UNITS else ""
+
+
+def _spelt(unit: str) -> str:
+    """A unit as `UNITS` spells it, whatever stands between the factors of a torque; one that is unknown as it is."""
+    small = unit.lower()
+    apart = re.sub(r"[ *·⋅.-]+", " ", small)
+    return unit if unit in UNITS else _SPELLINGS.get(small) or _SPELLINGS.get(apart) or (apart if apart in UNITS else unit)
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
@@ -64,7 +75,7 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     Raises:
         InputError: the unit is unknown, missing, or of another quantity.
     """
-    unit = unit if unit in UNITS else _SPELLINGS.get(unit.lower(), unit)
+    unit = _spelt(unit)
     if unit == target:
         return 1.0, 0.0
     target_base, target_factor, target_offset = UNITS[target]

@@ -77,7 +77,11 @@ def identify(
             "others of its pads, a single one as it was fitted."
         )
     gear_gain = known.motor.gear_gain_m_per_rad
-    floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
+    error, force = map(np.concatenate, zip(*errors, strict=True))
+    floor, relative = force_error_levels(error, force)
+    # What a relative error explains by the reference's force the daemon does not know where the path tells of none.
+    none = np.abs(force + error) < floor
+    floor = max(floor, rmse(error[none])) if none.any() else floor
     more = [(error, force) for error, force in hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
     if more:
         errors = [*errors, *more]
