@@ -26,7 +26,7 @@ _emb_daemon() {
         files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;
-        uds) options="--config --state --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        uds) options="--config --state --share --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         xcp) options="--config --share --udp --can --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         a2l) options="--config --output --udp --can --request-id --response-id -b --bitrate" ;;
         bench) options="--seconds --corners --json" ;;

@@ -24,6 +24,13 @@ def add_path(parser: argparse._ActionsContainer, name: str, help: str, metavar: 
     parser.add_argument(name, type=Path, metavar=metavar, help=help, **options)
 
 
+def add_share_argument(parser: argparse.ArgumentParser) -> None:
+    """--share of a process that reads what the daemon shares."""
+    default = "/run/emb_daemon/estimates"
+    text = f"the file given to emb-daemon run as --share (default: {default}, the service's)"
+    add_path(parser, "--share", text, default=Path(default))
+
+
 def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
     """Refuse a path that cannot be written, that is not a regular file, or that is an input.
 
