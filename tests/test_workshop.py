@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import emb_daemon
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.cli import serving
 from emb_daemon.cli.main import main
 from emb_daemon.errors import Unavailable
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
@@ -30,7 +31,7 @@ from emb_daemon.monitor.listener import Listener
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
-from emb_daemon.plant.scenarios import city_drive
+from emb_daemon.plant.scenarios import rest, stop
 from emb_daemon.runtime import shared
 from emb_daemon.runtime.bus import open_bus
 from emb_daemon.runtime.daemon import Daemon
@@ -272,19 +273,20 @@ class _Served:
         while not self._stop.is_set():
             self.diagnostics.step()
 
-    def broadcast(self, reasons: int, times: int = 3) -> None:
+    def broadcast(self, reasons: int, times: int = 3, corner: str = "FL") -> None:
         """Each is heard before the next comes: of what comes at once, the server takes the newest."""
-        status = self.diagnostics.listener.corners[FL].streams[ESTIMATOR_STATUS]
+        status = self.diagnostics.listener.corners[CORNERS.index(corner)].streams[ESTIMATOR_STATUS]
         for _ in range(times):
             heard, deadline = status.received, time.monotonic() + 30.0
             now, counter = time.monotonic_ns(), self._counter % 15
             self._counter += 1
             self.daemon.send(np.concatenate([
-                wirekit.frame("EMB_FL_ClampForce", now, counter, 1, ClampForce=12.345, ClampForceSigma=0.067, ForceSource=1),
-                wirekit.frame("EMB_FL_PadTemp", now, counter, 0, InnerSurfaceTemp=301.25, InnerMeanTemp=250.0,
+                wirekit.frame(f"EMB_{corner}_ClampForce", now, counter, 1, ClampForce=12.345, ClampForceSigma=0.067,
+                              ForceSource=1),
+                wirekit.frame(f"EMB_{corner}_PadTemp", now, counter, 0, InnerSurfaceTemp=301.25, InnerMeanTemp=250.0,
                               OuterSurfaceTemp=290.0, OuterMeanTemp=240.0),
-                wirekit.frame("EMB_FL_EstimatorStatus", now, counter, 1, Mode=3, StiffnessFactor=0.912, ContactAngle=-73.1,
-                              DegradedReasons=reasons),
+                wirekit.frame(f"EMB_{corner}_EstimatorStatus", now, counter, 1, Mode=3, StiffnessFactor=0.912,
+                              ContactAngle=-73.1, DegradedReasons=reasons),
             ]))  # fmt: skip
             while status.received == heard:
                 assert time.monotonic() < deadline, "a broadcast was not heard"
@@ -326,7 +328,8 @@ def _tester(channel: str, interface: str = "virtual"):
         address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x710, rxid=0x718)
         stack = isotp.CanStack(bus, address=address, params={"tx_padding": 0})
         size = struct.calcsize(Frame.LAYOUT)
-        identifiers = {0xF189: Rest(0), 0x1000: AsciiCodec(12), 0x1010: Rest(0), 0x1100: Bytes(size), 0x1120: Rest(0)}
+        texts = dict.fromkeys((0xF189, 0x1010, 0x1120, 0x1122), Rest(0))
+        identifiers = texts | {0x1000: AsciiCodec(12), 0x1100: Bytes(size)}
         # No timed test: what the server promises is for a machine that is not busy with others.
         config = {"data_identifiers": identifiers, "use_server_timing": False, "request_timeout": 10, "p2_timeout": 10}
         with Client(PythonIsoTpConnection(stack), config=config) as client:
@@ -381,6 +384,23 @@ def test_a_tester_reads_versions_calibration_and_estimates(served):
     assert client.read_data_by_identifier(0x1120).service_data.values[0x1120] == b"not known"
 
 
+def test_what_a_daemon_shares_goes_to_the_corner_that_it_is_of(served, tmp_path):
+    server, client = served
+    found, later = TABLE["zero_wanders"].sentence + "; " + TABLE["beyond_range"].sentence, time.monotonic_ns() + 10**12
+    facts = sum(1 << bit for bit, name in enumerate(TABLE) if name in ("zero_wanders", "beyond_range"))
+    forces = {"stiffness_force": 12000.4, "stiffness_sigma": 70.0, "torque_force": np.nan, "torque_sigma": np.inf}
+    rows = np.concatenate([_row(FL, later, torque_force=1.0), _row(2, later, facts=facts, **forces)])
+    loop = SharedEstimates(tmp_path / "estimates", SimpleNamespace(
+        samples=np.zeros(2, SAMPLE), estimates=rows, parameters=np.zeros(4, PARAMETERS)))  # fmt: skip
+    deadline = time.monotonic() + 30.0
+    while client.read_data_by_identifier(0x1122).service_data.values[0x1122] != found.encode():
+        assert time.monotonic() < deadline, "the facts are not told"
+        loop.write(2)
+    server.broadcast(RESOLVER_LOST, corner="RL")
+    [dtc] = client.get_dtc_snapshot_by_dtc_number(code_of(2, 0), record_number=1).service_data.dtcs
+    assert struct.unpack(Frame.LAYOUT, dtc.snapshots[0].data)[-5:] == (12000, 70, 0xFFFF, 0xFFFF, facts)
+
+
 def test_codes_that_cannot_be_kept_are_told_all_the_same(served, monkeypatch):
     server, client = served
 
@@ -410,38 +430,41 @@ def test_what_is_not_there_is_refused(served):
         assert refused.value.response.code == code
 
 
-class _Silent:
-    """A bus on which nobody hears some of what is sent."""
+class _Losing:
+    """A bus that loses what FL's thermocouples send once its brake is clamped."""
 
-    def __init__(self, bus, unheard: int):
-        self._bus, self._unheard = bus, unheard
+    def __init__(self, bus):
+        self._bus, self._lost = bus, -1
 
     def __getattr__(self, name):
         return getattr(self._bus, name)
 
     def send(self, frames: np.ndarray) -> None:
-        self._bus.send(frames[frames["can_id"] != self._unheard])
+        self._bus.send(frames[frames["can_id"] != self._lost])
+
+    def follow(self, _, truth: np.ndarray) -> None:
+        if truth["force"][0] > 3000.0:
+            self._lost = wirekit.database().get_message_by_name("EMB_FL_Thermocouple").frame_id
 
 
 @contextlib.contextmanager
 def _driven(calibration, estimates: Path):
-    """A daemon that shares its estimates, and a car without VEH_Status, each on the group's bus; the calls of both loops."""
+    """A daemon that shares its estimates, and a car that brakes, each on the group's bus."""
     setup = Setup(_CONFIGURATION)
     ids = np.flatnonzero(setup.layout["slot"][0] != -1).tolist()
     daemon = Daemon(setup, open_bus("udp_multicast", _GROUP, ids))
     daemon.share(estimates)
-    bus, unheard = open_bus("udp_multicast", _GROUP, []), wirekit.database().get_message_by_name("VEH_Status").frame_id
-    plant = np.array([plant_from_calibration(calibration, 0)])
-    car = LiveCar(Car(plant, ("FL",)), _Silent(bus, unheard), city_drive())
+    bus, plant = _Losing(open_bus("udp_multicast", _GROUP, [])), np.array([plant_from_calibration(calibration, 0)])
+    car = LiveCar(Car(plant, ("FL",)), bus, rest(1.0) + stop(6000.0, 60.0))
     daemon.warm_up(), car.warm_up()
-    stop = threading.Event()
-    threads = [threading.Thread(target=daemon.run), threading.Thread(target=car.run, args=(stop.is_set,))]
+    ended = threading.Event()
+    threads = [threading.Thread(target=daemon.run), threading.Thread(target=car.run, args=(ended.is_set, None, bus.follow))]
     for thread in threads:
         thread.start()
     try:
         yield
     finally:
-        stop.set(), daemon.stop()
+        ended.set(), daemon.stop()
         for thread in threads:
             thread.join()
         daemon._bus.close(), bus.close()
@@ -461,7 +484,7 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path, calib
         open_bus("udp_multicast", _GROUP, []).close()
     except Unavailable as error:
         pytest.skip(f"NOT RUN: no multicast here ({error})")
-    estimates, code = tmp_path / "estimates", code_of(FL, REASONS.index("vehicle status lost"))
+    estimates, code = tmp_path / "estimates", code_of(FL, REASONS.index("thermocouple lost"))
     command = [sys.executable, "-m", "emb_daemon.cli.main", "uds", "--config", _CONFIGURATION, "--state", tmp_path]
     process = subprocess.Popen([*command, "--share", estimates, "-i", "udp_multicast", "-c", _GROUP], text=True,
                                stdout=subprocess.PIPE, env=processkit.environment(NUMBA_DISABLE_JIT="1"))  # fmt: skip
@@ -482,10 +505,25 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path, calib
     entry = TroubleMemory(tmp_path).entries[code]
     assert entry.status & CONFIRMED and entry.frame.encode() == found[0].data
     kept = tuple(getattr(entry.frame, name) for name in _SHARED)
-    assert kept in told and None not in kept
+    assert kept in told and None not in kept and kept[0] != kept[2]
     *forces, facts = struct.unpack(Frame.LAYOUT, found[0].data)[-5:]
     assert forces == [round(value) for value in kept[:4]]
     assert tuple(name for bit, name in enumerate(TABLE) if facts >> bit & 1) == kept[4]
+
+
+def test_a_trouble_is_said_once(monkeypatch, capsys):
+    stopped, troubles = [], ["", "full", "full", "", "", "full"]
+
+    class Troubled:
+        trouble = ""
+
+        def step(self):
+            self.trouble = troubles.pop(0)
+            stopped.extend([True] * (not troubles))
+
+    monkeypatch.setattr(serving, "stop_signals", lambda: stopped)
+    serving.serve(Troubled(), "at work")
+    assert capsys.readouterr() == ("at work\n", "full\nfull\n")
 
 
 def test_an_id_that_the_daemon_sends_is_refused(capsys):
