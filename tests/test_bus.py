@@ -5,6 +5,7 @@ import os
 
 import can
 import numpy as np
+import processkit
 import pytest
 import wirekit
 
@@ -120,6 +121,18 @@ def _options(command_line: str, defaults=None) -> dict:
     parser = argparse.ArgumentParser()
     add_bus_arguments(parser)
     return bus_options(parser.parse_args(command_line.split()), defaults)
+
+
+def test_python_can_is_not_loaded_for_a_named_socketcan_bus():
+    """It would take a tenth of the daemon's start."""
+    code = (
+        "import argparse, sys; sys.modules['can'] = None; from emb_daemon.cli import options;"
+        "from emb_daemon.runtime.bus import open_bus; parser = argparse.ArgumentParser(); options.add_bus_arguments(parser);"
+        "arguments = parser.parse_args(['-i', 'socketcan', '-c', 'none0']);"
+        "open_bus(**options.bus_options(arguments), ids=[])"
+    )
+    done = processkit.python("-c", code, NUMBA_DISABLE_JIT="1")
+    assert done.stderr.splitlines()[-1].startswith("emb_daemon.errors.Unavailable: socketcan: "), done.stderr
 
 
 def test_command_line_before_environment_before_configuration(monkeypatch):

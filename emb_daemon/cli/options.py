@@ -131,9 +131,11 @@ def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
 def bus_options(arguments: argparse.Namespace, defaults: "Bus | None" = None) -> dict[str, Any]:
     """Keyword arguments for `runtime.bus.open_bus`: the command line, else CAN_* variables, else ``defaults``, a
     configuration's Bus."""
-    from can.util import load_environment_config
+    environment, options = {}, {}
+    if any(name.startswith("CAN_") for name in os.environ):
+        from can.util import load_environment_config
 
-    environment, options = load_environment_config(), {}
+        environment = load_environment_config()
     for name in ("interface", "channel", "bitrate"):
         options[name] = getattr(arguments, name) or environment.get(name) or getattr(defaults, name, None)
     if arguments.fd:
