@@ -22,7 +22,7 @@ _emb_daemon() {
         fleet) options="" ;;
         effect) options="" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --mapping --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        monitor) options="--once --json --web --record --udp --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        monitor) options="--once --json --web --record --udp --share --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;
