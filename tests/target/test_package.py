@@ -36,6 +36,7 @@ CONFIG, CALIBRATION = Path("/etc/emb_daemon/emb.yaml"), Path("/etc/emb_daemon/ca
 HOME, STATE = Path("/opt/emb_daemon"), Path("/var/lib/emb_daemon")
 # What dpkg, systemd and the journal keep of anything that was ever there.
 KEPT_BY_OTHERS = ("/var/lib/dpkg", "/var/log", "/var/cache/apt", "/var/lib/apt", "/var/lib/systemd", "/var/tmp")
+_UDS = "emb-daemon-uds.service"
 READY_S = 60  # 4 to 6 s seen
 MAXIMAL_EXPOSURE = 1.0
 #: Of the daemon with four corners, and of what is installed.
@@ -121,6 +122,11 @@ def test_install_configure_run_upgrade_remove_purge(
 
     with playing(rig_log, "-l", "i"):
         wait_for_forces(record, timeout_s=30)
+        # As another process of the same user it may read what the daemon shares.
+        systemctl("start", _UDS)
+        wait_for("the UDS server is at work", lambda: "trouble codes in" in journal("--unit", _UDS), READY_S)
+        time.sleep(2)
+        assert "no daemon shares" not in journal("--unit", _UDS)
         # What was accepted before, and what driving told the filter.
         Memory(STATE).save(learned("FR"))
         accepted = (STATE / "adaptation-FR.json").read_bytes()
