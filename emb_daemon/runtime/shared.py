@@ -41,6 +41,9 @@ SHARED = np.dtype(
 )
 #: Age up to which a row is of the present, ns: that of the first of the three messages in a row by which a trouble code fails.
 _PRESENT_NS = 300_000_000
+#: Looks without a row after which nobody is said to write any: not a time, because a reader of lowest priority may look seldom,
+#: and gets the first rows at its third look.
+_LOOKS = 15
 #: Version of the records above, on which writer and reader must agree.
 LAYOUT_DIGEST = hashlib.sha256(repr((SHARED.descr, SHARED.itemsize)).encode()).hexdigest()[:16].encode()
 
@@ -181,8 +184,7 @@ class PresentEstimates:
     def __init__(self, path: Path):
         self._reader = EstimatesReader(path)
         self._rows: dict[int, np.void] = {}
-        self._now_ns = 0
-        self._had_ns: int | None = None
+        self._now_ns = self._in_vain = 0
         self.trouble: str = ""
 
     def follow(self, now_ns: int) -> None:
@@ -191,11 +193,9 @@ class PresentEstimates:
         _, taken, _ = self._reader.take()
         # A prediction knows neither the forces of the paths nor what is amiss.
         self._rows.update((int(row["corner"]), row) for row in taken[taken["is_sample"]])
-        self._now_ns = now_ns
-        if len(taken) or self._had_ns is None:
-            self._had_ns, self.trouble = now_ns, ""
-        elif now_ns - self._had_ns > _PRESENT_NS:
-            self.trouble = self._reader.trouble or f"{self._reader.path}: no daemon shares its estimates there"
+        self._now_ns, self._in_vain = now_ns, 0 if len(taken) else self._in_vain + 1
+        why = self._reader.trouble or f"{self._reader.path}: no daemon shares its estimates there"
+        self.trouble = why if self._in_vain > _LOOKS else ""
 
     def of(self, corner: int) -> np.void | None:
         """ESTIMATE of a corner's newest sample; None if there is none of the present."""
