@@ -41,7 +41,7 @@ SHARED = np.dtype(
 )
 #: Age up to which a row is of the present, ns: that of the first of the three messages in a row by which a trouble code fails.
 _PRESENT_NS = 300_000_000
-#: Looks without a row after which nobody is said to write any: not a time, because a reader of lowest priority may look seldom,
+#: Looks without a row after which nobody is said to write any. It is no time: a reader of lowest priority may look seldom,
 #: and gets the first rows at its third look.
 _LOOKS = 15
 #: Version of the records above, on which writer and reader must agree.
